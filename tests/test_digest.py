@@ -2,10 +2,8 @@
 """The digest of a signal topic, by which runs in different hosts are compared."""
 
 import hashlib
-import itertools
 
 import numpy as np
-from cells import run
 
 from lathe_rc import messages
 from lathe_rc.cell.recording import Recording, SparseTopic
@@ -42,32 +40,7 @@ def test_byte_order_of_the_machine_leaves_no_trace():
     assert digest({**SIGNALS, "angle": SIGNALS["angle"].astype(">f8")}) == digest(SIGNALS)
 
 
-def test_every_bit_and_the_order_of_fields_count():
-    changed = [SIGNALS, {**SIGNALS, "angle": np.array([-0.0, 0.1, 0.2])}, dict(reversed(SIGNALS.items()))]
-    for a, b in itertools.combinations(changed, 2):
-        assert digest(a) != digest(b)
-
-
 def test_digest_of_events_is_of_their_stamps_and_fields_alone():
     stamps = np.array([1_000_000_000 + 5 * 15_625, 1_000_000_000 + 9 * 15_625], "<i8").tobytes()
     expected = combined(stamps, np.array([5, 9], "<i8").tobytes(), b"freeze\0clear\0")
     assert digest_of_events(event(5, "freeze"), event(9, "clear")) == expected
-
-
-def test_time_and_text_of_events_count():
-    told = [(event(5, "freeze"),), (event(6, "freeze"),), (event(5, "clear"),), (event(5, "freeze"), event(6, "clear"))]
-    assert len({digest_of_events(*events) for events in told}) == 4
-
-
-def test_every_signal_topic_has_a_digest():
-    assert list(run().digest) == [
-        "/coarse/command",
-        "/coarse/learning",
-        "/coarse/state",
-        "/electrodynamic_actuator/joint_states",
-        "/encoder",
-        "/learning_controller/events",
-        "/spindle_encoder/joint_states",
-        "/tool",
-        "/tool/joint_states",
-    ]

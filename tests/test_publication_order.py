@@ -56,15 +56,6 @@ def test_any_order_of_arrival_within_the_hold_gives_the_order_of_publication(mes
     assert order.late == order.left_out == 0
 
 
-@given(published, st.randoms(use_true_random=False))
-def test_what_has_not_been_given_back_can_arrive_in_any_order(messages, random):
-    made = told(messages)
-    order = new()
-    for message in random.sample(made, len(made)):
-        give(order, message)
-    assert list(order.rest()) == expected(made)
-
-
 def test_only_what_is_older_than_the_hold_is_given_back():
     order = new()
     give(order, (BEGAN + 1, "", 1, 7))

@@ -218,17 +218,6 @@ def test_what_cannot_be_read_is_the_same_fault_for_all_with_a_hint_where_recover
     assert (tmp_path / "new").exists() == (recovered.exit_code != 2)
 
 
-@PLUGINS
-def test_folder_without_metadata_is_read_and_called_wrong(tmp_path, plugin):
-    sent = strange_bag(tmp_path / "bag", plugin)
-    (tmp_path / "bag" / "metadata.yaml").unlink()
-    with Source(tmp_path / "bag") as source:
-        assert list(source.messages()) == sent
-    checked = lathe("bag", "check", tmp_path / "bag")
-    assert checked.exit_code == 1
-    assert checked.stdout.startswith("no metadata.yaml in that folder: bag.")
-
-
 def records_of(path):
     """Profile, channels with their schemas, messages, metadata and attachments of an MCAP file, by another library."""
     profile, schemas, channels, messages, others = "", {0: None}, {}, [], []
@@ -336,6 +325,7 @@ def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
     told = f"{found.lost_bytes} B of its write-ahead log are broken, or were not written to the end"
     assert f"(bag.db3: {told}); lathe bag recover saves the rest" in checked.stderr or not lost
     assert (checked.exit_code, lathe("bag", "info", bag).exit_code) == ((2, 3) if lost else (1, 0))
+    assert lost or checked.stdout.startswith("no metadata.yaml in that folder: bag.db3 alone is read")
     assert {file.name: file.read_bytes() for file in bag.iterdir()} == before
 
 
@@ -476,25 +466,10 @@ def test_what_is_not_of_ros_2_hides_nothing_of_it(tmp_path, kind, topic):
         assert read or (f"no topic that can be read ({told}" if alone else f"not read: {told}") in checked.output
 
 
-def test_databases_that_overlap_in_time_are_merged_by_it(tmp_path):
+def test_topics_in_other_serializations_are_named_and_copied_and_the_rest_is_read(tmp_path):
     sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
-    shutil.copy(tmp_path / "bag" / "bag.db3", tmp_path / "bag" / "further.db3")
-    (tmp_path / "bag" / "metadata.yaml").unlink()
-    with Source(tmp_path / "bag") as source:
-        assert list(source.messages()) == [message for message in sent for _ in range(2)]
-        part = list(source.messages({"/said"}, start_ns=10**9 + 1000, stop_ns=10**9 + 7000))
-    assert part == [message for message in sent[1:7] if message[0] == "/said" for _ in range(2)]
-
-
-@PLUGINS
-def test_topics_in_other_serializations_are_named_and_copied_and_the_rest_is_read(tmp_path, plugin):
-    sent = strange_bag(tmp_path / "bag", plugin)
-    if plugin == StoragePlugin.SQLITE3:
-        with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
-            database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
-    else:
-        file = storage_of(tmp_path / "bag")
-        file.write_bytes(file.read_bytes().replace(b"/said\x03\0\0\0cdr", b"/said\x03\0\0\0xdr"))
+    with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
+        database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
     with Source(tmp_path / "bag") as source:
         assert list(source.messages()) == [message for message in sent if message[0] != "/said"]
     said = "not read: /said std_msgs/msg/String, 200 messages serialized as 'xdr', not 'cdr'"

@@ -69,7 +69,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
 
 
 def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
-    """Of each class of others where it comes from, see `Registry.origin`, and the parameters that name it."""
+    """Return the origin of each third-party class, see `Registry.origin`, and the parameters that name it."""
     named: list[tuple[str, Mapping[str, str] | None]] = []
     for node, table in nodes.items():
         kind = kind_of(node, table.stage)
@@ -91,7 +91,7 @@ def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a class of others came from when a bag was made.
+    """Origin of a third-party class when a bag was made.
 
     Attributes:
         name: of the class, as ``package.module:Class``.
@@ -113,7 +113,7 @@ class Origin:
 
 
 def origins(about: Mapping[str, str]) -> list[Origin]:
-    """Where the classes of others in a bag came from; empty if there are none, or what the bag says of them is none."""
+    """Return the origins of the third-party classes of a bag; empty if there are none or their text is broken."""
     found: list[Origin] = []
     try:
         for name, said in list(json.loads(about.get(ORIGINS, "{}")).items())[:_MOST_ORIGINS]:
@@ -127,7 +127,7 @@ def origins(about: Mapping[str, str]) -> list[Origin]:
 
 
 def _check_installed(about: Mapping[str, str]) -> None:
-    """Refuse a bag whose classes of others are not here; nothing is imported.
+    """Refuse a bag whose third-party classes are not installed; nothing is imported.
 
     Raises:
         InputError: names one, and what to install.
@@ -143,7 +143,7 @@ def _check_installed(about: Mapping[str, str]) -> None:
 
 
 def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
-    """Changes since a bag was made in the classes of others of its scenario; a line for each class."""
+    """Return the changes of third-party classes since a bag was made, a line for each class."""
     made, here = {origin.name: origin for origin in origins(about)}, _origins(scenario.nodes)
     found = []
     for name, now in here.items():

@@ -22,7 +22,7 @@ class _Collector:
         self.sparse: dict[str, list[Sparse]] = {}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Append a piece."""
         for topic, signals in dense.items():
             fields = self.dense.setdefault(topic, {name: [] for name in signals})
             for name, array in signals.items():
@@ -32,7 +32,7 @@ class _Collector:
 
 
 def read_bag(path: str | os.PathLike[str]) -> Recording:
-    """Read all signal topics of a bag into memory; bags beyond it are read in pieces, see `lathe_rc.bag.reading.stream`.
+    """Read all signal topics of a bag into memory; `lathe_rc.bag.reading.stream` reads longer ones in pieces.
 
     Example:
         >>> import lathe_rc

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A snapshot: a bag of a part of a run, and what it says of that part."""
+"""Snapshots: bags of a part of a run, and their text about that part."""
 
 import json
 from collections.abc import Mapping

@@ -80,7 +80,7 @@ class Exporter:
         self._tables = {t: _Table(columns(kind), target.table(t, columns(kind))) for t, kind in types.items()}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Append the rows of a piece."""
         for topic, signals in dense.items():
             if table := self._tables.get(full(topic)):
                 table.add(dense_rows(first, signals, self._step_ns))

@@ -58,12 +58,12 @@ class _ArrowRows:
         self._writer, self._schema = writer, schema
 
     def write(self, rows: Mapping[str, Samples]) -> None:
-        """See `Rows`."""
+        """Append rows."""
         arrays = [pa.array(array, field.type) for array, field in zip(rows.values(), self._schema, strict=True)]
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:
-        """See `Rows`."""
+        """Finish the table."""
         self._writer.close()
 
 
@@ -76,7 +76,7 @@ class Csv(Format):
     """A file a topic, with units in the header; numbers have the digits that give the same bits again."""
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """See `Format`."""
+        """Begin the table of a topic."""
         schema = arrow_schema(columns, lambda column: column.label)
         path = self.place / f"{file_name(topic)}.csv"
         options = csv.WriteOptions(quoting_style="needed")
@@ -87,7 +87,7 @@ class Parquet(Format):
     """A file a topic, with units in the metadata of the fields."""
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """See `Format`."""
+        """Begin the table of a topic."""
         schema = arrow_schema(columns, lambda column: column.name)
         path = self.place / f"{file_name(topic)}.parquet"
         return _ArrowRows(parquet.ParquetWriter(path, schema, compression="zstd"), schema)
@@ -139,12 +139,12 @@ class _NpzRows:
         self._spools = spools
 
     def write(self, rows: Mapping[str, Samples]) -> None:
-        """See `Rows`."""
+        """Append rows."""
         for name, values in rows.items():
             self._spools[name].add(values)
 
     def close(self) -> None:
-        """See `Rows`."""
+        """Finish the table."""
 
 
 class Npz(Format):
@@ -158,7 +158,7 @@ class Npz(Format):
         self._units: list[tuple[str, str]] = []
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """See `Format`."""
+        """Begin the table of a topic."""
         spools = {}
         for column in columns:
             name = f"{topic.strip('/')}/{column.name}"
@@ -168,7 +168,7 @@ class Npz(Format):
         return _NpzRows(spools)
 
     def finish(self) -> None:
-        """See `Format`."""
+        """Write the archive from the columns."""
         with zipfile.ZipFile(self.place, "x") as archive:
             # A ZipInfo of its own has no date: the same bag gives the same file.
             with archive.open(zipfile.ZipInfo("units.npy"), "w") as member:

@@ -41,7 +41,7 @@ class _Records(Span):
     in_chunk: bool
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """See `Span`."""
+        """Yield the messages in batches, by log time."""
         with self.path.open("rb") as stream:
             stream.seek(self.start)
             whole = stream.read(self.length)

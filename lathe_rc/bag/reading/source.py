@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening bags, whoever made them: rosbag2 folders of any storage and compression, or a file of one.
+"""Opening bags of any maker: rosbag2 folders of any storage and compression, or a file of one.
 
-Nothing in a bag is trusted: what it says of sizes is checked before anything of that size is made. The limits stand in
+Nothing in a bag is trusted: its sizes are checked before memory of that size is taken. The limits are in
 `lathe_rc.bag.reading.limits`.
 """
 
@@ -43,7 +43,7 @@ Read = tuple[Span, Mapping[int, str]]  # and its channels that are wanted
 
 @dataclass(frozen=True)
 class Unread:
-    """A topic of a bag whose messages are not read.
+    """Topic whose messages are not read.
 
     Attributes:
         topic: its name.

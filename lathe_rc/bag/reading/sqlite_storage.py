@@ -93,7 +93,7 @@ class _Table(Span):
     path: Path
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """See `Span`."""
+        """Yield the messages one by one, by log time."""
         query = """SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END FROM messages
             WHERE topic_id IN (SELECT value FROM json_each(?)) AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"""
         with contextlib.closing(connect(self.path)) as base:
@@ -109,7 +109,7 @@ class _Table(Span):
 
 
 def open_sqlite(path: Path, folder: Path) -> Storage:
-    """The topics of a database, and one span with its messages; a copy of it may come into the folder.
+    """Return the topics of a database and one span with its messages; ``folder`` may get a copy of it.
 
     Raises:
         InputError, ValueError, OSError, sqlite3.Error: see `with_journal`.

@@ -19,7 +19,7 @@ CDR = "cdr"  #: the serialization of ROS 2, the only one that is read
 
 @dataclass(frozen=True)
 class Batch:
-    """Messages that stand in the same bytes.
+    """Messages in the same bytes.
 
     Attributes:
         whole: the bytes.
@@ -105,7 +105,7 @@ class Span:
 
 @dataclass
 class Storage:
-    """A file of a bag.
+    """Content of a file of a bag.
 
     Attributes:
         channels: by number.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every sound message of a bag that is cut off or broken in places.
 
-Bytes are copied, not understood: schemas, channels and messages keep every byte but for their numbers.
+Bytes are copied without decoding: schemas, channels and messages keep every byte but for their numbers.
 """
 
 import sqlite3

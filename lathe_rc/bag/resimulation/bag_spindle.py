@@ -45,7 +45,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """See `lathe_rc.cell.stage`."""
+    """Copy the recorded samples of a block."""
     angle, speed, angle_true, speed_true, index_pulse = outputs
     at, n = first - memory.span[0], angle.size
     put(angle, memory.angle[at : at + n])
@@ -82,20 +82,20 @@ class _RecordedSpindle(TimeMaster):
         return (low if low > 0.0 else min(made[0], high)), high
 
     def largest_acceleration(self) -> float:
-        """Of the scenario's."""
+        """Return the largest acceleration of the scenario's law [rad/s²]."""
         return self._made.largest_acceleration()
 
     def sample_at(self, angle: float) -> int:
-        """Of the scenario's."""
+        """Return the sample at an angle by the scenario's law."""
         return self._made.sample_at(angle)
 
     @property
     def memory(self) -> Memory:
-        """See `Stage`."""
+        """Memory of the step."""
         return Memory(self._span, *self._ready.values())
 
     def prepare(self, first: int, samples: int) -> None:
-        """See `Stage`: read ahead.
+        """Read the samples of the next block ahead of its computation.
 
         Raises:
             LatheError: the recording has not so many samples, or some are missing.
@@ -118,7 +118,7 @@ class _RecordedSpindle(TimeMaster):
             signals["angle_true"] -= self._said.turns
 
     def replay(self, action: str, index: int) -> None:
-        """See `Stage`: as it was said."""
+        """Schedule a recorded event at its sample."""
         self._scheduled.append((index, action))
 
     def act(self, action: str, index: int) -> None:
@@ -162,7 +162,7 @@ class Comparison:
         self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Add the errors of a piece."""
         tool, encoder = dense[self._tool], dense[self._encoder]
         between: Samples = tool["displacement"] - sum(reader.take(samples)[field] for reader, field in self._readers)
         for sink, error in ((self._recorded, tool["error"] + between), (self._between, between)):

@@ -70,14 +70,8 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
     tool = recorded.find("tool", messages.TOOL)
     position = (state, "measured_position") if state else (tool, "displacement") if tool else None
     if command is None or position is None:
-        missing = [
-            what
-            for what, found in (
-                (f"its command: {recorded.lacks(names['command'], messages.COMMAND)}", command),
-                (f"its position: {recorded.lacks(names['state'], messages.STATE)}", position),
-            )
-            if found is None
-        ]
+        missing = [f"its command: {recorded.lacks(names['command'], messages.COMMAND)}"] if command is None else []
+        missing += [f"its position: {recorded.lacks(names['state'], messages.STATE)}"] if position is None else []
         raise InputError(
             f"{recorded.path}: {node} cannot be identified without {'; nor without '.join(missing)}; the bag has "
             f"{recorded.holdings()}; leave --identify out and give the drive's parameters with --scenario FILE"

@@ -100,7 +100,7 @@ class _Digests:
         self._sparse = {f"/{topic}": SparseTopic() for topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Add a piece to the digests."""
         for topic, signals in dense.items():
             self._digester.dense(f"/{topic}", signals)
         for topic, found in sparse.items():
@@ -225,7 +225,7 @@ def resimulate(
                 writer.close()
         digest = digests.result()
         wall = time.monotonic() - start
-    found = recorded_digests(path) if original is not None else {}
+    found = _recorded_digests(path) if original is not None else {}
     digest_of_bag = {topic.removeprefix(recorded.namespace): digest for topic, digest in found.items()}
     before = errors
     if changed and compared is None:
@@ -305,6 +305,6 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
                 raise InputError(f"{name}.{what} = {asked}: {_PAST}")
 
 
-def recorded_digests(path: Path) -> dict[str, str]:
-    """Digests of a bag: those that were recorded, or made now from all of it; empty if it is not complete."""
+def _recorded_digests(path: Path) -> dict[str, str]:
+    """Return the digests of a bag, recorded or made now from all of it; empty if it is not complete."""
     return check.recorded(path) or check.check(path).digests

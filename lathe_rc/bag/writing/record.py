@@ -97,7 +97,7 @@ class OfflineRecorder:
         )
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Cut a piece into blocks and write them."""
         ends = first + np.minimum(np.arange(self._block, samples + self._block, self._block), samples)
         before = {name: framer.companions for name, framer in self._framers.items()}
         sent: dict[str, list[int]] = {}  # samples of the sparse messages of each node

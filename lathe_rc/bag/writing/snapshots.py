@@ -133,23 +133,23 @@ class Snapshots:
     # ---- what comes in ------------------------------------------------------------------------------
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """See `Output`; every bag says so."""
+        """Store texts, which every bag gets."""
         self._about.update(about)
         if self._open is not None:
             self._open[1].tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """See `Output`."""
+        """Announce a topic, which every bag gets."""
         self._topics[topic] = msgtype, qos
         if self._open is not None:
             self._open[1].add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
-        """See `Output`; a file counts its channels from 1."""
+        """Return the number of a topic; a file counts its channels from 1."""
         return list(self._topics).index(topic) + 1
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """See `Output`; an event or an alarm may be a trigger.
+        """Take a message; an event or an alarm may be a trigger.
 
         Raises:
             LatheError: the disk does not take it, or too much is kept.
@@ -159,7 +159,7 @@ class Snapshots:
             self._hear(topic, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """See `Output`.
+        """Take rows of blocks.
 
         Raises:
             LatheError: the disk does not take it, or too much is kept.
@@ -298,7 +298,7 @@ class Snapshots:
         self._told(snapshot)
 
     def flush(self) -> None:
-        """See `Output`; when nothing has come since the last time, so that writing all that waits delays no node.
+        """Hand messages to the operating system; if none has come since the last time, also those that wait.
 
         Raises:
             LatheError: the disk does not take it.

@@ -345,38 +345,38 @@ class Both:
         self._first, self._second = first, second
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """See `Output`."""
+        """Store texts in both."""
         self._first.tell(about)
         self._second.tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """See `Output`."""
+        """Announce a topic to both."""
         self._first.add_topic(topic, msgtype, qos)
         self._second.add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
-        """See `Output`; the same in both."""
+        """Return the number of a topic, the same in both."""
         number = self._first.channel(topic)
         assert number == self._second.channel(topic), "topics are announced to both in the same order"
         return number
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """See `Output`."""
+        """Append a message to both."""
         self._first.write(topic, log_ns, data)
         self._second.write(topic, log_ns, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """See `Output`."""
+        """Append rows of blocks to both."""
         self._first.write_rows(plan, first_ns, data)
         self._second.write_rows(plan, first_ns, data)
 
     def flush(self) -> None:
-        """See `Output`."""
+        """Flush both."""
         self._first.flush()
         self._second.flush()
 
     def close(self) -> None:
-        """See `Output`."""
+        """Close both, the second also if the first fails."""
         try:
             self._first.close()
         finally:
