@@ -52,21 +52,9 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "        if self.own.name in state.lost or not self.ready:\n",
-        "        if not self.ready:\n",
-        "a member that the cell has lost goes on",
-    ),
-    Fault(
-        "member",
         "        ended = name in self.ended\n",
         "        ended = False\n",
         "the death of the time master is overlooked",
-    ),
-    Fault(
-        "member",
-        "        elif self.phase == Phase.FAILED:\n",
-        "        elif False:\n",
-        "the failure of the cell is not heard",
     ),
     Fault(
         "member",

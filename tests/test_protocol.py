@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from deliberate_faults import FAULTS, faulty
 from simulation import play
 
 from lathe_rc import messages
@@ -227,3 +228,9 @@ def test_blocks_come_in_order_whatever_is_repeated():
     assert taken == list(range(0, 800, 4))
     with pytest.raises(LatheError, match="/t: /a goes from sample 800 to 808: 8 samples are missing"):
         order.missing("/a", 808, 4)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.mistake)
+def test_a_deliberate_fault_has_its_place_in_the_protocol(fault):
+    """`./lathe test --system` plays schedules with each of them; here it only has to fit the code as it is."""
+    compile(faulty(fault), fault.module, "exec")

@@ -56,12 +56,16 @@ def ignore(event: Event) -> None:
 
 @contextlib.contextmanager
 def free_domain(number: int | None = None) -> Iterator[int]:
-    """A ROS domain that no other program on this machine uses; ``number`` if one is given."""
-    if number is not None:
-        yield number
-        return
+    """A ROS domain that no other program on this machine uses; ``number`` if one is given, which others then leave alone."""
     from domain_coordinator import domain_id
+    from domain_coordinator.impl import PORT_BASE
 
+    if number is not None:
+        with socket.socket() as reservation:
+            with contextlib.suppress(OSError):  # several cells may share a domain that is asked for
+                reservation.bind(("", PORT_BASE + number))
+            yield number
+        return
     with domain_id(lambda: next(_numbers) % _DOMAINS + 1) as free:
         yield int(free)
 
