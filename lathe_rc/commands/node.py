@@ -50,4 +50,7 @@ def container(arguments: tuple[str, ...]) -> None:
 
 def _nodes(arguments: Sequence[str]) -> int:
     process = load("lathe_rc.nodes.process")
-    return int(process.run(*process.split(arguments)))
+    try:
+        return int(process.run(*process.split(arguments)))
+    finally:
+        process.arguments.bound_the_end()

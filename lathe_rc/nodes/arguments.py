@@ -2,6 +2,7 @@
 """The command line of a node's executable: what ROS does not answer or refuse; this module imports no ROS."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -15,6 +16,8 @@ from lathe_rc.errors import InputError, LatheError
 
 ROS = "--ros-args"  #: what follows is for ROS
 _TAKEN = f"allowed: --help, or {ROS} and what ROS takes: --params-file FILE, -p PARAM:=VALUE, -r OLD:=NEW"
+
+_LONGEST_END = 20  # [s] that destructors may take
 
 
 class Rule(NamedTuple):
@@ -110,7 +113,14 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         code = error.exit_code
+    bound_the_end()
     sys.exit(code)
+
+
+def bound_the_end() -> None:
+    """Let SIGALRM end this process if it does not leave: Fast DDS waits for itself for ever in one of some hundred ends."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(_LONGEST_END)
 
 
 def rules(words: Sequence[str]) -> Iterator[Rule]:

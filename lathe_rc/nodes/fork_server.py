@@ -52,7 +52,10 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
         os.execvpe(request["command"][0], request["command"], os.environ)
     sys.path[:] = request["path"]  # modules of others are found where who asks finds them
     process = importlib.import_module(_NODES)
-    return int(process.run(*process.split(request["arguments"])))
+    try:
+        return int(process.run(*process.split(request["arguments"])))
+    finally:
+        process.arguments.bound_the_end()
 
 
 def _reap_children(line: socket.socket, children: dict[int, int]) -> None:
