@@ -57,12 +57,6 @@ FAULTS = (
         "the death of the time master is overlooked",
     ),
     Fault(
-        "member",
-        "        if self._started:\n            self.announce()\n        self._leave_with_the_cell()\n",
-        "        self._leave_with_the_cell()\n",
-        "a member fails and does not say so",
-    ),
-    Fault(
         "member", "        if last or blocks // self", "        if blocks // self", "the last blocks are not reported"
     ),
     Fault(
