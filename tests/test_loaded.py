@@ -7,13 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 from cells import scenario
+from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
 from lathe_papers.formulas.loaded import compliance, compliance_in_series
 from lathe_papers.formulas.regeneration import Regeneration
 from lathe_rc import harness
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import LatheError
 from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import RIGID, SpecificForce
@@ -32,21 +33,18 @@ DELAY = 23 * STEP  # whole samples: what the servo follows is linear from sample
 
 
 def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=None, **piezo):
-    servo, stack = {**SERVO, **(servo or {})}, {**STACK, **(stack or {})}
     linear = Stack(
         stroke=15e-6, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
         step=step, method="foh",
     )  # fmt: skip
+    fine = Piezo(linear, *{**STACK, **(stack or {})}.values(), full_voltage=100.0, **piezo)
     return ToolDrive(
-        natural_frequency=servo["natural_frequency"],
-        damping=servo["damping"],
+        **{"stroke": 1e-3, **SERVO, **(servo or {})},
         delay=DELAY,
-        stroke=servo.get("stroke", 1e-3),
-        moving_mass=servo["moving_mass"],
         force_constant=FORCE_CONSTANT,
         radial=radial,
         coil=coil,
-        piezo=Piezo(linear, *stack.values(), full_voltage=100.0, **piezo) if series else None,
+        piezo=fine if series else None,
         step=step,
         method="foh",
         kept=8192,
@@ -75,58 +73,42 @@ CUT = {"depth": 0.3e-3, "lag": 2e-3, "elasticity": "realistic", "gap_start": [1.
 CUT |= {"run_out_order": [1], "run_out_amplitude": [5e-6], "regeneration": 0.5}
 
 
-def prefixed(prefix, values):
-    return {prefix + name: value for name, value in values.items()}
+def cell(*drives, **nodes):
+    """A cell with these nodes and no other drive than them."""
+    whole = scenario(profile=FORM, tool={"reference": "topic", "drives": list(drives)}, **nodes).nodes
+    kept = {name: table for name, table in whole.items() if name in nodes or name != "electrodynamic_actuator"}
+    return Scenario("test", kept)
 
 
-def apart(**drives):
-    """Drives and cut as nodes of their own, as they were before."""
-    cell = scenario(
-        profile=FORM,
-        tool={"reference": "topic", "drives": ["coarse", "fine"] if "series_drive" in drives else ["coarse"]},
-        cutting_process={"moved_by": ["tool"], **CUT},
-        **drives,
-    )
-    left_out = [] if "electrodynamic_actuator" in drives else ["electrodynamic_actuator"]
-    return without(cell, left_out)
+def together(**values):
+    """A drive and its cut as one node."""
+    cut = {f"cut_{name}": value for name, value in CUT.items()}
+    return cell("coarse", loaded_drive={**cut, **values})
 
 
-def together(kind, **values):
-    cell = scenario(
-        profile=FORM,
-        tool={"reference": "topic", "drives": ["coarse", "fine"] if kind == "loaded_series_drive" else ["coarse"]},
-        **{kind: {**prefixed("cut_", CUT), **values}},
-    )
-    return without(cell, ["electrodynamic_actuator"])
+FINE = {"fine_use_command": False, "fine_use_reference": True}
 
 
-def without(cell, names):
-    return Scenario("test", {name: table for name, table in cell.nodes.items() if name not in names})
-
-
-SIGNALS = ("/coarse/state", "/cut", "/tool", "/coarse/command")
-
-
-def test_without_a_force_on_it_a_drive_and_its_cut_are_those_of_two_nodes():
-    loose = harness.run(apart(electrodynamic_actuator={})).digest
-    held = harness.run(together("loaded_drive", radial_ratio=0.0)).digest
-    assert [held[topic] for topic in SIGNALS] == [loose[topic] for topic in SIGNALS]
-
-
-@pytest.mark.parametrize("compensates", [[], ["coarse"]])
-def test_without_a_force_on_them_both_drives_in_series_and_their_cut_are_those_of_two_nodes(compensates):
-    fine = {"fine_use_command": False, "fine_use_reference": True, "fine_compensates": compensates}
-    loose = harness.run(apart(series_drive=fine)).digest
-    held = harness.run(together("loaded_series_drive", radial_ratio=0.0, **fine)).digest
-    topics = (*SIGNALS, "/fine/state")
-    assert [held[topic] for topic in topics] == [loose[topic] for topic in topics]
+@pytest.mark.parametrize(
+    ("one", "drive", "values"),
+    [
+        ("loaded_drive", "electrodynamic_actuator", {}),
+        ("loaded_series_drive", "series_drive", FINE),
+        ("loaded_series_drive", "series_drive", {**FINE, "fine_compensates": ["coarse"]}),
+    ],
+)
+def test_without_a_force_on_them_drives_and_their_cut_are_those_of_two_nodes(one, drive, values):
+    drives = ("coarse", "fine") if values else ("coarse",)
+    cut = {f"cut_{name}": value for name, value in CUT.items()}
+    apart = harness.run(cell(*drives, cutting_process={"moved_by": ["tool"], **CUT}, **{drive: values})).digest
+    joined = harness.run(cell(*drives, **{one: {**cut, "radial_ratio": 0.0, **values}})).digest
+    topics = ["/cut", "/tool", "/coarse/command", *(f"/{drive}/state" for drive in drives)]
+    assert [joined[topic] for topic in topics] == [apart[topic] for topic in topics]
 
 
 def test_a_mass_that_nothing_moves_is_a_rigid_drive():
     """The force moves it by less than the last bit of the chip; what the coil would need for it is another matter."""
-    runs = [
-        harness.run(together("loaded_drive", radial_ratio=radial, coarse_moving_mass=1e30)) for radial in (0.0, 0.4)
-    ]
+    runs = [harness.run(together(radial_ratio=radial, coarse_moving_mass=1e30)) for radial in (0.0, 0.4)]
     assert runs[0].digest["/cut"] == runs[1].digest["/cut"]
     forms = [run.recording.dense["/tool"]["displacement"] for run in runs]
     assert_allclose(forms[0], forms[1], rtol=0.0, atol=1e-30)
@@ -363,30 +345,29 @@ def test_a_stack_is_torn_off_its_preload():
         loaded(series=True, preload=50.0).block(cutting(), 0, shaken)
 
 
-def test_a_current_loop_that_cannot_work_is_refused():
-    with pytest.raises(InputError, match=r"current loop of 500000 rad/s at a step of .*: largest pole"):
-        loaded(coil=replace(COIL, bandwidth=500e3))
-    cell = together("loaded_drive", coarse_current_limit=3.0)
-    with pytest.raises(InputError) as refused:
-        harness.run(cell)
-    assert str(refused.value) == (
-        "loaded_drive.coarse_current_limit = 3 with coarse_loop = ideal; allowed: 0, or current"
-    )
+@refusals(
+    (lambda: loaded(coil=replace(COIL, bandwidth=500e3)), "current loop of 500000 rad/s at a step of .*: largest pole"),
+    (
+        lambda: harness.run(together(coarse_current_limit=3.0)),
+        r"^loaded_drive\.coarse_current_limit = 3 with coarse_loop = ideal; allowed: 0, or current$",
+    ),
+    (
+        lambda: harness.run(together(cut_gap_start=[1.0, 2.0])),
+        r"loaded_drive\.cut_gap_start, cut_gap_width: 2 and 1; give as many of each",
+    ),
+)
+def test_what_cannot_work_is_refused_by_its_own_names(make, message):
+    assert_refused(make, message)
 
 
 def test_a_tool_breaks_as_in_a_cut_of_its_own():
     values = {"allow_faults": True, "faults": ["sample 8000: cut tool_broken length=0.2e-3"], "cut_gap_start": []}
-    run = harness.run(together("loaded_drive", **values, cut_gap_width=[], cut_regeneration=0.0)).recording.dense
+    run = harness.run(together(**values, cut_gap_width=[], cut_regeneration=0.0)).recording.dense
     before, after = (run["/cut"]["force"][n] for n in (7900, 9500))
     assert after == pytest.approx(before / 3, rel=0.3)
 
 
-def test_what_is_wrong_with_the_cut_is_named_as_it_was_given():
-    with pytest.raises(InputError, match=r"loaded_drive\.cut_gap_start, cut_gap_width: 2 and 1; give as many of each"):
-        harness.run(together("loaded_drive", cut_gap_start=[1.0, 2.0]))
-
-
 def test_what_a_limited_coil_cannot_is_said():
     limits = {"coarse_loop": "current", "coarse_voltage_limit": 0.1, "cut_depth": 0.0}
-    events = harness.run(together("loaded_drive", **limits)).recording.sparse["/loaded_drive/events"]
+    events = harness.run(together(**limits)).recording.sparse["/loaded_drive/events"]
     assert events.values["action"][0] == "limited: coil"

@@ -3,9 +3,10 @@
 
 import numpy as np
 import pytest
-from cells import cuts, in_blocks
+from cells import cuts
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import amplitude, assert_refused, refusals, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
@@ -14,7 +15,6 @@ from lathe_rc import messages
 from lathe_rc.analysis.hysteresis_fit import from_signals, identify
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
-from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii
 from lathe_rc.plants.linear import second_order
 from lathe_rc.plants.piezo import PiezoDrive, Stack, extend
@@ -22,6 +22,10 @@ from lathe_rc.plants.piezo import PiezoDrive, Stack, extend
 WN, ZETA, STROKE, VOLTS = 14600.0, 0.299, 15e-6, 100.0
 STEP = 1 / 64000
 TABLE = np.array([500.0, 1000.0, 1500.0, 2000.0])
+CREEP_TIMES = np.array([0.01, 0.1, 1.0])
+PERIOD = 160
+FREQUENCY = 2 * np.pi / (PERIOD * STEP)
+SINE = np.sin(FREQUENCY * np.arange(40 * PERIOD) * STEP)
 
 PAIRS = {
     None: lambda _: (None, None),
@@ -30,16 +34,13 @@ PAIRS = {
 }
 
 
-def make_drive(kind=None, *, linearised=True, scale=1.0, lag=0.0, slew=np.inf, creep=0.0, method="foh"):
+def make_drive(kind=None, *, linearised=True, scale=1.0, method="foh", **values):
     forward, inverse = PAIRS[kind](scale)
     stack = Stack(
-        stroke=STROKE,
-        amplifier_lag=lag,
-        slew_rate=slew,
+        **{"stroke": STROKE, "amplifier_lag": 0.0, "creep_per_decade": 0.0, **values},
         hysteresis=forward,
         inverse=inverse if linearised else None,
-        creep_per_decade=creep,
-        creep_times=np.array([0.01, 0.1, 1.0]),
+        creep_times=CREEP_TIMES,
         step=STEP,
         method=method,
     )
@@ -48,47 +49,28 @@ def make_drive(kind=None, *, linearised=True, scale=1.0, lag=0.0, slew=np.inf, c
 
 def drive(machine, set_point, lengths=None):
     """Position, velocity and voltage."""
-    motion = np.empty((3, set_point.size))
-    in_blocks(lengths or [set_point.size], lambda _, *parts: machine.block(*parts), set_point, *motion)
-    return motion
-
-
-def amplitude(signal, frequency, period):
-    """Complex amplitude of a sine in the last period."""
-    time = np.arange(signal.size)[-period:] * STEP
-    return 2j / period * (signal[-period:] * np.exp(-1j * frequency * time)).sum()
+    return run(lambda _, *parts: machine.block(*parts), 3, set_point, lengths=lengths)
 
 
 # --- linear
 
 
 @pytest.mark.parametrize("method", ["foh", "tustin"])
-@pytest.mark.parametrize("lag", [0.0, 40e-6])
-@pytest.mark.parametrize("kind", PAIRS)
+@pytest.mark.parametrize(("kind", "lag"), [*((kind, 0.0) for kind in PAIRS), (None, 40e-6)])
 def test_drive_answers_a_sine_as_its_response_says(kind, lag, method):
     """Without a lag between inverse and hysteresis a linearised drive is linear; without hysteresis always."""
-    machine = make_drive(kind if lag == 0.0 else None, lag=lag, method=method)
-    period = 160
-    frequency = 2 * np.pi / (period * STEP)
-    set_point = 0.5 * STROKE * np.sin(frequency * np.arange(40 * period) * STEP)
-    position, velocity, _ = drive(machine, set_point)
-    expected = machine.linear.response(frequency) * 0.5 * STROKE
-    assert_allclose(amplitude(position, frequency, period), expected, rtol=1e-9)
-    assert abs(amplitude(velocity, frequency, period)) == pytest.approx(frequency * abs(expected), rel=1e-3)
+    machine = make_drive(kind, amplifier_lag=lag, method=method)
+    position, velocity, _ = drive(machine, 0.5 * STROKE * SINE)
+    expected = machine.linear.response(FREQUENCY) * 0.5 * STROKE
+    assert_allclose(amplitude(position, FREQUENCY, PERIOD, STEP), expected, rtol=1e-9)
+    assert abs(amplitude(velocity, FREQUENCY, PERIOD, STEP)) == pytest.approx(FREQUENCY * abs(expected), rel=1e-3)
     assert machine.saturated == 0
 
 
 @pytest.mark.parametrize("lag", [0.0, 40e-6])
 def test_response_nears_the_ideal(lag):
     expected = ideal(TABLE, WN, ZETA) / (1 + 1j * TABLE * lag)
-    assert_allclose(make_drive(lag=lag).linear.response(TABLE), expected, rtol=2e-4)
-
-
-def test_row_of_the_uncompensated_is_that_of_the_spec():
-    """spec/learning.md prints .020 .040 .061 .083; its ζ = 0.299 gives them to 4 %."""
-    left = np.abs(1.0 - make_drive().linear.response(TABLE))
-    assert_allclose(left, [0.0205, 0.0414, 0.0629, 0.0853], atol=2e-4)
-    assert_allclose(left, [0.020, 0.040, 0.061, 0.083], rtol=0.04)
+    assert_allclose(make_drive(amplifier_lag=lag).linear.response(TABLE), expected, rtol=2e-4)
 
 
 def test_foh_is_exact_for_set_points_linear_between_samples():
@@ -104,7 +86,7 @@ def test_foh_is_exact_for_set_points_linear_between_samples():
 @pytest.mark.parametrize("kind", PAIRS)
 def test_the_amplifier_changes_its_voltage_no_faster_than_its_slew_rate(kind):
     """200 times full voltage in a second; what it cannot follow is counted, sample by sample as in a block."""
-    machine, other = (make_drive(kind, slew=200.0) for _ in range(2))
+    machine, other = (make_drive(kind, slew_rate=200.0) for _ in range(2))
     set_point = np.repeat([0.0, 0.8, -0.4], [10, 1000, 1000]) * STROKE
     _, _, voltage = drive(machine, set_point)
     slope = np.abs(np.diff(voltage)) / STEP
@@ -116,24 +98,12 @@ def test_the_amplifier_changes_its_voltage_no_faster_than_its_slew_rate(kind):
     assert np.array_equal(other.table.memory, machine.table.memory)
 
 
-def test_step_response_overshoots_as_its_damping_says():
-    position = drive(make_drive(), np.full(2000, 0.5 * STROKE))[0]
-    damped = np.sqrt(1 - ZETA**2)
-    assert position.max() / position[-1] == pytest.approx(1 + np.exp(-np.pi * ZETA / damped), abs=2e-3)
-    assert position[-1] == pytest.approx(0.5 * STROKE)
-
-
 def test_amplifier_lag_is_exact_for_set_points_linear_between_samples():
     """Voltage after a ramp from sample -1 on: t - T·(1 - e^{-t/T})."""
     lag, slope = 40e-6, 0.02
-    voltage = drive(make_drive(lag=lag), slope * STROKE * np.arange(1, 41))[2]
+    voltage = drive(make_drive(amplifier_lag=lag), slope * STROKE * np.arange(1, 41))[2]
     time = np.arange(1, 41) * STEP
     assert_allclose(voltage / VOLTS, slope / STEP * (time + lag * np.expm1(-time / lag)), rtol=1e-10)
-
-
-def test_lag_far_below_the_step_is_refused():
-    with pytest.raises(InputError, match=r"lag of 1e-09 s at a step of 1.5625e-05 s; allowed: at least 1.5625e-08"):
-        make_drive(lag=1e-9)
 
 
 # --- saturation
@@ -177,48 +147,31 @@ def test_voltage_that_a_wrong_inverse_asks_for_is_counted():
     assert machine.saturated == at_limit.sum()
 
 
-# --- hysteresis
-
-
-@pytest.mark.parametrize(("kind", "loop"), [(None, 0.0), ("plays", 0.13), ("bouc_wen", 0.13)])
-def test_loop_without_linearisation(kind, loop):
-    """In a swing of a second the lag of the resonance, 41 µs, is nothing."""
-    points = 64000
-    set_point = STROKE * np.sin(2 * np.pi * np.arange(4 * points) / points)
-    position = drive(make_drive(kind, linearised=False), set_point)[0][-points:]
-    rising, falling = position[0], position[points // 2]
-    assert (falling - rising) / np.ptp(position) == pytest.approx(loop, abs=2e-3)
-
-
 # --- creep
 
 
 def test_creep_grows_by_its_part_in_each_decade():
     rate = 0.02
-    position = drive(make_drive(creep=rate), np.full(70_000, 0.5 * STROKE))[0]
+    position = drive(make_drive(creep_per_decade=rate), np.full(70_000, 0.5 * STROKE))[0]
     # The set point rises from 0 in the step before sample 0, and the resonance lags by 2ζ/ωn.
     time = (np.arange(70_000) + 0.5) * STEP - 2 * ZETA / WN
-    crept = 1 + rate * sum(-np.expm1(-time / tau) for tau in (0.01, 0.1, 1.0))
+    crept = 1 + rate * sum(-np.expm1(-time / tau) for tau in CREEP_TIMES)
     assert_allclose(position[2000:] / (0.5 * STROKE), crept[2000:], rtol=1e-6)
     k = [3200, 32_000]
     assert np.diff(position[k])[0] / (0.5 * STROKE) == pytest.approx(rate, rel=0.15)
 
 
 def test_creep_is_in_the_response():
-    machine = make_drive(creep=0.05)
     frequency = 2 * np.pi * 5.0
-    expected = 1 + 0.05 * sum(1 / (1 + 1j * frequency * tau) for tau in (0.01, 0.1, 1.0))
-    assert_allclose(machine.linear.response(frequency) / make_drive().linear.response(frequency), expected, rtol=1e-5)
-    set_point = 0.5 * STROKE * np.sin(frequency * np.arange(64_000 * 6) * STEP)
-    measured = amplitude(drive(machine, set_point)[0], frequency, 12_800)
-    assert_allclose(measured, machine.linear.response(frequency) * 0.5 * STROKE, rtol=1e-3)
+    expected = 1 + 0.05 * sum(1 / (1 + 1j * frequency * tau) for tau in CREEP_TIMES)
+    crept, plain = (make_drive(creep_per_decade=rate).linear.response(frequency) for rate in (0.05, 0.0))
+    assert_allclose(crept / plain, expected, rtol=1e-5)
 
 
 @given(cuts, st.sampled_from(list(PAIRS)), st.sampled_from([0.0, 40e-6]), st.sampled_from([0.0, 0.02]))
 def test_cuts_change_nothing(lengths, kind, lag, creep):
     set_point = np.random.default_rng(2).normal(scale=STROKE, size=sum(lengths))
-    options = {"lag": lag, "creep": creep, "scale": 0.9}
-    whole, cut = make_drive(kind, **options), make_drive(kind, **options)
+    whole, cut = (make_drive(kind, amplifier_lag=lag, creep_per_decade=creep, scale=0.9) for _ in range(2))
     assert np.array_equal(drive(cut, set_point, lengths), drive(whole, set_point))
     assert cut.saturated == whole.saturated
 
@@ -230,81 +183,61 @@ def stage(name="piezo_actuator", **values):
     return PiezoActuator(name, PiezoActuatorParameters.read(name, values))
 
 
-def advance(made, *inputs, lengths=None):
+def advance(made, *inputs):
     """State that a stage makes of its inputs' arrays."""
-    samples = inputs[0].size
-    ports = [port.fields[0] for port in made.inputs]
-    assert len(ports) == len(inputs)
-    state = messages.allocate(messages.STATE, samples)
-
-    def block(first, *parts):
-        rows = len(inputs)
-        given_to = [{field: part} for field, part in zip(ports, parts[:rows], strict=True)]
-        made.advance(first, given_to, [dict(zip(state, parts[rows:], strict=True))])
-
-    in_blocks(lengths or [samples], block, *inputs, *state.values())
+    state = messages.allocate(messages.STATE, inputs[0].size)
+    given_to = [{port.fields[0]: array} for port, array in zip(made.inputs, inputs, strict=True)]
+    made.advance(0, given_to, [state])
     return state
-
-
-def topics(made):
-    return [(port.topic, port.type, port.fields, port.delay) for port in made.inputs]
-
-
-COMMAND = ("fine/command", messages.COMMAND, ("position",), 0)
-REFERENCE = ("reference", messages.REFERENCE, ("expected",), 0)
-
-
-def source(name):
-    return (f"{name}/state", messages.STATE, ("measured_position",), 0)
 
 
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({}, [COMMAND]),
-        ({"use_reference": True}, [COMMAND, REFERENCE]),
+        ({}, ["fine/command"]),
+        ({"use_reference": True}, ["fine/command", "reference"]),
         (
             {"use_command": False, "use_reference": True, "compensates": ["coarse", "vibration"]},
-            [REFERENCE, source("coarse"), source("vibration")],
+            ["reference", "coarse/state", "vibration/state"],
         ),
-        ({"use_command": False, "compensates": ["vibration"]}, [source("vibration")]),
+        ({"use_command": False, "compensates": ["vibration"]}, ["vibration/state"]),
     ],
 )
 def test_stage_reads_what_it_is_asked_for(values, expected):
     made = stage(**values)
-    assert topics(made) == expected
+    assert [port.topic for port in made.inputs] == expected
+    kinds = {
+        "fine/command": (messages.COMMAND, ("position",)),
+        "reference": (messages.REFERENCE, ("expected",)),
+    }
+    state = (messages.STATE, ("measured_position",))
+    assert all((port.type, port.fields) == kinds.get(port.topic, state) for port in made.inputs)
+    assert not any(port.delay for port in made.inputs)
     assert [(output.topic, output.type) for output in made.outputs] == [("fine/state", messages.STATE)]
     compile_kernels(made)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (
-            {"use_command": False},
-            "^piezo.use_command, use_reference, compensates: there is no set point; allowed: one of them or more",
-        ),
-        ({"compensates": ["a", "b", "a"]}, r"^piezo.compensates = \['a', 'b', 'a'\]; allowed: each displacement once"),
-        (
-            {"play_thresholds": [0.1, 0.2]},
-            "^piezo.play_thresholds, play_weights, play_proportional: plays: 2 thresholds and 10 weights",
-        ),
-        ({"play_thresholds": [0.2, 0.1], "play_weights": [0.1, 0.1]}, ": play thresholds"),
-        ({"play_proportional": 0.1, "play_weights": [-0.02] * 10}, ": play weights: slope .* after 5 plays"),
-        (
-            {"hysteresis": "bouc_wen", "bouc_wen_a": 0.8},
-            "^piezo.bouc_wen_a, bouc_wen_beta, bouc_wen_gamma: Bouc-Wen A = 0.8",
-        ),
-        ({"identified_thresholds": [0.1]}, "^piezo.identified_weights: empty"),
-        ({"identified_weights": [0.1]}, "^piezo.identified_thresholds, .*: plays: 10 thresholds and 1 weights"),
-        ({"amplifier_lag": 1e-12}, "^piezo.amplifier_lag, creep_shortest: lag of 1e-12 s"),
-        ({"events": ["revolution 3: freeze"]}, "^piezo.events: event 'freeze'"),
-    ],
+def made_of(**values):
+    return lambda: stage("piezo", **values)
+
+
+@refusals(
+    (made_of(use_command=False), "^piezo.use_command, use_reference, compensates: there is no set point; allowed: one"),
+    (made_of(compensates=["a", "b", "a"]), r"^piezo.compensates = \['a', 'b', 'a'\]; allowed: each displacement once"),
+    (
+        made_of(play_thresholds=[0.1]),
+        "^piezo.play_thresholds, play_weights, play_proportional: plays: 1 thresholds and",
+    ),
+    (made_of(play_thresholds=[0.2, 0.1], play_weights=[0.1, 0.1]), ": play thresholds"),
+    (made_of(play_proportional=0.1, play_weights=[-0.02] * 10), ": play weights: slope .* after 5 plays"),
+    (made_of(hysteresis="bouc_wen", bouc_wen_a=0.8), "^piezo.bouc_wen_a, bouc_wen_beta, bouc_wen_gamma: Bouc-Wen A"),
+    (made_of(identified_thresholds=[0.1]), "^piezo.identified_weights: empty"),
+    (made_of(identified_weights=[0.1]), "^piezo.identified_thresholds, .*: plays: 10 thresholds and 1 weights"),
+    (made_of(amplifier_lag=1e-9), "^piezo.amplifier_lag, creep_shortest: lag of 1e-09 s at a step of .* 1.5625e-08 s,"),
+    (made_of(events=["revolution 3: freeze"]), "^piezo.events: event 'freeze'"),
 )
-def test_stage_refuses_what_cannot_work(values, message):
-    with pytest.raises(InputError, match=message) as refusal:
-        stage("piezo", **values)
-    assert len(str(refusal.value).splitlines()) == 1
+def test_stage_refuses_what_cannot_work(make, message):
+    assert_refused(make, message)
 
 
 def test_direct_compensation_follows_the_error_of_the_same_sample():
@@ -322,30 +255,10 @@ def test_direct_compensation_follows_the_error_of_the_same_sample():
 
 def test_compensated_sine_leaves_the_formula():
     """Δx·(1 - Wpk) of a vibration (paper 001, eq. 6)."""
-    period = 160
-    frequency = 2 * np.pi / (period * STEP)
-    vibration = 1e-6 * np.sin(frequency * np.arange(40 * period) * STEP)
     made = stage(use_command=False, compensates=["vibration"])
-    left = vibration + advance(made, vibration)["position"]
-    expected = 1e-6 * (1 - made.drive.linear.response(frequency))
-    assert_allclose(amplitude(left, frequency, period), expected, rtol=1e-8)
-
-
-@given(cuts)
-def test_cuts_change_nothing_in_the_stage(lengths):
-    random = np.random.default_rng(5)
-    command, coarse = random.normal(scale=STROKE, size=(2, sum(lengths)))
-    values = {"compensates": ["coarse"], "noise_rms": 1e-8, "hysteresis": "bouc_wen"}
-    whole = advance(stage(**values), command, coarse)
-    cut = advance(stage(**values), command, coarse, lengths=lengths)
-    assert all(np.array_equal(whole[name], cut[name]) for name in whole)
-
-
-def test_sensor_measures_with_noise_and_resolution():
-    state = advance(stage(noise_rms=1e-8, resolution=2e-9), np.full(20_000, 5e-6))
-    noise = (state["measured_position"] - state["position"])[1000:]
-    assert noise.std() == pytest.approx(1e-8, rel=0.03)
-    assert_allclose(state["measured_position"] / 2e-9, np.rint(state["measured_position"] / 2e-9), atol=1e-6)
+    left = 1e-6 * SINE + advance(made, 1e-6 * SINE)["position"]
+    expected = 1e-6 * (1 - made.drive.linear.response(FREQUENCY))
+    assert_allclose(amplitude(left, FREQUENCY, PERIOD, STEP), expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("values", [{}, {"hysteresis": "bouc_wen"}, {"hysteresis": "none"}])

@@ -3,9 +3,10 @@
 
 import numpy as np
 import pytest
-from cells import cuts, in_blocks
+from cells import cuts
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import amplitude, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
@@ -25,25 +26,11 @@ def continuous(frequency):
     return np.exp(-p * TAU) / (1 + 2 * ZETA * p / WN + (p / WN) ** 2)
 
 
-def make_drive(*, delay=TAU, stroke=1e9, step=STEP, method="foh"):
-    return ElectrodynamicDrive(
-        natural_frequency=WN,
-        damping=ZETA,
-        delay=delay,
-        stroke=stroke,
-        moving_mass=1.2,
-        force_constant=30.0,
-        step=step,
-        method=method,
-    )
-
-
 def drive(command, lengths=None, **options):
     """Position, velocity and current of a drive."""
-    motion = np.empty((3, command.size))
-    machine = make_drive(**options)
-    in_blocks(lengths or [command.size], lambda _, *parts: machine.block(*parts), command, *motion)
-    return motion
+    values = {"natural_frequency": WN, "damping": ZETA, "delay": TAU, "stroke": 1e9, "moving_mass": 1.2}
+    machine = ElectrodynamicDrive(**values | {"force_constant": 30.0, "step": STEP, "method": "foh"} | options)
+    return run(lambda _, *parts: machine.block(*parts), 3, command, lengths=lengths)
 
 
 # --- frequency response
@@ -56,13 +43,6 @@ def test_foh_is_the_drive_behind_a_linear_interpolator(rate):
     triangle = np.sinc(FREQUENCIES / (2 * np.pi * rate)) ** 2
     assert_allclose(plant.response(FREQUENCIES), continuous(FREQUENCIES) * triangle, rtol=0, atol=1e-4)
     assert_allclose(plant.response(100.0), continuous(100.0), rtol=2e-5)
-
-
-def test_foh_error_falls_with_the_square_of_the_step():
-    steps = np.array([4e-5, 2e-5, 1e-5])
-    plants = [discretise(A, B, TAU, step, "foh") for step in steps]
-    errors = [abs(plant.response(1500.0) - continuous(1500.0)) for plant in plants]
-    assert_allclose(errors / errors[0], (steps / steps[0]) ** 2, rtol=0.01)
 
 
 @pytest.mark.parametrize("samples", [0.0, 23.0, 23.25])
@@ -100,9 +80,8 @@ def test_drive_answers_a_sine_as_its_response_says(method):
     frequency = 2 * np.pi * 200.0  # 320 samples a period
     time = np.arange(12800) * STEP
     position = drive(np.sin(frequency * time), method=method)[0]
-    amplitude = 2 / 320 * (position[-320:] * np.exp(-1j * frequency * time[-320:])).sum() * 1j
-    plant = discretise(A, B, TAU, STEP, method)
-    assert_allclose(amplitude, plant.response(frequency), rtol=1e-9)
+    expected = discretise(A, B, TAU, STEP, method).response(frequency)
+    assert_allclose(amplitude(position, frequency, 320, STEP), expected, rtol=1e-9)
 
 
 # --- time
@@ -120,23 +99,6 @@ def test_foh_is_exact_for_commands_linear_between_samples(eighths):
     assert_allclose(velocity, states[8::8, 1], rtol=1e-9, atol=1e-6)
 
 
-def test_step_response_is_analytic():
-    """After the ramp of one step from sample -1 to 0: the mean over it of the step responses."""
-    whole = 23
-    position = drive(np.ones(3000), delay=whole * STEP)[0]
-    damped = WN * np.sqrt(1 - ZETA**2)
-
-    def ramp(t):
-        """Integral of the unit step response."""
-        t = np.maximum(t, 0.0)
-        decay = np.exp(-ZETA * WN * t)
-        turn = (2 * ZETA**2 - 1) / np.sqrt(1 - ZETA**2)
-        return t - 2 * ZETA / WN + decay / WN * (2 * ZETA * np.cos(damped * t) + turn * np.sin(damped * t))
-
-    t = (np.arange(3000) - whole) * STEP
-    assert_allclose(position, (ramp(t + STEP) - ramp(t)) / STEP, atol=1e-9)
-
-
 def test_current_is_what_the_acceleration_asks_for():
     time = np.arange(6400) * STEP
     _, velocity, current = drive(1e-3 * np.sin(500.0 * time))
@@ -146,9 +108,7 @@ def test_current_is_what_the_acceleration_asks_for():
 
 def test_end_stop_holds_the_carriage_until_it_is_driven_back():
     command = np.where(np.arange(6400) < 3200, 3e-3, -0.5e-3)
-    machine = make_drive(stroke=1e-3)
-    position, velocity, current = np.empty((3, 6400))
-    machine.block(command, position, velocity, current)
+    position, velocity, _ = drive(command, stroke=1e-3)
     at_stop = position == 1e-3
     assert position.max() == 1e-3
     assert np.all(velocity[at_stop] <= 0.0)
@@ -169,14 +129,8 @@ def test_cuts_change_nothing(lengths, method, delay):
 
 
 def sense(true, lengths=None, name="drive", seed=1, noise=0.0, resolution=0.0):
-    sensor, measured = Sensor(noise, resolution, seed, name), np.empty_like(true)
-    in_blocks(lengths or [true.size], lambda _, *parts: sensor.measure(*parts), true, measured)
-    return measured
-
-
-def test_sensor_is_exact_by_default():
-    true = np.random.default_rng(3).normal(size=100)
-    assert np.array_equal(sense(true), true)
+    sensor = Sensor(noise, resolution, seed, name)
+    return run(lambda _, *parts: sensor.measure(*parts), 1, true, lengths=lengths)[0]
 
 
 @given(cuts)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
 from lathe_rc.analysis.shaft import Shaft
-from lathe_rc.errors import InputError
 
 LENGTH, DIAMETER = 0.6, 0.034
 BENDING = 2.1e11 * np.pi * DIAMETER**4 / 64
@@ -47,10 +47,7 @@ def test_compliance_is_that_of_finite_elements(support, head, tail, carriage, tu
 def test_between_centres_it_is_the_formula_of_the_task():
     z = np.linspace(0.0, LENGTH, 31)
     expected = (1 - z / LENGTH) ** 2 / 2e7 + (z / LENGTH) ** 2 / 1e7 + z**2 * (LENGTH - z) ** 2 / (3 * BENDING * LENGTH)
-    shaft = Shaft(LENGTH, DIAMETER, **SPRINGS)
-    assert_allclose(shaft.compliance(z), expected)
-    carried = Shaft(LENGTH, DIAMETER, **SPRINGS, carriage=5e7)
-    assert_allclose(carried.compliance(z) - shaft.compliance(z), 2e-8)
+    assert_allclose(Shaft(LENGTH, DIAMETER, **SPRINGS).compliance(z), expected)
 
 
 @pytest.mark.parametrize(
@@ -69,54 +66,19 @@ def test_rigid_supports_leave_the_beam_of_the_textbook(support, share, expected)
     assert_allclose(compliance * BENDING / LENGTH**3, expected, atol=1e-12)
 
 
-def test_ends_are_the_stocks():
-    assert_allclose(Shaft(LENGTH, DIAMETER, **SPRINGS).compliance([0.0, LENGTH]), [1 / 2e7, 1 / 1e7])
-
-
-def test_chuck_that_turns_freely_is_a_centre():
-    z = np.linspace(0.0, LENGTH, 31)
-    loose = Shaft(LENGTH, DIAMETER, "chuck_and_centre", **SPRINGS, chuck_rotation=1e3)
-    assert_allclose(loose.compliance(z), Shaft(LENGTH, DIAMETER, **SPRINGS).compliance(z), rtol=1e-5)
-
-
-def test_soft_tail_stock_is_none():
-    z = np.linspace(0.0, LENGTH, 31)
-    soft = Shaft(LENGTH, DIAMETER, "chuck_and_centre", head=2e7, tail=1e-3, chuck_rotation=1e-5)
-    alone = Shaft(LENGTH, DIAMETER, "chuck", head=2e7, chuck_rotation=1e-5)
-    assert_allclose(soft.compliance(z), alone.compliance(z), rtol=1e-6)
-
-
-@given(stiffnesses, stiffnesses, st.floats(0.0, 1e-4), st.floats(0.0, 1.0))
-def test_more_support_gives_way_less(head, tail, turn, share):
-    at = share * LENGTH
-    soft, held, clamped = (
-        Shaft(LENGTH, DIAMETER, "chuck", head, tail, chuck_rotation=turn),
-        Shaft(LENGTH, DIAMETER, "chuck_and_centre", head, tail, chuck_rotation=turn),
-        Shaft(LENGTH, DIAMETER, "chuck_and_centre", head, tail),
-    )
-    values = [float(shaft.compliance(at)) for shaft in (soft, held, clamped)]
-    assert values[0] >= values[1] * (1 - 1e-9)
-    assert values[1] >= values[2] * (1 - 1e-9)
-    assert values[2] >= 0.0
-
-
 def test_middle_of_the_example_is_as_soft_as_w3_of_the_paper():
     """The shaft of docs/force_position.md."""
     compliance = Shaft(LENGTH, DIAMETER, **SPRINGS, carriage=5e7).compliance(LENGTH / 2)
     assert float(compliance) == pytest.approx(3.85e-7, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (lambda: Shaft(0.0, 0.1), "shaft: length 0; allowed: above 0"),
-        (lambda: Shaft(0.6, np.inf), "shaft: diameter inf"),
-        (lambda: Shaft(0.6, 0.1, head=0.0), "shaft: stiffness 0 N/m of head; allowed: above 0, inf for rigid"),
-        (lambda: Shaft(0.6, 0.1, "chuck", chuck_rotation=-1.0), "chuck rotation -1"),
-        (lambda: Shaft(0.6, 0.1, chuck_rotation=1e-6), "between centres; a centre holds no moment"),
-        (lambda: Shaft(0.6, 0.1).compliance([0.1, 0.7]), "shaft: height 0.7 m; allowed: 0 to 0.6 m"),
-    ],
+@refusals(
+    (lambda: Shaft(0.0, 0.1), "shaft: length 0; allowed: above 0"),
+    (lambda: Shaft(0.6, np.inf), "shaft: diameter inf"),
+    (lambda: Shaft(0.6, 0.1, head=0.0), "shaft: stiffness 0 N/m of head; allowed: above 0, inf for rigid"),
+    (lambda: Shaft(0.6, 0.1, "chuck", chuck_rotation=-1.0), "chuck rotation -1"),
+    (lambda: Shaft(0.6, 0.1, chuck_rotation=1e-6), "between centres; a centre holds no moment"),
+    (lambda: Shaft(0.6, 0.1).compliance([0.1, 0.7]), "shaft: height 0.7 m; allowed: 0 to 0.6 m"),
 )
-def test_what_cannot_be_is_refused(wrong, message):
-    with pytest.raises(InputError, match=message):
-        wrong()
+def test_what_cannot_be_is_refused(make, message):
+    assert_refused(make, message)
