@@ -13,6 +13,7 @@ from cells import encoder, scenario
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import assert_refused
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness
@@ -21,7 +22,7 @@ from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
 from lathe_rc.signals.counts import CountedAngle, CsvReader, LineReader
 from lathe_rc.view.report_form import Form
@@ -31,16 +32,18 @@ TURN = 2 * np.pi
 LAW = speed.harmonic(104.72, np.array([0.05]), np.array([60.0]), np.array([0.0]))
 
 
-def counted(**changed):
-    given_ = {"counts": COUNTS, "step_ns": STEP_NS, "wraps": 0, "inverted": False, "max_reverse": 2.0, "max_gap": 0.01}
-    return CountedAngle(**{**given_, **changed})
-
-
 def filled(times, counts, **changed):
-    angle = counted(**changed)
-    for time, count in zip(times, counts, strict=True):
-        angle.add(int(time), float(count))
+    """The angle by readings; whole counts as integers, for a double would round them."""
+    given_ = {"counts": COUNTS, "step_ns": STEP_NS, "wraps": 0, "inverted": False, "max_reverse": 2.0, "max_gap": 0.01}
+    angle = CountedAngle(**{**given_, **changed})
+    for time, count in zip(np.asarray(times).tolist(), np.asarray(counts, dtype=object).tolist(), strict=True):
+        angle.add(time, count)
     return angle
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "counts.csv"
 
 
 # --- readers
@@ -60,13 +63,13 @@ _LINES = [b"5", b"1,2,3", b"a,b", b"1.5,2", b"1,--2", b"\xff\xfe,1", b"1,nan", b
 
 @pytest.mark.parametrize("line", [*_LINES, b"%d,2" % 2**63])
 def test_a_line_that_is_no_reading_is_refused_by_name(line):
-    with pytest.raises(InputError, match=r"^line: '.*'; allowed: a time and a counter, as time_ns,counts$"):
-        read(b"1,2\n" + line + b"\n")
+    text = b"1,2\n" + line + b"\n"
+    assert_refused(lambda: read(text), r"^line: '.*'; allowed: a time and a counter, as time_ns,counts$")
 
 
 def test_what_has_no_lines_is_refused():
-    with pytest.raises(InputError, match="1000 bytes without an end of line; allowed: lines of text"):
-        list(LineReader(_Ready([b"x" * 1000]), "line").read())
+    endless = LineReader(_Ready([b"x" * 1000]), "line").read()
+    assert_refused(lambda: list(endless), "1000 bytes without an end of line; allowed: lines of text")
 
 
 class _Ready:
@@ -82,29 +85,23 @@ class _Ready:
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=40))
 def test_lines_come_in_any_pieces(cuts):
     text = b"".join(b"%d,%d\n" % (n, 2 * n) for n in range(20))
-    ends = np.unique(np.minimum(np.cumsum(cuts), len(text)))
-    pieces = [text[a:b] for a, b in zip([0, *ends], [*ends, len(text)], strict=True) if b > a]
-    stream = _Ready(pieces)
-    reader, found = LineReader(stream, "line"), []
-    while stream.pieces:
-        found += reader.read()
-    assert found == [(n, 2.0 * n) for n in range(20)]
+    pieces = [bytes(piece) for piece in np.split(np.frombuffer(text, "S1"), np.cumsum(cuts)) if piece.size]
+    reader = LineReader(_Ready(pieces), "line")
+    found = [reading for _ in pieces.copy() for reading in reader.read()]
+    assert found == [(n, 2 * n) for n in range(20)]
     assert not reader.ended
 
 
 def test_a_terminal_is_read_raw_and_its_first_line_may_lack_its_beginning():
-    """A terminal is read raw; its first line may lack its beginning.
-
-    Nothing is waited for; when the other end has gone the line has ended.
-    """
+    """Nothing is waited for; when the other end has gone the line has ended."""
     ours, theirs = pty.openpty()
-    reader = LineReader.open(os.ttyname(theirs), 115200)
+    name = os.ttyname(theirs)
+    assert_refused(lambda: LineReader.open(name, 12345), r"12345 baud; allowed: .*9600.*115200")
+    reader = LineReader.open(name, 115200)
     os.close(theirs)
-    assert list(reader.read()) == []
-    os.write(ours, b"00,7\n1,2\n3,")
-    assert list(reader.read()) == [(1, 2.0)]
-    os.write(ours, b"4\n")
-    assert list(reader.read()) == [(3, 4.0)]
+    for sent, readings in ((b"", []), (b"00,7\n1,2\n3,", [(1, 2)]), (b"4\n", [(3, 4)])):
+        os.write(ours, sent)
+        assert list(reader.read()) == readings
     os.close(ours)
     assert list(reader.read()) == []
     assert reader.ended
@@ -122,16 +119,6 @@ def test_a_pipe_has_not_ended_before_somebody_writes_to_it(tmp_path):
     reader.close()
 
 
-def test_a_speed_that_a_terminal_has_not_is_refused():
-    ours, theirs = pty.openpty()
-    try:
-        with pytest.raises(InputError, match=r"12345 baud; allowed: .*9600.*115200"):
-            LineReader.open(os.ttyname(theirs), 12345)
-    finally:
-        os.close(ours)
-        os.close(theirs)
-
-
 @pytest.mark.parametrize(
     ("text", "found"),
     [
@@ -140,8 +127,7 @@ def test_a_speed_that_a_terminal_has_not_is_refused():
         (f"\ufefftime_ns,counts\n{2**62},{2**62 + 1}\n", [(2**62, 2**62 + 1)]),
     ],
 )  # fmt: skip
-def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(tmp_path, text, found):
-    path = tmp_path / "counts.csv"
+def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(path, text, found):
     path.write_text(text)
     reader = CsvReader(path)
     assert list(reader.read()) == found
@@ -149,15 +135,12 @@ def test_a_file_says_its_unit_of_time_and_loses_no_nanosecond(tmp_path, text, fo
     assert list(reader.read()) == []
 
 
-def test_a_file_with_another_header_or_line_is_refused(tmp_path):
-    path = tmp_path / "counts.csv"
-    path.write_text("time,counts\n1,2\n")
-    with pytest.raises(InputError, match="header 'time,counts'; allowed: time_ns,counts or time_s,counts"):
-        CsvReader(path)
+def test_a_file_with_another_header_or_line_is_refused(path):
     for row in ("1,x", "0,001;5;", "1e999999999,2"):
         path.write_text(f"time_s,counts\n1,2\n{row}\n")
-        with pytest.raises(InputError, match=rf"counts.csv:3: '{row}'; allowed"):
-            list(CsvReader(path).read())
+        assert_refused(lambda: list(CsvReader(path).read()), rf"counts.csv:3: '{row}'; allowed")
+    path.write_text("time,counts\n1,2\n")
+    assert_refused(lambda: CsvReader(path), "header 'time,counts'; allowed: time_ns,counts or time_s,counts")
 
 
 # --- the angle
@@ -172,17 +155,15 @@ def test_angle_is_linear_between_readings_and_begins_within_a_revolution():
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
 def test_pieces_change_no_bit_of_the_angle(cuts, seed):
     random = np.random.default_rng(seed)
-    times = np.cumsum(random.integers(1, 200_000, 60))
-    counts = np.cumsum(random.integers(0, 9, 60))
+    times, counts = np.cumsum(random.integers(1, 200_000, 60)), np.cumsum(random.integers(0, 9, 60))
     whole = filled(times, counts)
     expected = whole.take(0, whole.available)
-    angle, found = counted(), []
-    for time, count, cut in zip(times, counts, itertools.cycle(cuts), strict=False):
-        angle.add(int(time), float(count))
-        size = min(cut, angle.available - sum(map(len, found)))
-        found.append(angle.take(sum(map(len, found)), size))
-    found.append(angle.take(sum(map(len, found)), angle.available - sum(map(len, found))))
-    assert np.array_equal(np.concatenate(found), expected)
+    angle, found = filled([], []), np.empty(0)
+    for time, count, cut in zip(times.tolist(), counts.tolist(), itertools.cycle(cuts), strict=False):
+        angle.add(time, count)
+        found = np.append(found, angle.take(found.size, min(cut, angle.available - found.size)))
+    found = np.append(found, angle.take(found.size, angle.available - found.size))
+    assert np.array_equal(found, expected)
     assert np.all(np.diff(expected) >= 0.0)
 
 
@@ -203,41 +184,42 @@ def test_a_counter_that_begins_anew_goes_on(inverted, wraps):
 def test_counts_far_from_0_keep_their_digits(start, changed):
     """The angle is that of small counts, to the bit."""
     sign, wraps = -1 if "inverted" in changed else 1, changed.get("wraps", 0)
-    near, far = (
-        filled_exactly([sign * (first + count) for count in range(0, 2100, 7)], wraps, changed)
-        for first in (start % COUNTS, start)
-    )
+    angles = []
+    for first in (start % COUNTS, start):
+        counts = [sign * (first + count) for count in range(0, 2100, 7)]
+        sent = [count % wraps for count in counts] if wraps else counts
+        angle = filled(1_000_000 * np.arange(300), sent, **changed)
+        angles.append(angle.take(0, angle.available))
     if not wraps:
-        assert np.array_equal(near, far)
-    assert_allclose(np.diff(near), np.diff(far), atol=1e-9)
+        assert np.array_equal(*angles)
+    assert_allclose(*np.diff(angles), atol=1e-9)
 
 
-def filled_exactly(counts, wraps, changed):
-    """The angle by counts, a millisecond apart, that are no doubles."""
-    angle = counted(**changed)
-    for n, count in enumerate(counts):
-        angle.add(n * 1_000_000, count % wraps if wraps else count)
-    return angle.take(0, angle.available)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        *(
+            (lambda count=count: filled([0], [count]), r"^counter of .* at 0 ns; allowed: finite numbers up to 2\^64$")
+            for count in (np.nan, -np.inf, 1e20, 10**250)
+        ),
+        (
+            lambda: filled([0, 5_000_000, 20_500_000], [0, 1, 9]),
+            "^no counts from 0.005 to 0.0205 s, for 15.5 ms; allowed: up to max_gap = 10 ms$",
+        ),
+        (
+            lambda: filled(np.arange(6) * STEP_NS, [10, 12, 11, 10, 13, 10]),
+            "gone back by 3 counts at 7.8125e-05 s; allowed: up to max_reverse = 2",
+        ),
+    ],
+)
+def test_readings_that_no_encoder_gives_are_an_error(make, message):
+    with pytest.raises(LatheError, match=message):
+        make()
 
 
-@pytest.mark.parametrize("count", [np.nan, -np.inf, 1e20, 10**30, 10**250])
-def test_a_number_that_no_counter_has_is_an_error(count):
-    with pytest.raises(LatheError, match=r"^counter of .* at 0 ns; allowed: finite numbers up to 2\^64$"):
-        counted().add(0, count)
-
-
-def test_a_gap_is_an_error_that_names_the_time():
-    angle = filled([0, 5_000_000], [0, 1])
-    with pytest.raises(LatheError) as refused:
-        angle.add(20_500_000, 9.0)
-    assert str(refused.value) == "no counts from 0.005 to 0.0205 s, for 15.5 ms; allowed: up to max_gap = 10 ms"
-
-
-def test_the_angle_stands_while_the_counter_trembles_and_a_spindle_that_turns_back_is_an_error():
+def test_the_angle_stands_while_the_counter_trembles():
     angle = filled(np.arange(5) * STEP_NS, [10, 12, 11, 10, 13])
     assert_allclose(angle.take(0, 5) * COUNTS / TURN, [10, 12, 12, 12, 13])
-    with pytest.raises(LatheError, match=r"gone back by 3 counts at 7.8125e-05 s; allowed: up to max_reverse = 2"):
-        angle.add(5 * STEP_NS, 10.0)
 
 
 def test_a_reading_that_comes_after_a_younger_one_is_left_out_and_counted():
@@ -269,20 +251,13 @@ def write_counts(path, seconds=0.4, every=5e-4, law=LAW, first=7 * 10**17):
 
 def follower(path, **changed):
     """The smallest cell with an encoder in the place of the spindle."""
-    device = {
-        "source": "file",
-        "counts_file": str(path),
-        "counts_per_revolution": COUNTS,
-        "revolutions": 5.0,
-        **changed,
-    }
-    nodes = dict(scenario(encoder_device=device, learning_controller={"feedback_delay": 2048}).nodes)
+    device = {"source": "file", "counts_file": str(path), "counts_per_revolution": COUNTS, "revolutions": 5.0}
+    nodes = dict(scenario(encoder_device=device | changed, learning_controller={"feedback_delay": 2048}).nodes)
     del nodes["spindle_encoder"]
     return Scenario("device", nodes)
 
 
-def test_a_cell_learns_by_a_file_of_counts(tmp_path):
-    path = tmp_path / "counts.csv"
+def test_a_cell_learns_by_a_file_of_counts(path):
     write_counts(path)
     result = harness.run(follower(path))
     signals = encoder(result)
@@ -297,76 +272,66 @@ def test_a_cell_learns_by_a_file_of_counts(tmp_path):
     assert result.errors.rms[-1] < 0.1 * result.errors.rms[0]
 
 
-def test_block_size_changes_no_bit_of_what_follows_a_file(tmp_path):
-    path = tmp_path / "counts.csv"
-    write_counts(path, 0.2)
-    runs = [follower(path, revolutions=2.0), follower(path, revolutions=2.0)]
-    other = Scenario("device", {n: t.model_copy(update={"block_size": 37}) for n, t in runs[1].nodes.items()})
-    assert harness.run(runs[0]).digest == harness.run(other).digest
-
-
-def test_without_revolutions_a_run_is_as_long_as_its_file(tmp_path):
-    path = tmp_path / "counts.csv"
+def test_a_run_is_as_long_as_its_file_in_blocks_of_any_size(path):
     last = write_counts(path, 0.1)
-    assert harness.run(follower(path, revolutions=0.0)).samples == round(last * 1e9) // STEP_NS + 1
+    cell = follower(path, revolutions=0.0)
+    whole = harness.run(cell)
+    assert whole.samples == round(last * 1e9) // STEP_NS + 1
+    other = Scenario("device", {n: t.model_copy(update={"block_size": 37}) for n, t in cell.nodes.items()})
+    assert harness.run(other).digest == whole.digest
 
 
-def test_events_tell_of_speeds_that_the_checks_did_not_count_on(tmp_path):
-    path = tmp_path / "counts.csv"
+def test_events_tell_of_speeds_that_the_checks_did_not_count_on(path):
     write_counts(path, 0.2)
     result = harness.run(follower(path, revolutions=2.0, max_deviation=0.02))
     said = [found.text.partition(":")[0] for found in result.event_log if found.topic == "/encoder_device/events"]
     assert sorted(said) == ["too fast", "too slow"]
-    with pytest.raises(InputError, match="at 199 rad/s the cycle leaves"):
-        harness.run(follower(path, revolutions=2.0, max_deviation=0.9))
 
 
-def test_a_file_of_counts_is_part_of_the_scenario(tmp_path):
-    path = tmp_path / "counts.csv"
-    write_counts(path, 0.1)
-    cell = tmp_path / "cell.yaml"
-    cell.write_text(
-        "/encoder_device: {ros__parameters: {source: file, counts_file: counts.csv, counts_per_revolution: 1000}}"
-    )
-    loaded = scenarios.load(cell)
-    assert harness.run(loaded).samples > 6000
-    write_counts(path, 0.09)
-    assert scenarios.load(cell).shared.run_id != loaded.shared.run_id
+def test_a_file_of_counts_is_part_of_the_scenario(path):
+    cell, ids = path.with_name("cell.yaml"), set()
+    device = "{source: file, counts_file: counts.csv, counts_per_revolution: 1000}"
+    cell.write_text(f"/encoder_device: {{ros__parameters: {device}}}")
+    for seconds in (0.1, 0.09):
+        write_counts(path, seconds)
+        loaded = scenarios.load(cell)
+        ids.add(loaded.shared.run_id)
+    assert len(ids) == 2
+    assert harness.run(loaded).samples > 5000
+
+
+EVENT = {"allow_faults": True, "events": ["revolution 1: repair encoder"]}
 
 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        (
-            {"revolutions": 50.0},
-            r"ends at 0.0995 s, after 1\.6\d+ revolutions; encoder_device.revolutions = 50, allowed",
-        ),
+        ({"revolutions": 50.0}, r"at 0.0995 s, after 1\.6\d+ revolutions; encoder_device.revolutions = 50, allowed"),
         ({"max_gap": 1e-4}, r"counts.csv: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap = 0.1 ms"),
         ({"inverted": True}, r"counts.csv: the encoder has gone back by"),
+        ({"max_deviation": 0.9}, "at 199 rad/s the cycle leaves"),
         ({"counts_file": ""}, r"encoder_device.counts_file is empty with source = file; allowed: a name"),
         ({"source": "line"}, r"encoder_device.device is empty with source = line; allowed: a name"),
         ({"source": "topic", "speed_factor": 0.0}, r"speed_factor = 0 with source = topic; allowed: 1"),
         ({"source": "topic"}, r"follows a device, which a node hears; allowed: --mode composed or processes"),
         ({"source": "topic", "revolutions": 0.0}, r"encoder_device.revolutions = 0; this run needs an end"),
-        (
-            {"source": "topic", "allow_faults": True, "events": ["revolution 1: repair encoder"]},
-            r"nobody knows when 1 rev",
-        ),
+        ({"source": "topic", **EVENT}, r"nobody knows when 1 rev"),
     ],
 )
-def test_what_cannot_work_is_refused_in_one_line(tmp_path, changed, message):
-    path = tmp_path / "counts.csv"
+def test_what_cannot_work_is_refused_in_one_line(path, changed, message):
     write_counts(path, 0.1)
-    with pytest.raises(InputError, match=message) as refused:
-        harness.run(follower(path, **{"revolutions": 1.0, **changed}))
-    assert "\n" not in str(refused.value)
+    assert_refused(lambda: harness.run(follower(path, **{"revolutions": 1.0, **changed})), message)
 
 
-def test_a_file_whose_times_do_not_rise_is_refused(tmp_path):
-    path = tmp_path / "counts.csv"
+def test_what_its_file_or_its_controller_cannot_have_is_refused(path):
+    write_counts(path, 0.1)
+    nodes = dict(follower(path, revolutions=1.0).nodes)
+    nodes["learning_controller"] = nodes["learning_controller"].model_copy(update={"lead_law": "exact_preview"})
+    unknown = "exact_preview, but nobody knows the speed of encoder_device in advance"
+    assert_refused(lambda: harness.run(Scenario("device", nodes)), unknown)
     path.write_text("time_ns,counts\n0,0\n1000000,2\n1000000,3\n2000000,5\n")
-    with pytest.raises(InputError, match="1 readings are not later than those before them; allowed: times that rise"):
-        harness.run(follower(path, revolutions=0.0))
+    late = "1 readings are not later than those before them; allowed: times that rise"
+    assert_refused(lambda: harness.run(follower(path, revolutions=0.0)), late)
 
 
 def still(*pieces):
@@ -374,64 +339,47 @@ def still(*pieces):
     return np.cumsum(np.concatenate([np.full(readings, step, dtype=float) for readings, step in pieces])).astype(int)
 
 
+def write_rows(path, counts):
+    path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))
+
+
 @pytest.mark.parametrize(
     "counts",
     [
-        still((1, 0), (1, 0), (200, 17)),
         still((100, 0), (200, 17)),
-        still((100, 17), (50, 0), (150, 17)),
         still((100, 17), (50, 0), (50, 17), (50, 0), (100, 17)),
         still((200, 17), (100, 0)),
         still((120, 17), (1, 0), (120, 17)),
         still((50, 0), (2, 1), (3, 0), (200, 17)),
         still((100, 0.01), (200, 17)),
-        still((100, 0), *[(1, step) for step in range(17)], (200, 17)),
-        17 * (still((250, 17)) // 17 // 2 * 2),
-        20 * (still((250, 17)) // 20),
         50 * (still((250, 17)) // 50),
     ],
 )
-def test_what_stands_still_is_turned_and_measured(tmp_path, counts):
-    path = tmp_path / "counts.csv"
-    path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))
-    result = harness.run(follower(path, revolutions=0.0))
-    found = result.part
+def test_what_stands_still_is_turned_and_measured(path, counts):
+    write_rows(path, counts)
+    found = harness.run(follower(path, revolutions=0.0)).part
     assert found.form.rms.size == found.profile.shape[0] == int(counts[-1] / COUNTS + 1e-3) > 0
     assert np.all(np.isfinite(found.form.rms))
     assert np.abs(found.profile).max() < 1.1 * found.form.largest.max()
     assert_allclose(np.sqrt((found.profile**2).mean(axis=1)), found.form.rms, rtol=0.02)
 
 
-def test_a_bag_with_a_standstill_goes_through_every_command(tmp_path):
-    """Every command takes the bag of a run with a standstill.
-
-    The tachogram says how long the spindle stands; a re-simulation gives the events, too.
-    """
-    path, bag = tmp_path / "counts.csv", tmp_path / "bag"
-    counts = still((50, 0), (80, 17), (20, 0), (80, 17))
-    path.write_text("\n".join(["time_s,counts", *(f"{n / 1000},{count}" for n, count in enumerate(counts))]))
+def test_a_bag_with_a_standstill_goes_through_every_command(path, tmp_path):
+    """The tachogram says how long the spindle stands; a re-simulation gives the events, too."""
+    bag = tmp_path / "bag"
+    write_rows(path, still((50, 0), (80, 17), (20, 0), (80, 17)))
     result = harness.run(follower(path, revolutions=0.0), bag=bag)
     assert [event.text.partition(":")[0] for event in result.event_log] == ["too slow"]
-    again = resimulate(bag)
-    assert not again.different
-    said = {}
-    for words in (["info"], ["tachogram", "-o", tmp_path / "speed.csv"]):
-        done = CliRunner().invoke(main, ["bag", words[0], str(bag), *map(str, words[1:]), "--json"])
-        said[words[0]] = json.loads(done.stdout)
-    last = said["info"]["error_um"]["last"]
-    assert last["rms"] == pytest.approx(result.errors.rms[-1] * 1e6, rel=0.01)
-    assert (said["tachogram"]["standstill"], said["tachogram"]["stands_from"]) == pytest.approx((0.067, 1e-3), abs=2e-4)
+    assert not resimulate(bag).different
+    info, stands = (
+        json.loads(CliRunner().invoke(main, ["bag", *map(str, words), "--json"]).stdout)
+        for words in (("info", bag), ("tachogram", bag, "-o", tmp_path / "speed.csv"))
+    )
+    rms = info["error_um"]["last"]["rms"]
+    assert rms == pytest.approx(result.errors.rms[-1] * 1e6, rel=0.01)
+    assert (stands["standstill"], stands["stands_from"]) == pytest.approx((0.067, 1e-3), abs=2e-4)
     form = Form("/encoder", "/tool")
     stream.feed(bag, [form])
     form.finish()
     assert form.refused == ""
-    assert form.last.numbers["rms"] == pytest.approx(last["rms"], rel=0.01)
-
-
-def test_a_lead_law_that_must_know_the_speed_in_advance_is_refused(tmp_path):
-    path = tmp_path / "counts.csv"
-    write_counts(path, 0.2)
-    nodes = dict(follower(path, revolutions=2.0).nodes)
-    nodes["learning_controller"] = nodes["learning_controller"].model_copy(update={"lead_law": "exact_preview"})
-    with pytest.raises(InputError, match="exact_preview, but nobody knows the speed of encoder_device in advance"):
-        harness.run(Scenario("device", nodes))
+    assert form.last.numbers["rms"] == pytest.approx(rms, rel=0.01)

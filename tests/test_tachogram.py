@@ -2,6 +2,7 @@
 """Tachograms: read from a file as speed law, and made from a recorded run."""
 
 import json
+import re
 from decimal import Decimal
 
 import numpy as np
@@ -10,15 +11,25 @@ from cells import encoder, scenario
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import assert_refused
 
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError
 from lathe_rc.signals import tachogram
 
 SWING = {"deviation_amplitude": [0.1], "deviation_frequency": [60.0], "revolutions": 4.0}
 FILE = "time_s,rpm\n0.0,1000\n0.1,1100\n0.3,900\n"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "speed.csv"
+
+
+def turned(**spindle):
+    """A run of the smallest cell."""
+    return harness.run(scenario(spindle_encoder=spindle))
 
 
 @given(
@@ -42,27 +53,24 @@ def test_lines_stay_within_the_tolerance_of_every_point_however_they_come(values
 
 def test_a_straight_record_is_two_points_however_long():
     thinner = tachogram.Thinner(1e-3)
-    for start in range(0, 1_000_000, 64):
+    for start in range(0, 320_000, 64):
         thinner.add(np.arange(start, start + 64) * 1e-5, np.full(64, 1000.0))
-    assert thinner.finish()[0].tolist() == pytest.approx([0.0, 9.99999])
+    assert thinner.finish()[0].tolist() == pytest.approx([0.0, 3.19999])
 
 
-def test_the_file_gives_the_law_of_both_lists(tmp_path):
-    path = tmp_path / "speed.csv"
+def test_the_file_gives_the_law_of_both_lists(path):
     path.write_text(FILE)
     lists = {"tachogram_time": [0.0, 0.1, 0.3], "tachogram_deviation": [0.0, 1100 / 1000 - 1, 900 / 1000 - 1]}
-    of_file = harness.run(scenario(spindle_encoder={"tachogram_file": str(path), "revolutions": 4.0}))
-    of_lists = harness.run(scenario(spindle_encoder={**lists, "revolutions": 4.0}))
-    assert of_file.digest == of_lists.digest
+    assert turned(tachogram_file=str(path), revolutions=4.0).digest == turned(**lists, revolutions=4.0).digest
 
 
-def test_the_file_s_content_is_part_of_the_run_s_identity(tmp_path):
-    (tmp_path / "speed.csv").write_text(FILE)
-    cell = tmp_path / "cell.yaml"
+def test_the_file_s_content_is_part_of_the_run_s_identity(path, tmp_path):
+    cell, ids = tmp_path / "cell.yaml", set()
     cell.write_text("/spindle_encoder: {ros__parameters: {tachogram_file: speed.csv, revolutions: 2.0}}")
-    before = load(cell).shared.run_id
-    (tmp_path / "speed.csv").write_text(FILE.replace("1100", "1101"))
-    assert load(cell).shared.run_id != before
+    for text in (FILE, FILE.replace("1100", "1101")):
+        path.write_text(text)
+        ids.add(load(cell).shared.run_id)
+    assert len(ids) == 2
 
 
 @pytest.mark.parametrize(
@@ -71,9 +79,7 @@ def test_the_file_s_content_is_part_of_the_run_s_identity(tmp_path):
         ("time_s,rpm\n", "no row; allowed: one or more of time_s,rpm"),
         ("time,rpm\n0,1\n", "header 'time,rpm'; allowed: time_s,rpm"),
         ("time_s,rpm\n0,1000\n1,1000\n1,900\n", "row 3 is 0 s after the one before; allowed: times that rise"),
-        ("time_s,rpm\n5,1000\n4,900\n", "row 2 is -1 s after the one before; allowed: times that rise"),
         ("time_s,rpm\n0,1000\n0.5,0\n", "rpm = 0 in row 2, 0.5 s after the first; allowed: above 0"),
-        ("time_s,rpm\n0,-1000\n", "rpm = -1000 in row 1, 0 s after the first; allowed: above 0"),
         ("time_s\trpm\n0\t1000\n", "allowed: time_s,rpm (parted by commas, decimals with a point)"),
         ("time_s,rpm\n0,16.7\n1,16.6\n", "rpm is 16.65 in the middle, with nominal_rpm = 1000, which looks like rev"),
         ("time_s,rpm\n0,1\n1,15\n2,16\n3,17\n", "(multiply by 60, or set nominal_rpm = 15.5 if it is)"),
@@ -81,26 +87,16 @@ def test_the_file_s_content_is_part_of_the_run_s_identity(tmp_path):
         ("time_s,rpm\n0,6000\n", "looks like degrees per second; allowed: 1/min (multiply by 0.1667, or set nominal_r"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
-    path = tmp_path / "speed.csv"
+def test_a_bad_file_is_refused_in_one_line(path, text, message):
     path.write_text(text)
-    with pytest.raises(InputError) as refused:
-        harness.run(scenario(spindle_encoder={"tachogram_file": str(path)}))
-    assert message in str(refused.value)
-    assert str(path) in str(refused.value)
-    assert "\n" not in str(refused.value)
+    assert_refused(lambda: turned(tachogram_file=str(path)), f"{re.escape(str(path))}.*{re.escape(message)}")
 
 
-@pytest.mark.parametrize(
-    "start", ["1700000000", "1700000000.000000125", "-3.5", "0.25", f"{2**52}", "1e9", "+86400.0", "36e2", "1e-9", "7"]
-)
-def test_a_file_begins_at_its_first_row_whatever_its_clock_shows(tmp_path, start):
-    path, times = tmp_path / "speed.csv", ("0", "0.1000000001", "0.3")
-    rows = [f"{Decimal(start) + Decimal(time)},{rpm}" for time, rpm in zip(times, (1000, 1100, 900), strict=True)]
+@pytest.mark.parametrize("start", ["1700000000.000000125", "-3.5", f"{2**52}", "1e9", "+86400.0", "1e-9", "7"])
+def test_a_file_begins_at_its_first_row_whatever_its_clock_shows(path, start):
+    rows = [f"{Decimal(start) + Decimal(time)},{rpm}" for time, rpm in (("0", 1000), ("0.1000000001", 1100))]
     path.write_text("\n".join(["time_s,rpm", *rows]))
-    time, rpm = tachogram.read(path)
-    assert time.tolist() == [0.0, 0.1000000001, 0.3]
-    assert rpm.tolist() == [1000.0, 1100.0, 900.0]
+    assert [column.tolist() for column in tachogram.read(path)] == [[0.0, 0.1000000001], [1000.0, 1100.0]]
 
 
 @pytest.mark.parametrize(
@@ -109,56 +105,41 @@ def test_a_file_begins_at_its_first_row_whatever_its_clock_shows(tmp_path, start
         ({"revolutions": 4.9}, []),
         (
             {"revolutions": 9.0},
-            ["tachogram_file ends 0.3 s after its first row, the run at 0.56112 s: the spindle goes on at 900 rpm"],
+            ["tachogram_file ends 0.3 s after its first row, the run at 0.56112 s: the spindle"],
         ),
         (
             {"tachogram_file": "", "tachogram_time": [1.7e9, 1.7e9 + 1], "tachogram_deviation": [0.1, 0.2]},
             ["tachogram_time begins at 1700000000 s, after the end of the run at 0.10909 s: the spindle turns at 1100"],
         ),
-        ({"tachogram_file": "", "tachogram_time": [0.05], "tachogram_deviation": [0.1]}, []),
     ],
 )
-def test_a_tachogram_that_does_not_meet_the_run_is_told(tmp_path, changed, said):
-    """A tachogram that is too short for the run is reported before the start and in the result.
-
-    Before the start, and in the result.
-    """
-    (tmp_path / "speed.csv").write_text(FILE.replace("\n0.", "\n7."))
+def test_a_tachogram_that_does_not_meet_the_run_is_told(path, changed, said):
+    """A tachogram that is too short for the run is reported before the start and in the result."""
+    path.write_text(FILE.replace("\n0.", "\n7."))
     events = []
-    changed = {"tachogram_file": str(tmp_path / "speed.csv"), "revolutions": 2.0, **changed}
-    result = harness.run(scenario(spindle_encoder=changed), watch=events.append)
+    spindle = {"tachogram_file": str(path), "revolutions": 2.0, **changed}
+    result = harness.run(scenario(spindle_encoder=spindle), watch=events.append)
     assert len(result.summary()["warnings"]) == len(said)
     assert all(line.startswith(f"spindle_encoder.{start}") for line, start in zip(result.warnings, said, strict=True))
     assert [event["message"] for event in events if event["event"] == "warning"] == result.warnings
 
 
-def test_a_file_beside_the_lists_is_refused(tmp_path):
-    both = {"tachogram_file": str(tmp_path / "speed.csv"), "tachogram_time": [0.0], "tachogram_deviation": [0.1]}
-    with pytest.raises(InputError, match=r"speed\.csv beside tachogram_time; allowed: one of them"):
-        harness.run(scenario(spindle_encoder=both))
+def test_a_file_beside_the_lists_is_refused(path):
+    both = {"tachogram_file": str(path), "tachogram_time": [0.0], "tachogram_deviation": [0.1]}
+    assert_refused(lambda: turned(**both), r"speed\.csv beside tachogram_time; allowed: one of them")
 
 
-def test_a_recorded_speed_comes_back_within_the_tolerance(tmp_path):
-    """A tachogram of a bag keeps its tolerance, and the run that follows it has the recorded speed.
-
-    By the command; the run that follows the file has the recorded speed at every sample.
-    """
+def test_a_recorded_speed_comes_back_within_the_tolerance(path, tmp_path):
+    """A tachogram of a bag keeps its tolerance, and the run that follows it has the recorded speed."""
     first = harness.run(scenario(spindle_encoder=SWING), bag=tmp_path / "bag")
-    path = tmp_path / "speed.csv"
     words = ["bag", "tachogram", str(tmp_path / "bag"), "-o", str(path), "--tolerance", "0.5", "--json"]
-    said = CliRunner().invoke(main, words, catch_exceptions=False)
-    told = json.loads(said.output)
-    again = harness.run(scenario(spindle_encoder={"tachogram_file": str(path), "revolutions": 3.9}))
+    told = json.loads(CliRunner().invoke(main, words, catch_exceptions=False).output)
+    again = turned(tachogram_file=str(path), revolutions=3.9)
     speed, recorded = encoder(again)["speed_true"], encoder(first)["speed_true"]
     difference = np.abs(speed - recorded[: speed.size]).max() * 30 / np.pi
     assert told["samples"] == first.samples
     assert told["points"] == len(path.read_text().splitlines()) - 2 < 60
     assert difference <= told["largest"] <= 0.5
-
-
-def test_a_bag_without_an_encoder_of_that_name_is_refused(tmp_path):
-    harness.run(scenario(spindle_encoder={"revolutions": 0.2}), bag=tmp_path / "bag")
-    said = CliRunner().invoke(main, ["bag", "tachogram", str(tmp_path / "bag"), "--topic", "/other"])
-    assert (said.exit_code, said.output.strip()) == (
-        2, f"lathe: --topic /other: {tmp_path / 'bag'} has no such encoder; allowed: /encoder",
-    )  # fmt: skip
+    refused = CliRunner().invoke(main, [*words[:3], "--topic", "/other"])
+    message = f"lathe: --topic /other: {tmp_path / 'bag'} has no such encoder; allowed: /encoder"
+    assert (refused.exit_code, refused.output.strip()) == (2, message)
