@@ -189,13 +189,6 @@ def test_loop_over_the_deflection_is_the_linear_one(elasticity, lag):
     assert_allclose(change, expected, atol=2e-5 * np.abs(expected).max())
 
 
-def test_deflection_is_w3_of_the_force():
-    out = cut(make(elasticity=REALISTIC, lag=5e-3), 5000)
-    expected = np.empty(5000)
-    LinearSystem(REALISTIC.transfer, STEP).block(out["force"], expected)
-    assert_allclose(out["deflection"], expected, rtol=1e-9, atol=1e-18)
-
-
 def test_presets_are_the_modes_that_the_spec_says():
     for elasticity, hertz, damping, away in ((PAPER, 2.9, 0.0046, False), (REALISTIC, 53.0, 0.0833, True)):
         pole = elasticity.transfer.poles[0]

@@ -95,12 +95,11 @@ def test_position_does_not_depend_on_the_command_of_its_sample(commands, other):
 
 def test_command_is_cut_off_and_counted():
     command = 2.0 * np.sin(np.arange(1000) / 50)
-    machine, clipped = FeedDrive(sampled(), step=COARSE, command_limit=1.5), FeedDrive(sampled(), step=COARSE)
+    machine = FeedDrive(sampled(), step=COARSE, command_limit=1.5)
     position, _, effort, *_ = run(machine, command)
-    assert np.array_equal(effort, command.clip(-1.5, 1.5))
-    assert np.array_equal(position, run(clipped, command.clip(-1.5, 1.5))[0])
+    assert_array_equal(effort, command.clip(-1.5, 1.5))
+    assert_array_equal(position, run(FeedDrive(sampled(), step=COARSE), effort)[0])
     assert machine.saturated == np.count_nonzero(np.abs(command) > 1.5) > 0
-    assert clipped.saturated == 0
 
 
 @given(st.sampled_from(list(MODELS)), st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=6))
