@@ -30,8 +30,8 @@ Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of proc
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.chip import (
@@ -49,10 +49,8 @@ from lathe_rc.plants.chip import (
     pressed_by,
 )
 from lathe_rc.plants.cutting_force import RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
-from lathe_rc.plants.workpiece import HardSpot, Part
+from lathe_rc.plants.workpiece import HardSpot, Part, spot_rows
 from lathe_rc.transfer import System, TransferFunction, discretise, rest
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _NEW_EDGE, _NO_DAMPING = Wear(), Flank()
@@ -89,7 +87,7 @@ def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) 
 
 
 def _instant(system: System) -> float:
-    """The change of the output for a unit of the input of the same sample."""
+    """Change of the output for a unit of the input in the same sample."""
     return float(system.through + system.output @ system.now)
 
 
@@ -141,7 +139,7 @@ class CuttingProcess:
         flank: Flank = _NO_DAMPING,
         step: float,
     ) -> None:
-        least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
+        least = float(f"{step / 1000.0:g}")  # the rounded number of the message is itself allowed
         if not (lag == 0.0 or least <= lag < np.inf):
             raise InputError(f"cutting: lag {lag:g} s at a step of {step:g} s; allowed: 0 or at least {least:g} s")
         if not 0.0 <= overlap <= 1.0:
@@ -155,6 +153,7 @@ class CuttingProcess:
         heights, compliances = part.heights, part.compliances
         if heights is None or compliances is None:
             heights, compliances = np.zeros(1), np.array([elasticity.compliance])
+        # Without damage: each call of `damage` starts from it, so that a repair takes all of it back.
         self._whole = Process(
             step=step,
             depth=depth,
@@ -169,7 +168,7 @@ class CuttingProcess:
             mode=mode,
             mode_now=_instant(mode),
             gaps=np.array(part.gaps, dtype=np.float64).reshape(-1, 2),
-            spots=np.array([spot.row for spot in part.hard_spots], dtype=np.float64).reshape(-1, 5),
+            spots=spot_rows(part.hard_spots),
             heights=np.ascontiguousarray(heights, dtype=np.float64),
             compliances=np.ascontiguousarray(compliances, dtype=np.float64),
             grid=grid,
@@ -183,11 +182,9 @@ class CuttingProcess:
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
-        """Let the edge be shorter [m] than it was made, and the part further hard spots; nothing given: neither."""
-        further = np.array([spot.row for spot in spots], dtype=np.float64).reshape(-1, 5)
-        process = self._whole._replace(
-            depth=self._whole.depth - shorter, spots=np.concatenate((self._whole.spots, further))
-        )
+        """Shorten the edge [m] against its first length, and add hard spots to those of the part; default: neither."""
+        all_spots = np.concatenate((self._whole.spots, spot_rows(spots)))
+        process = self._whole._replace(depth=self._whole.depth - shorter, spots=all_spots)
         self.table = self.table._replace(process=process)
 
     def block(self, **arrays: Array) -> None:

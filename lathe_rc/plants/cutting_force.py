@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force of the cut and what it does to the edge: material, wear, flank, elasticity.
+"""Cutting force: material, wear of the tool, flank, elasticity of the edge.
 
     Pz = kc1·ap·f0·(f/f0)^{1-mc}·(1 + cw·VB),  f0 = 1 mm                        (Kienzle, with wear)
 
@@ -70,7 +70,7 @@ class Wear(NamedTuple):
 
 
 class Flank(NamedTuple):
-    """The flank that presses on the surface: process damping.
+    """Process damping: the flank presses on the surface.
 
     Attributes:
         pressure: Ksp, force by the volume that is pressed in [N/m³]; 0: no process damping.

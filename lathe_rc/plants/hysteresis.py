@@ -22,16 +22,15 @@ sample by sample; it exists while dy/du = g·(1 - dh/du) is positive, which is 2
 Source: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation has to remove.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.signals.checks import stacked
 
 #: Ten plays; with them the loop over ±1 is 13 % of its height wide and ends at ±1.
 THRESHOLDS = np.arange(1, 11) / 11
@@ -42,30 +41,13 @@ _LINEAR, PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3  #: kinds of a `Law`
 
 
 class Law(NamedTuple):
-    """An operator as kernels take it: which one, and its constants; its state is an array of its own."""
+    """Operator for kernels: its kind and constants; its state is an array of its own."""
 
     kind: int
     table: Array
 
 
 LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; it has no state
-
-
-class Hysteresis(Protocol):
-    """An operator with memory, at rest at 0 when made.
-
-    Attributes:
-        law: for kernels that step it themselves, see `advance`.
-        state: its memory, shape (n,).
-        steepest: largest slope dy/du that it can have.
-    """
-
-    law: Law
-    state: Array
-    steepest: float
-
-    def block(self, value: Array, result: Array) -> None:
-        """Step through a block; relative input and output, shape (n,)."""
 
 
 @kernel
@@ -91,7 +73,7 @@ def _travel(rate: float, relaxed: float) -> float:
 def _move(h: float, travel: float, shape: Array) -> float:
     """The hysteretic part after ``travel`` >= 0; positive in the direction of travel, as ``h`` is."""
     a, beta, gamma = shape[0], shape[1], shape[2]
-    if h < 0.0:
+    if h < 0.0:  # against the travel: the rate is β - γ until h passes 0, then β + γ
         slope = a - (beta - gamma) * h
         to_zero = _travel(beta - gamma, -h / slope)
         if travel < to_zero:
@@ -130,7 +112,7 @@ def _needed(h: float, target: float, shape: Array) -> float:
 
 @inlined
 def play(position: float, threshold: float, value: float) -> float:
-    """Where a play stands after the input ``value``."""
+    """Position of a play after the input ``value``."""
     return min(max(position, value - threshold), value + threshold)
 
 
@@ -187,7 +169,10 @@ def advance(kind: int, table: Array, state: Array, start: int, value: float) -> 
 
 @kernel
 def _plays_along(table: Array, state: Array, start: int, value: Array, result: Array) -> None:
-    """`advance` of plays: one after the other goes through the block, five at a time to keep the processor busy."""
+    """`advance` of plays: one after the other goes through the block, five at a time to keep the processor busy.
+
+    The output of a sample grows play by play in the order of `advance`, so that the bits are the same.
+    """
     r, p = table[0], table[1]
     for k in range(value.size):
         result[k] = p[0] * value[k]
@@ -222,14 +207,20 @@ def advance_along(kind: int, table: Array, state: Array, start: int, value: Arra
             result[k] = advance(kind, table, state, start, value[k])
 
 
-class _Operator:
-    """The common part of all operators."""
+class Hysteresis:
+    """An operator with memory.
+
+    Attributes:
+        law: for kernels that step it themselves, see `advance`.
+        state: its memory, shape (n,).
+        steepest: largest slope dy/du that it can have.
+    """
 
     def __init__(self, law: Law, state: Array, steepest: float) -> None:
         self.law, self.state, self.steepest = law, state, steepest
 
     def block(self, value: Array, result: Array) -> None:
-        """See `Hysteresis`."""
+        """Step through a block; relative input and output, shape (n,)."""
         advance_along(*self.law, self.state, 0, value, result)
 
 
@@ -245,12 +236,14 @@ def check_thresholds(thresholds: Array) -> None:
 
 
 def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
+    """Law, state and steepest slope of plays in such a state."""
     table = np.empty((2, thresholds.size + 1))
+    # Plays that are past their thresholds add up: the steepest slope is the largest partial sum.
     table[:, 0], table[0, 1:], table[1, 1:] = (0.0, proportional), thresholds, weights
     return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
 
-class PrandtlIshlinskii(_Operator):
+class PrandtlIshlinskii(Hysteresis):
     """Weighted plays.
 
     Args:
@@ -265,8 +258,7 @@ class PrandtlIshlinskii(_Operator):
     def __init__(
         self, thresholds: Array = THRESHOLDS, weights: Array = WEIGHTS, proportional: float = PROPORTIONAL
     ) -> None:
-        if thresholds.size != weights.size:
-            raise InputError(f"plays: {thresholds.size} thresholds and {weights.size} weights; give as many of each")
+        stacked("plays", thresholds=thresholds, weights=weights)
         check_thresholds(thresholds)
         slopes = proportional + np.append(0.0, np.cumsum(weights))
         if not (np.all(slopes > 0.0) and np.all(np.isfinite(slopes))):
@@ -282,15 +274,15 @@ class PrandtlIshlinskii(_Operator):
         return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
 
     def inverse(self) -> "PrandtlIshlinskiiInverse":
-        """The inverse from its present state on."""
+        """Return the inverse from the present state on."""
         return PrandtlIshlinskiiInverse(self)
 
 
-class PrandtlIshlinskiiInverse(_Operator):
+class PrandtlIshlinskiiInverse(Hysteresis):
     """The operator that undoes `PrandtlIshlinskii`; plays as well, in closed form.
 
     Args:
-        forward: what to undo. Its present state is taken over, so at rest the inverse is at rest too.
+        forward: operator to undo. Its present state is taken over, so at rest the inverse is at rest too.
     """
 
     def __init__(self, forward: PrandtlIshlinskii) -> None:
@@ -304,7 +296,7 @@ class PrandtlIshlinskiiInverse(_Operator):
         super().__init__(*_weighted(thresholds, -p / (slopes * before), 1.0 / forward.proportional, state))
 
 
-class BoucWen(_Operator):
+class BoucWen(Hysteresis):
     """Bouc-Wen with n = 1 in the form y = g·(u - h).
 
     Args:
@@ -332,7 +324,7 @@ class BoucWen(_Operator):
         super().__init__(Law(_BOUC_WEN, table), np.zeros(2), self.gain)
 
     def _end_of_loop(self) -> float:
-        """The hysteretic part at the end of a steady loop over ±1: what a way of 2 turns into its opposite."""
+        """Hysteretic part at the end of a steady loop over ±1: a travel of 2 turns it into its opposite."""
         shape = np.array([self.a, self.beta, self.gamma])
         # It stays below A/(β + γ), but for rounding.
         bound = 2.0 * self.a / (self.beta + self.gamma)
@@ -348,15 +340,15 @@ class BoucWen(_Operator):
         return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
 
     def inverse(self) -> "BoucWenInverse":
-        """The inverse from its present state on."""
+        """Return the inverse from the present state on."""
         return BoucWenInverse(self)
 
 
-class BoucWenInverse(_Operator):
+class BoucWenInverse(Hysteresis):
     """The operator that undoes `BoucWen`: each sample's step in u is solved for.
 
     Args:
-        forward: what to undo; its present state is taken over.
+        forward: operator to undo; its present state is taken over.
     """
 
     def __init__(self, forward: BoucWen) -> None:

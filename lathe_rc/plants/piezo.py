@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance, advance_along
 from lathe_rc.plants.linear import Constant, DiscretePlant, Discretisation, discretise, second_order
 
-Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _ROUNDING = 1e-9  # of the stroke: an exact inverse may pass full voltage by rounding
@@ -90,6 +90,7 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
 def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: Array, voltage: Array) -> int:
     """`extend` for a block: fills the extension [m] and the voltage relative to full, shape (n,).
 
+    Element by element through the whole block, which is faster; each keeps the order of operations of `extend`.
     Returns the number of samples where something was cut off.
     """
     inverse = _MEMORIES + stack.creep.shape[0]
@@ -121,13 +122,14 @@ def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: 
 
 def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
     """1/(1 + p·time), times in s."""
-    least = float(f"{step / 1000.0:g}")  # the one that is said, to the bit
+    least = float(f"{step / 1000.0:g}")  # the rounded number of the message is itself allowed
     if time < least:
         raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: at least {least:g} s, or none")
     return discretise(np.array([[-1.0 / time]]), np.array([1.0 / time]), 0.0, step, method)
 
 
 def _row(lag: DiscretePlant) -> Array:
+    """Decay of a lag, and the weights of its present and last input."""
     return np.array([lag.transition[0, 0], lag.weights[0, 0], lag.weights[0, 1]])
 
 
@@ -198,14 +200,13 @@ class Stack:
         )
         amplifier = _row(self.linear.amplifier) if self.linear.amplifier else np.array([0.0, 1.0, 0.0])
         creep = np.array([_row(lag) for lag in self.linear.creep]).reshape(-1, 3)
-        none = np.empty(0)
-        inverse_state = inverse.state.copy() if inverse else none
-        forward_state = hysteresis.state.copy() if hysteresis else none
+        none = Hysteresis(LINEAR, np.empty(0), 1.0)
+        inverse, hysteresis = inverse or none, hysteresis or none
         self.table = StackTable(
             stroke=stroke,
-            inverse=inverse.law if inverse else LINEAR,
-            inverse_size=inverse_state.size,
-            forward=hysteresis.law if hysteresis else LINEAR,
+            inverse=inverse.law,
+            inverse_size=inverse.state.size,
+            forward=hysteresis.law,
             decay=amplifier[0],
             now=amplifier[1],
             before=amplifier[2],
@@ -213,13 +214,9 @@ class Stack:
             creep=creep,
             creep_gain=creep_per_decade,
         )
-        self.state = np.concatenate((np.zeros(_MEMORIES + len(creep)), inverse_state, forward_state))
-        self.steepest = float(
-            (inverse.steepest if inverse else 1.0)
-            * amplifier[1]
-            * (hysteresis.steepest if hysteresis else 1.0)
-            * (1.0 + creep_per_decade * creep[:, 1].sum())
-        )
+        self.state = np.concatenate((np.zeros(_MEMORIES + len(creep)), inverse.state, hysteresis.state))
+        crept = 1.0 + creep_per_decade * creep[:, 1].sum()
+        self.steepest = float(inverse.steepest * amplifier[1] * hysteresis.steepest * crept)
 
 
 class FineTable(NamedTuple):

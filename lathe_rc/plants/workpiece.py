@@ -1,23 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part's effect on the cut: where it has no material, where it is harder, how it gives way along it."""
+"""The part's effect on the cut: keyways, hard spots, compliance along it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.signals.checks import stacked
 
 _TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
 class HardSpot:
-    """A place in the part where the force is another.
+    """Place in the part where the force is multiplied.
 
     Attributes:
         start, width: angular window [rad].
@@ -38,13 +37,14 @@ class HardSpot:
         if not 0.0 <= self.factor < np.inf:
             raise InputError(f"hard spot: factor {self.factor:g}; allowed: 0 or more")
 
-    @property
-    def row(self) -> tuple[float, ...]:
-        """As the kernel has it."""
-        return self.start, self.width, self.bottom, self.top, self.factor
+
+def spot_rows(spots: Sequence[HardSpot]) -> Array:
+    """Hard spots for `hardness`, shape (n, 5)."""
+    return np.array([astuple(spot) for spot in spots], dtype=np.float64).reshape(-1, 5)
 
 
 def _check_window(what: str, start: float, width: float) -> None:
+    """Refuse an angular window that is not a part of a revolution."""
     if not (np.isfinite(start) and 0.0 < width < _TURN):
         raise InputError(
             f"{what}: window at {start:g} rad of {width:g} rad; allowed: a width above 0 and below a revolution"
@@ -80,10 +80,9 @@ class Part:
         if (self.heights is None) != (self.compliances is None):
             raise InputError("part: heights without compliances or the other way round; give both or none")
         if self.heights is not None and self.compliances is not None:
-            if self.heights.size != self.compliances.size or not self.heights.size:
-                raise InputError(
-                    f"part: {self.heights.size} heights and {self.compliances.size} compliances; give as many of each"
-                )
+            stacked("part", heights=self.heights, compliances=self.compliances)
+            if not self.heights.size:
+                raise InputError("part: 0 heights and 0 compliances; give as many of each")
             if np.any(np.diff(self.heights) <= 0.0) or np.any(self.compliances < 0.0):
                 raise InputError("part: heights have to rise, compliances must not be negative; sort or correct them")
 
@@ -106,7 +105,7 @@ def missing(gaps: Array, angle: float) -> bool:
 
 @inlined
 def hardness(spots: Array, angle: float, height: float) -> float:
-    """Factor of the force at an angle [rad] and a height [m], see `HardSpot.row`."""
+    """Factor of the force at an angle [rad] and a height [m], see `spot_rows`."""
     factor = 1.0
     for i in range(spots.shape[0]):
         if spots[i, 2] <= height <= spots[i, 3] and _within(angle, spots[i, 0], spots[i, 1]):

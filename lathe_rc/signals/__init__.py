@@ -3,7 +3,7 @@
 
 Spindle: `speed`, `deviation_law`, `tachogram`; `encoder` with `encoder_errors`, `counts` of a real one. Form:
 `profile`, `part_profile`, `measured_profile`, `tip_path`, tabulated by `profile_table`. Disturbances: `noise`,
-`vibration`, `allowance`, `example_002`. `table`: CSV files.
+`vibration`, `allowance`, `example_002`. `table`: CSV files; `checks` of arrays.
 """
 
 __all__ = ["deviation_law", "part_profile", "speed"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Allowance: how far the blank's surface lies beyond where it is taken to be.
+"""Allowance: distance of the blank's surface beyond its nominal place.
 
     d(t) = w(t) + Σ a_i·sin(n_i·φ(t) + ψ_i)
 
@@ -11,13 +11,12 @@ that is an allowance of 20.7 µm RMS at 233.3 N/mm.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.signals.noise import DRAWN, Drawn, NormalStream
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.signals.checks import stacked
+from lathe_rc.signals.noise import Drawn, NormalStream
 
 PAPER_RMS = 20.7e-6  #: [m]
 
@@ -96,6 +95,7 @@ def allow(made: AllowanceTable, angle: Array, allowance: Array) -> None:
     w, begun = state[0], state[1]
     for k in range(angle.size):
         normal = made.normal.values[place + k]
+        # The first value has the RMS of the stationary walk, so that no run starts with a transient.
         w = walk.keep * w + walk.kick * normal if begun else walk.start * normal
         begun = 1.0
         total = w
@@ -126,15 +126,10 @@ class Allowance:
     def __init__(
         self, walk: Walk, *, order: Array, amplitude: Array, phase: Array, seed: int, name: str = "allowance"
     ) -> None:
-        if not order.size == amplitude.size == phase.size:
-            raise InputError(
-                f"run-out: {order.size} orders, {amplitude.size} amplitudes and {phase.size} phases; "
-                "give as many of each"
-            )
+        run_out = stacked("run-out", orders=order, amplitudes=amplitude, phases=phase).astype(np.float64)
         wrong = order[(order < 1.0) | (order != np.rint(order))]
         if wrong.size:
             raise InputError(f"run-out: order {wrong[0]:g}; allowed: whole numbers from 1")
-        run_out = np.stack((order, amplitude, phase)).astype(np.float64)
         self._stream = NormalStream(seed, name)
         self.table = AllowanceTable(walk, run_out, self._stream.drawn, np.zeros(2))
 
@@ -144,7 +139,5 @@ class Allowance:
 
     def block(self, angle: Array, allowance: Array) -> None:
         """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,)."""
-        for start in range(0, angle.size, DRAWN):
-            piece = slice(start, min(start + DRAWN, angle.size))
-            self.draw(piece.stop - start)
+        for piece in self._stream.draw_along(angle.size):
             allow(self.table, angle[piece], allowance[piece])

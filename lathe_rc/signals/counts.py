@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of a real encoder: where they come from, and the spindle angle at any time between them.
+"""Counts of a real encoder: their sources, and the spindle angle at any time between two of them.
 
 A reading is a time [ns] and the counter at that time. Between two readings the angle is linear.
 """
@@ -35,7 +35,7 @@ _IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # places in wh
 
 
 class Reader(ABC):
-    """Where readings come from.
+    """Source of readings.
 
     Attributes:
         ended: no more will come.
@@ -45,7 +45,7 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self) -> Iterator[Reading]:
-        """The readings that have come since the last call; waits for none.
+        """Yield the readings that have come since the last call, without waiting.
 
         Raises:
             LatheError: what has come is no reading, or the source has failed.
@@ -53,11 +53,12 @@ class Reader(ABC):
 
 
 def _count(text: str) -> int | float:
-    """A counter; an integer of so many digits that no counter has them is infinite, as a double."""
+    """Read a counter; an integer with more digits than any counter has becomes infinite, as a double."""
     return int(text) if text.lstrip("+-").isdigit() and len(text) < _LONGEST_LINE else float(text)
 
 
 def _reading(text: str, unit: int, where: str) -> Reading:
+    """Read a time in a unit of so many nanoseconds and a counter; ``where`` they stand, for the message."""
     found = _READING.fullmatch(text)
     try:
         if found:
@@ -90,7 +91,7 @@ class CsvReader(Reader):
         self._unit = _HEADERS[header]
 
     def read(self) -> Iterator[Reading]:
-        """See `Reader`."""
+        """Yield all readings of the file, once."""
         for number, line in [] if self.ended else self._lines[1:]:
             yield _reading(line, self._unit, f"{self._path}:{number}")
         self.ended = True
@@ -134,12 +135,12 @@ class LineReader(Reader):
         self._stream.close()
 
     def read(self) -> Iterator[Reading]:
-        """See `Reader`."""
+        """Yield the readings of the lines that are complete."""
         while not self.ended:
             try:
                 data = self._stream.read(_PIECE)
             except OSError:
-                data = b""  # who was at the other end of a terminal has gone
+                data = b""  # a terminal whose other end is closed fails instead of giving nothing
             if data is None or (self._waits and not data):
                 return
             self.ended, self._waits = not data, False
@@ -158,7 +159,7 @@ class LineReader(Reader):
 
 
 def _make_raw(number: int, path: Path, baud: int) -> None:
-    """Let bytes come as they are, at a speed."""
+    """Set a terminal to raw bytes at a speed."""
     if baud not in _BAUD:
         raise InputError(f"{path}: {baud} baud; allowed: {', '.join(map(str, sorted(_BAUD)))}")
     state = termios.tcgetattr(number)
@@ -201,17 +202,17 @@ class CountedAngle:
 
     @property
     def time(self) -> float:
-        """Of the newest reading, after sample 0 [s]."""
+        """Time of the newest reading after sample 0 [s]."""
         return 0.0 if self._newest is None else (self._newest[0] - self._start_ns) * 1e-9
 
     @property
     def angle(self) -> float:
-        """At the newest reading [rad]."""
+        """Angle at the newest reading [rad]."""
         return self._highest * 2.0 * np.pi / self._counts
 
     @property
     def available(self) -> int:
-        """Samples that the readings reach to."""
+        """Number of samples whose angle the readings give."""
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
     def add(self, time_ns: int, count: float) -> None:
@@ -250,18 +251,20 @@ class CountedAngle:
         self._keep()
 
     def go_on(self, speed: float) -> None:
-        """Take it that the spindle turns at ``speed`` [rad/s] from the newest reading on, for an hour."""
+        """Extrapolate the newest reading by an hour at ``speed`` [rad/s]."""
         assert self._newest is not None, "a reading has come"
         self._newest = self._newest[0] + _GOES_ON * 10**9, self._newest[1]
         self._highest += speed * _GOES_ON * self._counts / (2.0 * np.pi)
         self._keep()
 
     def _keep(self) -> None:
+        """Store the newest reading; lists grow cheaply, and `_gather` makes arrays of them."""
         assert self._newest is not None, "a reading has come"
         self._times.append(float(self._newest[0] - self._start_ns))
         self._angles.append(self.angle)
 
     def _gather(self) -> None:
+        """Append the stored readings to the arrays."""
         if self._times:
             self._time, self._angle = np.append(self._time, self._times), np.append(self._angle, self._angles)
             self._times, self._angles = [], []
@@ -269,15 +272,17 @@ class CountedAngle:
     def take(self, first: int, samples: int) -> Array:
         """The angle [rad] of the samples ``first`` on, shape (n,), up to `available`; those before are forgotten."""
         self._gather()
-        at = self._step_ns * np.arange(first, first + samples, dtype=np.float64)
-        if samples:
-            begin = max(int(np.searchsorted(self._time, at[0], side="right")) - 1, 0)
-            self._time, self._angle = self._time[begin:], self._angle[begin:]
-        end = int(np.searchsorted(self._time, at[-1])) + 1 if samples else 0
-        return np.interp(at, self._time[:end], self._angle[:end]) if samples else at
+        at: Array = self._step_ns * np.arange(first, first + samples, dtype=np.float64)
+        if not samples:
+            return at
+        begin = max(int(np.searchsorted(self._time, at[0], side="right")) - 1, 0)
+        self._time, self._angle = self._time[begin:], self._angle[begin:]
+        # `np.interp` looks at all points that it gets: those of later samples may be a whole file.
+        end = int(np.searchsorted(self._time, at[-1])) + 1
+        return np.interp(at, self._time[:end], self._angle[:end])
 
     def reached(self, angle: float) -> int | None:
-        """First sample at which the angle [rad] is at least so large; None if the readings do not reach so far."""
+        """Return the first sample at which the angle [rad] is at least so large; None if there is none yet."""
         self._gather()
         if not self._time.size or angle > self._angle[-1]:
             return None
@@ -288,5 +293,6 @@ class CountedAngle:
         at = np.interp(
             self._step_ns * np.arange(first, last + 1, dtype=np.float64), self._time[begin:end], self._angle[begin:end]
         )
+        # By the interpolation of `take`, sample by sample, so that both agree to the bit.
         found = first + int(np.searchsorted(at, angle))
         return found if found < self.available else None

@@ -5,9 +5,11 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
-from lathe_rc.signals.speed import Array, SpeedLaw
+from lathe_rc.signals.checks import real_numbers
+from lathe_rc.signals.speed import SpeedLaw
 
 _MOST = 2**22  # points of a tachogram
 
@@ -38,12 +40,7 @@ def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> Spe
             f"{end:g} s in steps of {step:g} s are {points} points; allowed: {_MOST} (a longer step or an earlier end)"
         )
     time: Array = step * np.arange(points, dtype=np.float64)
-    deviation = np.asarray(law.deviation(time))
-    if deviation.shape != time.shape or deviation.dtype.kind not in "fiu":
-        raise InputError(
-            f"deviation(time) gives {deviation.dtype} of shape {deviation.shape} for times of shape {time.shape}; "
-            "allowed: a real number for each"
-        )
+    deviation = real_numbers("deviation(time)", law.deviation(time), "times", time)
     wrong = np.flatnonzero(~np.isfinite(deviation))
     if wrong.size:
         raise InputError(f"deviation(time) = {deviation[wrong[0]]} at {time[wrong[0]]:g} s; allowed: finite numbers")

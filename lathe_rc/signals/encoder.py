@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder_errors import EncoderErrors, ErrorsTable, rate, seen, seen_along
 from lathe_rc.signals.speed import SpeedLaw, evaluate_along
 
-Array = npt.NDArray[np.float64]
 Fields = tuple[npt.NDArray[Any], ...]
 
 _TURN = 2.0 * np.pi
@@ -48,13 +48,13 @@ def encode(encoder: EncoderTable, first: int, samples: Fields) -> None:
 
 @kernel
 def follow_law(encoder: EncoderTable, first: int, angle_true: Array, speed_true: Array) -> None:
-    """Fill what the speed law says of the samples from index ``first`` on."""
+    """Fill true angle and speed of the samples from index ``first`` on by the speed law."""
     evaluate_along(first, encoder.step, encoder.nominal, encoder.lines, encoder.tachogram, angle_true, speed_true)
 
 
 @kernel
 def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
-    """Fill what is measured of the true angle and speed, see `Encoder.block`."""
+    """Fill measured angle, speed and index pulse from the true angle and speed, see `Encoder.block`."""
     angle, speed, index_pulse, angle_true, speed_true = samples
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
     before = revolution[0]

@@ -15,12 +15,10 @@ Source: P. L. M. Heydemann, Applied Optics 20 (1981) 3382 (the ellipse of two si
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _GREATEST = 0.5  # of the sum of a signal's errors, and of the eccentricity: the angle that is seen still rises
@@ -65,6 +63,7 @@ class EncoderErrors(NamedTuple):
 
     @property
     def _signals(self) -> tuple[float, float, float, float]:
+        """Errors of the two signals."""
         return self.cosine_offset, self.sine_offset, self.mismatch, self.skew
 
     @property
@@ -111,7 +110,7 @@ def seen(table: ErrorsTable, angle: float) -> float:
 
 @inlined
 def rate(table: ErrorsTable, angle: float) -> float:
-    """How fast what is seen rises with the angle."""
+    """Derivative of the reading with respect to the angle."""
     errors = table.errors
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
@@ -125,6 +124,6 @@ def rate(table: ErrorsTable, angle: float) -> float:
 
 @kernel
 def seen_along(table: ErrorsTable, angle: Array, found: Array) -> None:
-    """The encoder's reading of angles, shape (n,)."""
+    """Fill the encoder's readings of angles, shape (n,)."""
     for k in range(angle.size):
         found[k] = seen(table, angle[k])

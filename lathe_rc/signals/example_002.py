@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The example of paper 002: what its drive shall follow and what disturbs it.
+"""The example of paper 002: reference and disturbance of its drive.
 
     r(t) = 1.1 - 0.1·e^{-t} - |cos 0.04πt|³      (17)
     f(t) = 0.5·(sin 0.04πt)²                     (18)
@@ -8,11 +8,9 @@ Both have the period of 25 s but for the term that decays.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 PERIOD = 25.0  #: [s]
 OMEGA = 0.04 * np.pi  #: [rad/s]

@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
-_FLATTEST = 0.01  # [µm] peak to valley of a form: nobody turns less
+_FLATTEST = 0.01  # [µm] peak to valley: no lathe turns a flatter form
 _MILLIMETRES = 2.0  # [µm] a form with less is perhaps in mm: few forms have 2 mm
 _METRES = 0.1  # [mm] heights over less are perhaps in m
 _WIDE, _WIDER = 3.0, 15.0  # of the median step, and [°]: more than both between two angles is a gap
@@ -42,7 +42,7 @@ class Measured:
     radius: Array
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """See `lathe_rc.signals.profile.Profile`."""
+        """Radius deviation [m] on the spline through the points, see `lathe_rc.signals.profile.Profile`."""
         rows = [np.interp(height, self.heights, column) for column in self.radius.T]
         closed = np.append(rows, rows[0])
         spline = scipy.interpolate.CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
@@ -50,6 +50,7 @@ class Measured:
 
 
 def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
+    """Refuse places that are nearly the same."""
     near = np.flatnonzero(np.diff(places) < _CLOSEST)
     if near.size:
         a, b = places[near[0]], places[near[0] + 1]
@@ -89,7 +90,7 @@ def _gap(angle_deg: Array) -> tuple[float, float, float]:
 
 
 def _closed(path: Path, rows: Array) -> Array:
-    """Rows with their points at 360° left out, if the same are at 0°, or taken as those at 0°.
+    """Move the points at 360° to 0°, or leave them out where 0° has the same.
 
     Raises:
         InputError: the two differ.
@@ -110,7 +111,7 @@ def _closed(path: Path, rows: Array) -> Array:
 
 
 def doubts(form: Measured) -> list[str]:
-    """Doubts about a form that can be meant, one line each: a gap in its angles, values as in another unit."""
+    """List doubts about a possible form, one line each: a gap in its angles, values as in another unit."""
     said = []
     start, width, median = _gap(np.rad2deg(form.angle))
     if width > max(_WIDE * median, _WIDER):
@@ -145,7 +146,7 @@ def read_csv(path: Path) -> Measured:
 
 @lru_cache(maxsize=8)
 def _measured(text: str, path: Path) -> Measured:
-    """The profile in a text: to make it takes longer than some cells run, and nobody changes it."""
+    """Return the profile in a text; cached, since it takes longer to make than some cells run, and never changes."""
     header, rows = parse_table(text, path, _HEADERS)
     if not rows.size:
         raise InputError(f"{path}: no points; give at least three angles")

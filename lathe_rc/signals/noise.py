@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement noise and quantisation of a sensor."""
+"""Random numbers of a run: noise and quantisation of sensors, lines of a random disturbance."""
 
 import zlib
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, put
 from lathe_rc.jit import inlined, kernel
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 DRAWN = 8192  #: numbers that a stream draws at a time, at most
@@ -58,10 +58,29 @@ class NormalStream:
         """Have so many numbers in advance, up to 8192."""
         values, used = self.drawn
         if values.size and used[0] + numbers > values.size:
+            # Unused numbers move to the front: the order of use is that of drawing, whatever the blocks.
             left = values.size - used[0]
             values[:left] = values[used[0] :].copy()
             self._random.standard_normal(out=values[left:])
             used[0] = 0
+
+    def draw_along(self, samples: int) -> Iterator[slice]:
+        """Pieces of a block of any length, each with its numbers drawn."""
+        for start in range(0, samples, DRAWN):
+            piece = slice(start, min(start + DRAWN, samples))
+            self.draw(piece.stop - start)
+            yield piece
+
+
+def random_lines(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
+    """Amplitude, frequency [rad/s] and phase [rad] of sines with an RMS between two frequencies, shape (3, lines).
+
+    The lines are equal, one in each of as many equal parts of the band, with frequency and phase drawn from
+    ``random``: the sum repeats only after many periods and nears a normal distribution.
+    """
+    frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
+    phase = random.uniform(0.0, 2.0 * np.pi, lines)
+    return np.stack((np.full(lines, rms * np.sqrt(2.0 / lines)), frequency, phase))
 
 
 class SensorTable(NamedTuple):
@@ -116,7 +135,5 @@ class Sensor:
 
     def measure(self, true: Array, measured: Array) -> None:
         """Fill ``measured`` from ``true``; both of shape (n,)."""
-        for start in range(0, true.size, DRAWN):
-            piece = slice(start, min(start + DRAWN, true.size))
-            self.draw(piece.stop - start)
+        for piece in self._stream.draw_along(true.size):
             measure(self.table, true[piece], measured[piece])

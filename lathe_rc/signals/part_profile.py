@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from lathe_rc.errors import InputError
+from lathe_rc.signals.checks import real_numbers
 from lathe_rc.signals.profile import Array
 from lathe_rc.signals.profile_table import ProfileTable, tabulated
 
@@ -30,7 +31,7 @@ class PartProfile(ABC):
 
 
 def checked(profile: PartProfile) -> ProfileTable:
-    """The table of a profile that is one.
+    """Check a profile and return its table.
 
     Raises:
         InputError: heights out of order, or a deviation that is not finite, of another shape, or not periodic.
@@ -40,12 +41,7 @@ def checked(profile: PartProfile) -> ProfileTable:
         raise InputError(f"heights of shape {heights.shape}; allowed: one or more finite positions that increase")
     angle = np.linspace(0.0, _TURN, 361)
     for height in heights.tolist():
-        deviation = np.asarray(profile.deviation(angle, height))
-        if deviation.shape != angle.shape or deviation.dtype.kind not in "fiu":
-            raise InputError(
-                f"deviation(angle, height) gives {deviation.dtype} of shape {deviation.shape} for angles of shape "
-                f"{angle.shape}; allowed: a real number for each"
-            )
+        deviation = real_numbers("deviation(angle, height)", profile.deviation(angle, height), "angles", angle)
         wrong = np.flatnonzero(~np.isfinite(deviation))
         if wrong.size:
             raise InputError(

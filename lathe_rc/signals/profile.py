@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError, at_most
+from lathe_rc.signals.checks import stacked
 
 Array = npt.NDArray[np.float64]
 
@@ -33,19 +34,15 @@ class Harmonics:
     phase: Array
 
     def __post_init__(self) -> None:
-        if not self.order.size == self.amplitude.size == self.phase.size:
-            raise InputError(
-                f"harmonic profile: {self.order.size} orders, {self.amplitude.size} amplitudes and "
-                f"{self.phase.size} phases; give as many of each"
-            )
+        stacked("harmonic profile", orders=self.order, amplitudes=self.amplitude, phases=self.phase)
 
     @property
     def heights(self) -> Array:
-        """One height: the form is the same all along the part."""
+        """One height, since the form is the same all along the part."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """See `Profile`."""
+        """Radius deviation [m] of the sum, see `Profile`."""
         waves = self.amplitude[:, None] * np.sin(np.outer(self.order, angle) + self.phase[:, None])
         return np.asarray(waves.sum(axis=0))
 
@@ -105,7 +102,7 @@ class Polygon:
 
     @property
     def heights(self) -> Array:
-        """One height: a prism."""
+        """One height, since the part is a prism."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:

@@ -17,23 +17,22 @@ from functools import lru_cache, partial
 
 import llvmlite.binding
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.files import replacing, sealed
 from lathe_rc.jit import cache_folder, inlined, kernel, read_kept
 from lathe_rc.signals.measured_profile import Measured
 from lathe_rc.signals.profile import Profile
 
-Array = npt.NDArray[np.float64]
-
 _MOST = 32  # tables, the newest
 
 
 def kept(content: bytes, make: Callable[[], Array]) -> Array:
-    """The array that ``make`` makes of some content: read, if the same libraries have made it on such a processor.
+    """Return the array that ``make`` makes of some content, from the disk where the same libraries have stored it.
 
-    A file that is damaged is said and made anew, and one that cannot be written is not kept.
+    Results are those of such a processor alone: libraries choose their instructions by it, and so the last bits. A
+    damaged file is reported and made anew; if the disk cannot be written, nothing is stored.
     """
     made_by = f"{np.__version__} {scipy.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
     path = cache_folder() / "tables" / f"{hashlib.sha256(made_by + content).hexdigest()}.npy"
@@ -54,6 +53,15 @@ def kept(content: bytes, make: Callable[[], Array]) -> Array:
 _TURN = 2.0 * np.pi
 
 
+@inlined
+def _height(feed: float, start: float, part: int, angle: float) -> float:
+    """Place along the part [m] at a spindle angle [rad], see `height_along`."""
+    turns = angle / _TURN
+    if part > 0:
+        turns -= part * np.floor(turns / part)
+    return start + feed * turns
+
+
 @kernel
 def height_along(feed: float, start: float, part: int, angle: Array, height: Array) -> None:
     """Fill the place along the part [m] at a spindle angle [rad], shape (n,).
@@ -66,16 +74,14 @@ def height_along(feed: float, start: float, part: int, angle: Array, height: Arr
         height: see above.
     """
     for k in range(angle.size):
-        turns = angle[k] / _TURN
-        if part > 0:
-            turns -= part * np.floor(turns / part)
-        height[k] = start + feed * turns
+        height[k] = _height(feed, start, part, angle[k])
 
 
 @inlined
 def _cubic(row: Array, place: float) -> float:
     """A row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
     whole = np.floor(place)
+    # Unsigned, since Numba checks signed indices for negative ones.
     j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
     u = place - whole
     return float(((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3])
@@ -144,10 +150,7 @@ def derivatives_at(
     Returns:
         r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The slope along the part counts in the first derivative.
     """
-    turns = angle / _TURN
-    if part > 0:
-        turns -= part * np.floor(turns / part)
-    height = start + feed * turns
+    height = _height(feed, start, part, angle)
     row, last = 0, heights.size - 1
     while row < last and height >= heights[row + 1]:
         row += 1
@@ -170,7 +173,7 @@ def derivatives_at(
 
 @dataclass(frozen=True)
 class Demand:
-    """The demand of a profile on a drive at its worst place."""
+    """Demand of a profile on a drive at its worst place."""
 
     stroke: float  #: largest displacement from the middle [m]
     velocity: float  #: [m/s]
@@ -178,7 +181,7 @@ class Demand:
 
 
 class _ByContent:
-    """A profile that is equal to others of the same content.
+    """Profile that is equal to others of the same content, as the key of a cache.
 
     Args:
         profile: what it stands for.
@@ -197,13 +200,14 @@ class _ByContent:
 
 @lru_cache(maxsize=8)
 def _table(given: _ByContent) -> "ProfileTable":
+    """Return the table of a profile; that of a file is stored on the disk too."""
     if isinstance(given.profile, Measured):  # a file: others vary with parameters, and a sweep would keep thousands
         return ProfileTable(given.profile, made=partial(kept, given.content))
     return ProfileTable(given.profile)
 
 
 def tabulated(profile: Profile) -> "ProfileTable":
-    """The table of a profile; equal profiles share one, which nobody changes: to make it takes 20 ms and more."""
+    """Return the table of a profile; equal profiles share one, which is read-only: to make it takes 20 ms and more."""
     return _table(_ByContent(profile))
 
 
@@ -234,7 +238,7 @@ class ProfileTable:
 
 
 def _splines(profile: Profile, points: int) -> Array:
-    """See `ProfileTable.table`."""
+    """Coefficients of the splines, see `ProfileTable.table`."""
     angle = np.linspace(0.0, _TURN, points + 1)
     table = np.empty((profile.heights.size, points, 4))
     for row, height in zip(table, profile.heights, strict=True):
@@ -247,6 +251,7 @@ def _splines(profile: Profile, points: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _demand(form: ProfileTable, speed: float, acceleration: float, feed: float) -> Demand:
+    """Return `ProfileTable.demand`; cached, since the checks of cells that are alike ask for the same."""
     per_radian = form.table.shape[1] / _TURN
     value, slope = form.table[..., 3], form.table[..., 2] * per_radian
     curvature = 2.0 * form.table[..., 1] * per_radian**2

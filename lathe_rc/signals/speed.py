@@ -15,10 +15,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.signals.checks import stacked
+from lathe_rc.signals.noise import random_lines
 
 _MOST_SAMPLES = 2**53  # that a double counts
 _PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], phase [rad], start [s]
@@ -63,7 +64,7 @@ def evaluate_along(
     first: int, step: float, nominal: float, lines: Array, tachogram: Array, angle: Array, speed: Array
 ) -> None:
     """Fill angle [rad] and speed [rad/s] of the samples ``first`` on, shape (n,); see `evaluate`."""
-    if lines.shape[1] == 0 and tachogram.shape[1] == 0:
+    if lines.shape[1] == 0 and tachogram.shape[1] == 0:  # the bits of `evaluate`, without its branches
         for k in range(angle.size):
             angle[k] = nominal * ((first + k) * step)
             speed[k] = nominal
@@ -74,6 +75,7 @@ def evaluate_along(
 
 @kernel
 def _evaluate_many(t: Array, nominal: float, lines: Array, tachogram: Array) -> Array:
+    """Rows angle, speed and acceleration at times, shape (3, n)."""
     out = np.empty((3, t.size))
     for n in range(t.size):
         out[0, n], out[1, n], out[2, n] = evaluate(t[n], nominal, lines, tachogram)
@@ -109,7 +111,7 @@ class SpeedLaw:
         return _evaluate_many(times, self.nominal, self.lines, self.tachogram)
 
     def speed_range(self, duration: float = np.inf) -> tuple[float, float]:
-        """Lowest and highest speed [rad/s] within ``duration`` [s]; for an endless run a safe bound."""
+        """Return the lowest and highest speed [rad/s] within ``duration`` [s]; for an endless run a safe bound."""
         lines, tachogram = self.lines, self.tachogram
         amplitude = float(np.abs(lines[0]).sum())
         below, above = (tachogram[1].min(), tachogram[1].max()) if tachogram.size else (0.0, 0.0)
@@ -143,12 +145,13 @@ class SpeedLaw:
         lowest = self.speed_range()[0]
         horizon = angle / lowest if lowest > 0.0 else 2.0 * angle / self.nominal
         if lowest <= 0.0 and self.at(horizon)[0, 0] >= angle:
-            # What comes after the angle is reached does not matter.
+            # Only the time until the angle is reached matters: the spindle may turn back later.
             lowest = self.speed_range(horizon)[0]
         if lowest <= 0.0:
             raise InputError(f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)")
         if not horizon / step < _MOST_SAMPLES:
             raise InputError(f"that takes up to {horizon / step:.3g} samples; allowed: below {_MOST_SAMPLES}")
+        # The angle only rises up to the horizon, so that it can be searched by halves.
         low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2
@@ -169,20 +172,15 @@ def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, s
 
     All arrays have the shape (n,). Paper 000, Fig. 6: ΔΩ = 10.5·sin(ωd·t).
     """
-    if not amplitude.size == frequency.size == phase.size:
-        raise InputError(
-            f"harmonic deviation: {amplitude.size} amplitudes, {frequency.size} frequencies and "
-            f"{phase.size} phases; give as many of each"
-        )
+    lines = stacked("harmonic deviation", amplitudes=amplitude, frequencies=frequency, phases=phase)
     if np.any(frequency <= 0.0):
         raise InputError(f"harmonic deviation: frequency {frequency.min():g} rad/s; allowed: above 0")
-    return SpeedLaw(nominal, np.stack((amplitude, frequency, phase, np.full(amplitude.size, start))))
+    return SpeedLaw(nominal, np.vstack((lines, np.full(amplitude.size, start))))
 
 
 def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
     """Piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s], held before and after; shape (n,)."""
-    if time.size != deviation.size:
-        raise InputError(f"tachogram: {time.size} times and {deviation.size} deviations; give as many of each")
+    stacked("tachogram", times=time, deviations=deviation)
     if time.size and (time[0] < 0.0 or np.any(np.diff(time) <= 0.0)):
         raise InputError("tachogram: times must start at 0 s or later and increase; sort them and drop repeats")
     if not time.size:
@@ -195,15 +193,11 @@ def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
 def band_limited_random(nominal: float, rms: float, low: float, high: float, lines: int, seed: int) -> SpeedLaw:
     """Random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
 
-    ``lines`` equal lines, one in each of as many equal parts of the band, with frequency and phase drawn
-    from ``seed``: the sum repeats only after many periods and nears a normal distribution.
+    Frequencies and phases of the ``lines`` are drawn from ``seed``, see `lathe_rc.signals.noise.random_lines`.
     """
     if rms == 0.0:
         return SpeedLaw(nominal)
     if not 0.0 < low < high:
         raise InputError(f"random deviation: band {low:g}-{high:g} rad/s; allowed: 0 < low < high")
     random = np.random.default_rng(np.random.SeedSequence([seed, 0x5BEED]))
-    frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
-    phase = random.uniform(0.0, 2.0 * np.pi, lines)
-    amplitude = np.full(lines, rms * np.sqrt(2.0 / lines))
-    return SpeedLaw(nominal, np.stack((amplitude, frequency, phase, np.zeros(lines))))
+    return SpeedLaw(nominal, np.vstack((random_lines(rms, low, high, lines, random), np.zeros(lines))))

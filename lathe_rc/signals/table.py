@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 
 
 def read_text(path: Path, what: str) -> str:
-    """The text of a CSV file that holds ``what``.
+    """Return the text of a CSV file that holds ``what``.
 
     Raises:
         InputError: the file is missing, far too large, or none of text.
@@ -34,6 +34,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _number(text: str, path: Path, line: int) -> float:
+    """Read a finite number."""
     try:
         number = float(text)
     except ValueError:

@@ -22,7 +22,7 @@ _FIRST_LOOK = 256  # points that are looked at together; twice as many after eac
 
 
 def read(path: Path) -> tuple[Array, Array]:
-    """Times after the first row [s] and speeds [1/min] of a file, shape (n,) each.
+    """Return times after the first row [s] and speeds [1/min] of a file, shape (n,) each.
 
     Raises:
         InputError: the file is missing or malformed, times do not rise, or a speed is not above 0.
@@ -109,7 +109,7 @@ class Thinner:
         self._look()
 
     def finish(self) -> tuple[Array, Array]:
-        """Times and values of the points that were picked, the first and the last one among them; shape (m,) each."""
+        """Return times and values of the picked points, the first and the last point among them; shape (m,) each."""
         while self._reached is not None:
             self._pick()
             self._look()
@@ -117,20 +117,22 @@ class Thinner:
         return found[:, 0], found[:, 1]
 
     def _open(self) -> None:
-        """Any slope will do, as long as no point after the picked one has been looked at."""
+        """Allow any slope: no point after the picked one has been looked at yet."""
         self._seen, self._low, self._high = 0, -np.inf, np.inf
 
     def _drop(self, count: int) -> None:
+        """Forget the first points after the picked or the reached one."""
         self._time, self._value = self._time[count:], self._value[count:]
 
     def _pick(self) -> None:
+        """Begin the next line at the last point that this one reaches."""
         assert self._reached is not None, "the first point after the picked one can be reached"
         self._picked.append(self._reached)
         self._reached = None
         self._open()
 
     def _look(self) -> None:
-        """Go through the points that have not been looked at, as far as they allow a line, and on from there."""
+        """Go through the points that have not been looked at, and pick one wherever no line passes all."""
         count = _FIRST_LOOK
         while self._seen < self._time.size:
             time, value = self._time[self._seen :][:count], self._value[self._seen :][:count]
@@ -139,6 +141,7 @@ class Thinner:
             high = np.minimum(np.minimum.accumulate((rise + self._tolerance) / since), self._high)
             closed = np.flatnonzero(low > high)
             end = int(closed[0]) if closed.size else since.size
+            # A line to a point passes those before it if its slope is between the ``low`` and ``high`` of that point.
             slope = rise[:end] / since[:end]
             fits = np.flatnonzero((low[:end] <= slope) & (slope <= high[:end]))
             self._seen += end

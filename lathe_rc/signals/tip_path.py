@@ -17,14 +17,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.profile import Profile
 from lathe_rc.signals.profile_table import ProfileTable
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _POINTS = 8192  # of the form, between which its path is interpolated
@@ -32,7 +30,7 @@ _POINTS = 8192  # of the form, between which its path is interpolated
 
 @dataclass(frozen=True)
 class TipPath:
-    """Where a round tip has to be to turn a form; itself a `Profile`.
+    """Path of a round tip that turns a form; itself a `Profile`.
 
     Attributes:
         form: of the part.
@@ -55,11 +53,11 @@ class TipPath:
 
     @property
     def heights(self) -> Array:
-        """Those of the form."""
+        """Heights of the form."""
         return self.form.heights
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """See `Profile`: displacement of the tip's foremost point from R."""
+        """Displacement [m] of the tip's foremost point from R, see `Profile`."""
         at = np.linspace(0.0, _TURN, _POINTS + 1)
         values = self.form.deviation(at, height)
         values[-1] = values[0]
@@ -83,7 +81,7 @@ class TipPath:
 
 @dataclass(frozen=True)
 class Fall:
-    """Where a form falls most.
+    """Steepest fall of a form.
 
     Attributes:
         slope: -tan β, above 0 where it falls.
@@ -97,12 +95,12 @@ class Fall:
 
     @property
     def clearance(self) -> float:
-        """That a tool needs here [rad]."""
+        """Clearance angle that a tool needs here [rad]."""
         return math.atan(self.slope)
 
 
 def steepest_fall(form: ProfileTable, radius: float, feed: float) -> Fall:
-    """Where the form of a part of ``radius`` [m] falls most towards the edge, along a path of ``feed`` [m/rev]."""
+    """Find the steepest fall towards the edge on a part of ``radius`` [m], along a path of ``feed`` [m/rev]."""
     points = form.table.shape[1]
     value, slope = form.table[..., 3], form.table[..., 2] * points / _TURN
     along = np.zeros_like(value)

@@ -10,12 +10,12 @@ Fig. 4 and eq. 6.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
+from lathe_rc.signals.checks import stacked
+from lathe_rc.signals.noise import random_lines
 
 
 @kernel
@@ -41,19 +41,11 @@ def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
     Raises:
         InputError: arrays of different lengths.
     """
-    if not amplitude.size == frequency.size == phase.size:
-        raise InputError(
-            f"vibration: {amplitude.size} amplitudes, {frequency.size} frequencies and {phase.size} phases; "
-            "give as many of each"
-        )
-    return np.stack((amplitude, frequency, phase))
+    return stacked("vibration", amplitudes=amplitude, frequencies=frequency, phases=phase)
 
 
 def band_limited_random(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
-    """Random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s] as lines, shape (3, ``lines``).
-
-    The lines are equal, one in each of as many equal parts of the band, with frequency and phase drawn from
-    ``random``: the sum repeats only after many periods and nears a normal distribution.
+    """Random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s]: `random_lines`, none without an RMS.
 
     Raises:
         InputError: a band that is none.
@@ -62,6 +54,4 @@ def band_limited_random(rms: float, low: float, high: float, lines: int, random:
         return np.empty((3, 0))
     if not 0.0 < low < high:
         raise InputError(f"random vibration: band {low:g}-{high:g} rad/s; allowed: 0 < low < high")
-    frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
-    phase = random.uniform(0.0, 2.0 * np.pi, lines)
-    return np.stack((np.full(lines, rms * np.sqrt(2.0 / lines)), frequency, phase))
+    return random_lines(rms, low, high, lines, random)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of the arrays that a scenario or a third-party class gives."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+def stacked(what: str, **arrays: Array) -> Array:
+    """Stack arrays of one length, shape (m, n).
+
+    Args:
+        what: the subject of the message.
+        **arrays: by their names in the message; shape (n,).
+
+    Raises:
+        InputError: arrays of different lengths.
+    """
+    if len({array.size for array in arrays.values()}) > 1:
+        *sizes, last = (f"{array.size} {name}" for name, array in arrays.items())
+        raise InputError(f"{what}: {', '.join(sizes)} and {last}; give as many of each")
+    return np.stack(tuple(arrays.values()))
+
+
+def real_numbers(call: str, result: object, argument: str, like: Array) -> Array:
+    """The result of a formula in plain Python, if it is a real number for each argument.
+
+    Args:
+        call: of the formula, for the message.
+        result: shape (n,).
+        argument: plural of what the formula takes, for the message.
+        like: the arguments, shape (n,).
+
+    Raises:
+        InputError: another shape or type; numbers that are not finite pass.
+    """
+    numbers = np.asarray(result)
+    if numbers.shape != like.shape or numbers.dtype.kind not in "fiu":
+        raise InputError(
+            f"{call} gives {numbers.dtype} of shape {numbers.shape} for {argument} of shape {like.shape}; "
+            "allowed: a real number for each"
+        )
+    return numbers
