@@ -25,7 +25,7 @@ _TOGETHER = 16  # revolutions that are looked at at once
 
 
 def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
-    """The part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
+    """Measure the part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
 
     Args:
         recording: of the run; with a tool.
@@ -46,13 +46,13 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
 
 
 def tolerances(scenario: Scenario) -> dict[str, float]:
-    """Tolerance [m] by relative topic of each tool that has one."""
+    """Return the tolerance [m] by relative topic of each tool that has one."""
     tools = [table for table in scenario.nodes.values() if isinstance(table, ToolParameters)]
     return {remapped(table, "tool"): table.tolerance for table in tools if table.tolerance}
 
 
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
-    """Whether the part that a run of a scenario has turned is in tolerance; None if its tool has no tolerance."""
+    """Judge whether the part of a run is in tolerance; None if its tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
@@ -61,7 +61,7 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
 
 
 def error_growth(recording: Recording) -> Growth | None:
-    """The growth of the form error of a run; see `lathe_rc.analysis.tolerance.growth`."""
+    """Return the growth of the form error of a run; see `lathe_rc.analysis.tolerance.growth`."""
     return growth(recording.errors.largest, _turns_before(recording))
 
 
@@ -71,7 +71,7 @@ def _turns_before(recording: Recording) -> int:
 
 
 def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay:
-    """The surface along the part that a run has turned; see `lathe_rc.analysis.metrology.lay`.
+    """Measure the surface along the part that a run has turned; see `lathe_rc.analysis.metrology.lay`.
 
     Args:
         recording: of the run.
@@ -84,7 +84,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
 
 
 def along(found: Lay) -> dict[str, Any]:
-    """The figures of the surface along the part; lengths in µm, the feed in µm a revolution."""
+    """Figures of the surface along the part; lengths in µm, the feed in µm a revolution."""
     rt, ra = found.rt * 1e6, found.ra * 1e6
     return {
         "revolutions": found.revolutions,
@@ -97,7 +97,7 @@ def along(found: Lay) -> dict[str, Any]:
 
 
 def along_in_words(found: Lay) -> str:
-    """The same as a line."""
+    """Figures of the surface along the part as a line of text."""
     told = along(found)
     return (
         f"along the part, last {told['revolutions']} revolutions at {told['feed']:.4g} µm/rev: Ra {told['ra']:.3g} µm, "
@@ -127,7 +127,7 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
 
 
 def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
-    """The first topic of each of the two types, where there is one."""
+    """Topics of encoder and tool, the first of each; None where there is none."""
     kinds = (messages.ENCODER, messages.TOOL)
     return [next((topic for topic, found in types.items() if found == kind), None) for kind in kinds]
 
@@ -144,7 +144,7 @@ class ErrorsByRevolution:
         self._errors: RunningErrors | None = None
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a piece of the run, see `lathe_rc.cell.engine.Sink`."""
         encoder, tool = self._topics
         if encoder is None or tool is None:
             return
@@ -176,7 +176,7 @@ class FirstAndLast:
         self._before = 0  # revolutions before the tail
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a piece of the run, see `lathe_rc.cell.engine.Sink`."""
         named = {full(topic): signals for topic, signals in dense.items()}
         angle, error = named[self._encoder]["angle_true"], named[self._tool]["error"]
         piece = np.stack([angle, error])[:, that_count(angle, error)]
@@ -186,6 +186,7 @@ class FirstAndLast:
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)
         self._tail = np.concatenate([self._tail, piece], axis=1)
+        # Filters need the revolutions before the last one; older ones are dropped, so that memory does not grow.
         past = int(self._tail[0, -1] / (2.0 * np.pi)) - _TOGETHER
         if past > self._before:
             self._before = past

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.compiled.struct_view import sized
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 
-Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Hold = Literal["zoh", "foh", "tustin"]
 
@@ -133,6 +133,23 @@ def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
     return np.asarray(a, np.float64), b, c, float(top[0])
 
 
+def hold_response(a: Array, b: Array, step_s: float) -> tuple[Array, Array, Array]:
+    """Φ of a step of x' = a·x + b·u, and what u = 1 adds to x in it, held, and as a ramp from 0 to 1; step in s."""
+    order = a.shape[0]
+    block = np.zeros((order + 2, order + 2))
+    block[:order, :order], block[:order, order] = a, b
+    block[order, order + 1] = 1.0 / step_s if step_s else 0.0
+    whole = scipy.linalg.expm(block * step_s)
+    return whole[:order, :order], whole[:order, order], whole[:order, order + 1]
+
+
+def bilinear(a: Array, b: Array, step_s: float) -> tuple[Array, Array]:
+    """Φ of x' = a·x + b·u by the bilinear rule, and the weight of u at both ends of a step [s]."""
+    one = np.eye(a.shape[0])
+    left = np.linalg.inv(one - a * step_s / 2.0)
+    return left @ (one + a * step_s / 2.0), left @ b * (step_s / 2.0)
+
+
 def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     """Discretise a transfer function.
 
@@ -147,14 +164,10 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     if not order:
         return System(a, column, column, c, through)
     if hold == "tustin":
-        left = np.linalg.inv(np.eye(order) - a * step_s / 2.0)
-        transition = left @ (np.eye(order) + a * step_s / 2.0)
-        before = now = left @ column * (step_s / 2.0)
+        transition, now = bilinear(a, column, step_s)
+        before = now
     else:
-        whole = np.zeros((order + 2, order + 2))
-        whole[:order, :order], whole[:order, order], whole[order, order + 1] = a, column, 1.0 / step_s
-        whole = scipy.linalg.expm(whole * step_s)
-        transition, held, rising = whole[:order, :order], whole[:order, order], whole[:order, order + 1]
+        transition, held, rising = hold_response(a, column, step_s)
         before, now = (held, np.zeros(order)) if hold == "zoh" else (held - rising, rising)
     return System(
         np.ascontiguousarray(transition), np.ascontiguousarray(before), np.ascontiguousarray(now),

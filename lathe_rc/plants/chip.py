@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chip of a sample, the force that it makes, and what that does to the edge: the cut for kernels.
+"""The cut for kernels: chip of a sample, its force, deflection of the edge, remembered surface.
 
 The equations are those of `lathe_rc.plants.cutting`. Here they stand sample by sample, so that what moves the edge can
 be solved together with the chip, see `lathe_rc.plants.tool_drive`.
@@ -12,16 +12,14 @@ angles.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.cutting_force import Flank, SpecificForce, Wear, cutting_stiffness, flank_damping
 from lathe_rc.plants.workpiece import hardness, missing
 from lathe_rc.transfer import System, step
-
-Array = npt.NDArray[np.float64]
 
 # Places in what is known of the last sample: its place on the grid, what it left, the next grid point.
 _PLACE, _LEFT, _NEXT = 0, 1, 2
@@ -40,7 +38,7 @@ class SurfaceTable(NamedTuple):
 
 
 def blank(grid: int) -> SurfaceTable:
-    """Nothing has been cut; ``grid`` points in a revolution."""
+    """Surface of an uncut part, with ``grid`` points in a revolution."""
     # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
     return SurfaceTable(np.zeros(1 << (2 * grid + 2).bit_length()), np.array([np.nan, 0.0, 0.0]))
 
@@ -62,10 +60,11 @@ def surface_at(ring: Array, place: float) -> float:
 
 @kernel
 def remember(ring: Array, last: Array, place: float, left: float) -> None:
-    """Lay down what the edge left [m] between the last sample and this one, at ``place`` [grid point]."""
+    """Interpolate the surface that the edge left [m] from the last sample to this one, at ``place`` [grid point]."""
     mask = ring.size - 1
     if np.isnan(last[_PLACE]):
         last[_PLACE], last[_LEFT], last[_NEXT] = place, left, np.ceil(place)
+    # Each grid point between the two samples; at a slow spindle most samples pass none.
     while last[_NEXT] <= place:
         u = 0.0
         if place > last[_PLACE]:
@@ -137,7 +136,8 @@ class CutTable(NamedTuple):
 
 @inlined
 def _free(system: System, state: Array) -> float:
-    """The next output if the input were 0; the state stays."""
+    """Next output of a system with an input of 0; the state stays."""
+    # `step` would move the state, and the chip needs this output before the force that is the input is known.
     order = system.now.size
     value = 0.0
     for row in range(order):
@@ -150,7 +150,7 @@ def _free(system: System, state: Array) -> float:
 
 @inlined
 def pressed_by(process: Process, speed: float, wear: float) -> float:
-    """The loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    """Loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
     if process.flank.pressure == 0.0:
         return 0.0
     damping = flank_damping(process.flank, process.radius * speed, wear)
@@ -161,7 +161,7 @@ def pressed_by(process: Process, speed: float, wear: float) -> float:
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """The cut at ``place`` [grid point]: the reason to stop, feed, K, and σ·c; nothing changes."""
+    """Conditions of the cut at ``place`` [grid point]: the reason to stop, feed, K, and σ·c; nothing changes."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0
@@ -175,13 +175,13 @@ def meet(
 
 @inlined
 def held(cut: CutTable) -> float:
-    """Force [N] that a sample has without a chip: what the lag keeps."""
+    """Force [N] of a sample without a chip, which its lag keeps from before."""
     return _free(cut.process.lag, cut.lag_state)
 
 
 @inlined
 def _moved(cut: CutTable, base: float) -> float:
-    """How far the edge is from where it was a sample before, as far as the tool is not bent [m]."""
+    """Motion of the edge since the last sample, without its deflection [m]."""
     before = cut.state[_EDGE]
     return 0.0 if np.isnan(before) else base - before
 
@@ -205,12 +205,14 @@ def chip_of(
     the chip adds to it. ``pressed``: see `pressed_by`; where it is not 0, ``give`` is.
     """
     process, lag_now = cut.process, cut.process.lag_now
+    # The chip that a rigid edge would have, then what force and flank of this sample take from it: with contact all of
+    # that is linear in the chip, so that one division solves it. A chip below 0 says that there is no contact.
     chip = process.depth + allowance - cross_position - displacement
     if process.overlap > 0.0:
         chip += process.overlap * surface_at(cut.surface.ring, place - process.grid)
     follows = 1.0 + process.mode_now * pressed * compliance
     bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
-    if not 1.0 + bend > 0.0:
+    if not 1.0 + bend > 0.0:  # the edge would be drawn in by all of the chip, or more
         return np.nan
     lagging = held(cut) - pressed * _moved(cut, cross_position + displacement)
     chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * lagging) / follows
@@ -222,7 +224,7 @@ def chip_of(
 def press(
     cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float, base: float, pressed: float
 ) -> tuple[float, float]:
-    """Step force [N] and deflection [m] on by a sample with a chip of 0 or more; the tool wears.
+    """Step force [N], deflection [m] and wear of the tool by a sample with a chip of 0 or more.
 
     ``base``: place of the edge but for its deflection [m]; ``pressed``: see `pressed_by`.
     """
@@ -241,14 +243,14 @@ def press(
 
 @inlined
 def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
-    """Remember where the edge [m] is, and where it has been if that is met again."""
+    """Remember the place of the edge [m], and the surface that it left if that is met again."""
     if cut.process.overlap > 0.0:
         remember(cut.surface.ring, cut.surface.last, place, edge if chip > 0.0 else 0.0)
     cut.state[_EDGE] = edge
 
 
 def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
-    """Why a cut cannot go on at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
+    """Return the error of a cut that cannot go on at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
     if reason == _STANDS:
         return LatheError(
             f"the spindle's speed is {speed:.6g} rad/s in the cut; allowed: above 0 (reduce its deviation)"

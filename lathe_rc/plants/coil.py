@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,20 +64,21 @@ class CoilTable(NamedTuple):
 
 
 def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
-    """A coil at rest.
+    """Table of a coil at rest.
 
     Args:
         coil: None: there is none.
         step: sampling step [s].
         kept: samples of which it is kept whether something was cut off, a power of two.
     """
+    values = coil or Coil(0.0, 0.0, 0.0)
     return CoilTable(
         on=coil is not None,
-        proportional=coil.bandwidth * coil.inductance if coil else 0.0,
-        integral=coil.bandwidth * coil.resistance if coil else 0.0,
-        current_limit=coil.current_limit if coil else np.inf,
-        voltage_limit=coil.voltage_limit if coil else np.inf,
-        slew=coil.slew_rate * step if coil else np.inf,
+        proportional=values.bandwidth * values.inductance,
+        integral=values.bandwidth * values.resistance,
+        current_limit=values.current_limit,
+        voltage_limit=values.voltage_limit,
+        slew=values.slew_rate * step,
         step=step,
         state=np.zeros(2),
         limited=np.zeros(kept, np.uint8),
@@ -94,7 +94,7 @@ def applied(coil: CoilTable, n: int, asked: float, current: float) -> float:
     integral = coil.state[0] + error * coil.step
     given = coil.proportional * error + coil.integral * integral
     voltage = min(max(given, -coil.voltage_limit), coil.voltage_limit)
-    if voltage == given:
+    if voltage == given:  # else the integral would wind up against the limit
         coil.state[0] = integral
     coil.state[1] = demand
     coil.limited[n & (coil.limited.size - 1)] = demand != asked or voltage != given

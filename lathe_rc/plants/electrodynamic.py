@@ -10,9 +10,8 @@ carriage's acceleration asks for, i = m·x''/k.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, put
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
 
@@ -28,9 +27,6 @@ def between_stops(position: float, velocity: float, stroke: float) -> tuple[floa
     if position < -stroke:
         return -stroke, max(velocity, 0.0)
     return position, velocity
-
-
-Array = npt.NDArray[np.float64]
 
 
 class CoarseTable(NamedTuple):
@@ -61,11 +57,12 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
     """Step the drive through a block, see `ElectrodynamicDrive.block`."""
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
     spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
+    # Scalars in locals: the compiler cannot know that the output arrays do not overlap the matrices.
     a, w = drive.transition, drive.weights
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
     w00, w01, w02, w10, w11, w12 = w[0, 0], w[0, 1], w[0, 2], w[1, 0], w[1, 1], w[1, 2]
     x, v = state[0], state[1]
-    sent = np.concatenate((line, command))
+    sent = np.concatenate((line, command))  # one array, so that the loop needs neither a ring nor a branch
     for k in range(command.size):
         u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
         new_x = a00 * x + a01 * v + w00 * u0 + w01 * u1 + w02 * u2

@@ -31,6 +31,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.compiled.struct_view import sized
 from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
@@ -42,13 +43,12 @@ from lathe_rc.plants.screw import Screw, ScrewTable, nut, nut_speed, warm
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
 
-Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 
 @kernel
 def follow(load: float, half: float, motor: float) -> float:
-    """Where the load is once the motor has moved straight to ``motor``.
+    """Position of the load once the motor has moved straight to ``motor``: it moves only when a flank pushes it.
 
     Args:
         load: where it was, within ``half`` of where the motor was [m].
@@ -74,7 +74,7 @@ class LimitTable(NamedTuple):
 
 @inlined
 def keep_within(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
-    """Keep a command within its limits; ``state`` is the drive's. The first of ``memory`` is what is given."""
+    """Keep a command within its limits, by the ``state`` of the drive; ``memory[0]`` is the limited command."""
     if limits.coming.size == 0:
         return keep_position(limits.limits, limits.step, memory, command)
     coming = 0.0
@@ -84,7 +84,7 @@ def keep_within(limits: LimitTable, memory: Array, state: Array, command: float)
 
 
 def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
-    """The limits of a drive's command, taken every ``step`` [s]."""
+    """Return the limits of a drive's command that is taken every ``step`` [s]."""
     gain, integrates = settles(model)
     if limits.any and not gain:
         raise InputError(
@@ -155,7 +155,7 @@ def load_of(state: Array) -> float:
 
 @inlined
 def _rub(table: DriveTable, state: Array) -> None:
-    """Take friction from the next values, which stand behind the present ones."""
+    """Subtract friction from the next values, which stand behind the present ones."""
     order = table.weights.size
     speed, free, gained = state[1], state[order + 1], table.rubbed[1]
     force, rests = 0.0, False
@@ -190,6 +190,8 @@ def move(table: DriveTable, state: Array) -> bool:
     if limited:
         state[0] = before + min(max(travel, -table.furthest), table.furthest)
         state[1] = min(max(speed, -table.speed_limit), table.speed_limit)
+        # A drive that would accelerate further gets derivatives of 0 under the command that just keeps this speed (the
+        # states lack what the command adds at once), so that it slows down as soon as its command falls.
         if order > 2 and (state[2] + table.jumps[1] * effort) * speed > 0.0:
             enough = min(max(effort, -table.needed), table.needed)
             for row in range(2, order):
@@ -277,7 +279,7 @@ def advance(
 
 
 def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
-    """The loss of position, speed, … by 1 N of friction, held over a step, shape (m,).
+    """Loss of position, speed, … by 1 N of friction, held over a step, shape (m,).
 
     Raises:
         InputError: the friction acts on a lag that the drive does not have.

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
-
-Array = npt.NDArray[np.float64]
 
 APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
 FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
@@ -50,7 +48,7 @@ def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> 
 
 @lru_cache(maxsize=64)
 def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> TransferFunction:
-    """The same of lags that can be looked up: each variation of a cell asks for the models of its drives."""
+    """`dc_screw`, cached: each variation of a cell asks for the models of its drives."""
     if not all(lag > 0.0 for lag in lags):
         raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
     bottom = np.array([1.0, 0.0])
@@ -91,7 +89,7 @@ def realise(model: TransferFunction) -> tuple[Array, Array]:
 
 
 def settles(model: TransferFunction) -> tuple[float, bool]:
-    """The motion that a command of 1 asks for, 0 if neither a position nor a speed, and whether it is a speed."""
+    """Return the position or speed that a command of 1 settles at, 0 if neither, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
     divisor = model.denominator[-2 if integrates else -1]
     return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

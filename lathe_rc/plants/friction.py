@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction of a slide: what its force takes from the speed of the motor, within a step.
+"""Friction of a slide, solved together with the speed of the motor within a step.
 
     g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve, of the dry part
     stribeck   F = g(v)·sgn v + Fv·v; at rest what holds the slide, up to Fs
@@ -112,7 +112,7 @@ def mobility(velocity_gain: float, lag: float, motor_force: float) -> TransferFu
 
 
 def no_friction(step: float) -> FrictionTable:
-    """The table of none."""
+    """Table of a slide without friction."""
     return FrictionTable(NONE, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, step)
 
 
@@ -134,6 +134,7 @@ def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tup
         free: at its end if there were no friction [m/s].
     """
     level = _dry(table, speed)
+    # A force that can bring the speed to 0 in this step does just that: the slide never swings about its rest.
     if abs(free) <= gained * level:
         return free / gained, True
     force = level if free > 0.0 else -level
@@ -143,6 +144,7 @@ def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tup
 @inlined
 def bend(table: FrictionTable, gained: float, speed: float, free: float, bristle: float) -> tuple[float, float]:
     """Force of a step by LuGre [N], and the bristles at its end [m]; arguments as of `slide`, and z at its start."""
+    # Implicit Euler in the bristles, with |v|/g of the start: stable at any stiffness, and F linear in the new speed.
     relaxed = 1.0 / (1.0 + table.step * table.stiffness * abs(speed) / _dry(table, speed))
     hard = table.stiffness + table.damping / table.step
     held = (hard * relaxed - table.damping / table.step) * bristle

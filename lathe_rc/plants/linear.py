@@ -8,17 +8,17 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.transfer import bilinear, hold_response
 
-Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Discretisation = Literal["foh", "tustin"]
 
 
 class Constant:
-    """Base of what is made of constants alone and gives the same for ever; those that are alike are one."""
+    """Base of objects that consist of constants; caches share one object between all that are alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +47,13 @@ class DiscretePlant(Constant):
 
 @inlined
 def _square(number: complex) -> float:
+    """Squared magnitude, without the square root of ``abs``."""
     return number.real * number.real + number.imag * number.imag
 
 
 @inlined
 def _quotient(above: complex, below: complex) -> complex:
-    """Not finite where ``below`` is 0."""
+    """Quotient of complex numbers; not finite where ``below`` is 0."""
     square = _square(below)
     real = above.real * below.real + above.imag * below.imag
     return complex(real / square, (above.imag * below.real - above.real * below.imag) / square)
@@ -95,7 +96,7 @@ def _respond(transition: Array, weights: Array, back: Complex, late: Complex, in
 
 @lru_cache(maxsize=64)
 def _response(plant: DiscretePlant, content: bytes) -> Complex:
-    """The response of the bytes of the frequencies: checks of cells that are alike ask for the same."""
+    """Response at frequencies given as bytes, cached: the checks of cells that are alike ask for the same."""
     back = _delayed(content, plant.step)
     found = np.empty_like(back)
     _respond(plant.transition, plant.weights, back, _delayed(content, plant.step * plant.delay), found)
@@ -104,18 +105,8 @@ def _response(plant: DiscretePlant, content: bytes) -> Complex:
 
 @lru_cache(maxsize=64)
 def _delayed(content: bytes, time: float) -> Complex:
-    """exp(-jω·time) of the bytes of the frequencies."""
+    """exp(-jω·time) at frequencies given as bytes, cached: many plants share step and delay."""
     return np.asarray(np.exp(-1j * time * np.frombuffer(content)))
-
-
-def _foh(a: Array, b: Array, step: float) -> tuple[Array, Array, Array]:
-    """Φ and the weights of the input at the start and at the end of a step, exact for an input linear in it."""
-    order = a.shape[0]
-    block = np.zeros((order + 2, order + 2))
-    block[:order, :order], block[:order, order], block[order, order + 1] = a, b, 1.0 / step if step else 0.0
-    whole = scipy.linalg.expm(block * step)
-    end = whole[:order, order + 1]
-    return whole[:order, :order], whole[:order, order] - end, end
 
 
 def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisation) -> DiscretePlant:
@@ -134,7 +125,7 @@ def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisa
 
 @lru_cache(maxsize=64)
 def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, method: Discretisation) -> DiscretePlant:
-    """The same of the bytes of a and b: cells that are alike share it, and what it has computed of itself."""
+    """`discretise` of matrices given as bytes, cached: cells that are alike share a plant and its responses."""
     b = np.frombuffer(b_bytes)
     a, samples = np.frombuffer(a_bytes).reshape(b.size, b.size), delay / step
     # Less than a billionth of a step is rounding, on either side, and its inverse would overflow.
@@ -143,16 +134,15 @@ def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, meth
     weights = np.zeros((a.shape[0], 3))
     if method == "foh":
         # The delayed input has its kink `part` of a step after each sample: integrate up to it, then on.
-        first, start_1, end_1 = _foh(a, b, part * step)
-        second, start_2, end_2 = _foh(a, b, (1.0 - part) * step)
+        first, held_1, end_1 = hold_response(a, b, part * step)
+        second, held_2, end_2 = hold_response(a, b, (1.0 - part) * step)
+        start_1, start_2 = held_1 - end_1, held_2 - end_2
         transition = second @ first
         weights[:, 0] = (1.0 - part) * end_2
         weights[:, 1] = second @ ((1.0 - part) * start_1 + end_1) + start_2 + part * end_2
         weights[:, 2] = second @ (part * start_1)
     else:
-        left = np.linalg.inv(np.eye(a.shape[0]) - a * step / 2.0)
-        transition = left @ (np.eye(a.shape[0]) + a * step / 2.0)
-        gain = left @ b * (step / 2.0)
+        transition, gain = bilinear(a, b, step)
         weights[:] = np.outer(gain, [1.0 - part, 1.0, part])
     return DiscretePlant(transition, weights, whole, part, step)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The screw of a feed drive: where its nut is when the motor says x.
+"""The screw of a feed drive: position of its nut when the motor is at x.
 
     nut = x + s·x + a·(sin(2π·x/P + ψ) - sin ψ) + α·ΔT·(x - x0)
     T·dΔT/dt = R·|v| + A - ΔT
@@ -48,7 +48,7 @@ class Screw(NamedTuple):
     anchor: float = 0.0
 
     def check(self) -> None:
-        """Refuse what is no screw.
+        """Refuse values that no screw has.
 
         Raises:
             InputError: a value that is out of its range, or a wave so steep that the nut would go back.
@@ -102,7 +102,7 @@ def warm(table: ScrewTable, rise: float, speed: float) -> float:
 
 @inlined
 def nut(table: ScrewTable, rise: float, place: float) -> float:
-    """Where the nut is [m] when the motor is at ``place`` [m]; ``rise`` is ΔT [K]."""
+    """Position of the nut [m] when the motor is at ``place`` [m]; ``rise`` is ΔT [K]."""
     errors = table.errors
     wave = errors.amplitude * (np.sin(table.wave * place + errors.phase) - table.offset)
     return float(place + errors.slope * place + wave + errors.expansion * rise * (place - errors.anchor))

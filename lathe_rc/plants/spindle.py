@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A spindle that the cut slows: motor, belt and spindle, a speed loop, and the torque of the cutting force.
 
-The speed law is what the spindle would do without a load; here stands by how much it does something else. With the
+The speed law is the motion of the spindle without a load; here are the deviations from it. With the
 deviations δ of the spindle's angle and ϑ of the motor's, all referred to the spindle,
 
     J·δ''  = B - r·F,       B = k·(ϑ - δ) + c·(ϑ' - δ')
@@ -20,12 +20,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, put
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise
-
-Array = npt.NDArray[np.float64]
 
 _DONE, _OVERLOADED, _OUT_OF_SPEED = 0, 1, 2
 _INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # places in the memory of the loop
@@ -33,7 +31,7 @@ _INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # places in the memory of the loop
 
 @dataclass(frozen=True)
 class Belt:
-    """Between motor and spindle; referred to the spindle.
+    """Belt between motor and spindle; referred to the spindle.
 
     Attributes:
         stiffness: k [N·m/rad].
@@ -110,6 +108,7 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
         error = -state[spindle.measured]
         integral = loop[_INTEGRAL] + error * step
         asked = spindle.proportional * error + spindle.integral * integral
+        # The motor also provides the torque of the law, which takes its part of the limit but is not published.
         own = spindle.inertia * ((speed[k] - loop[_SPEED]) / step) if n > 0 else 0.0
         wanted = asked + own
         given = min(max(wanted, -spindle.torque_limit), spindle.torque_limit)
@@ -119,7 +118,7 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
             loop[_INTEGRAL] = integral
         spindle.limited[n & (spindle.limited.size - 1)] = limited
         load = spindle.radius * force[k]
-        for i in range(order):
+        for i in range(order):  # into another array, since each row needs the whole old state
             new[i] = spindle.motor[i] * torque[k] + spindle.load[i, 0] * load + spindle.load[i, 1] * loop[_LOAD]
             for j in range(order):
                 new[i] += transition[i, j] * state[j]
@@ -203,7 +202,7 @@ class LoadedSpindle:
             )
 
     def _largest_pole(self) -> float:
-        """Of the loop without a limit; δ itself, which nothing brings back, is left out."""
+        """Largest pole of the loop without a limit; δ itself, which no control brings back, is left out."""
         table = self.table
         order = table.state.size
         row = np.zeros(order + 1)
@@ -242,7 +241,7 @@ class LoadedSpindle:
 
 
 def failure(reason: int, spindle: SpindleTable, angle: float, force: float) -> LatheError:
-    """Why a spindle cannot go on, at an angle [rad] with a cutting force [N]."""
+    """Return the error of a spindle that cannot go on, at an angle [rad] with a cutting force [N]."""
     if reason == _OVERLOADED:
         return LatheError(
             f"the cut loads the spindle with {spindle.radius * force:.4g} N·m at {angle:.6g} rad; allowed: up to "

@@ -38,6 +38,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
@@ -46,7 +47,6 @@ from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, se
 from lathe_rc.plants.piezo import Stack, StackTable
 from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
 
-Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2'
@@ -79,7 +79,7 @@ class Piezo:
 
 
 def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
-    """The same plant with another state as the first, whose response is asked for."""
+    """Return the plant with another state as the first, since `DiscretePlant.response` is that of the first."""
     order = np.roll(np.arange(plant.transition.shape[0]), -place)
     return DiscretePlant(
         plant.transition[np.ix_(order, order)], plant.weights[order], plant.delay, plant.fraction, plant.step
@@ -172,6 +172,7 @@ class ToolDrive:
             extends[1], extends[3] = -piezo.mass_ratio * stiff, stiff
         if radial:
             loads[tool + 1] = 1.0 / mass_of_tool
+        # Without a coil the servo's force acts at once, and `a` stays the same array as `servo`.
         a = servo = free.copy()
         servo[1, 0] -= spring
         servo[1, 1] -= damper
@@ -252,6 +253,7 @@ class ToolDrive:
         return motion | of_cut
 
     def _check(self, coil: Coil) -> None:
+        """Refuse a current loop that oscillates."""
         radius = float(np.abs(np.linalg.eigvals(self._closed()[0])).max())
         if radius >= 1.0:
             raise InputError(
@@ -260,7 +262,7 @@ class ToolDrive:
             )
 
     def _closed(self) -> tuple[Array, Array]:
-        """Transition of state and current loop's integral without limits, and the weight of the wanted position."""
+        """Closed current loop without limits: transition of state and integral, and weight of the wanted position."""
         table, coil = self.table, self.table.coil
         order = table.state.size
         # U of the state before: (kp + ki·h)·(i* - i) + ki·integral
@@ -295,6 +297,7 @@ class ToolDrive:
         return np.asarray(np.linalg.solve(left, right[:, :, None])[:, place, 0].reshape(wanted.shape))
 
     def _with_feedback(self, alone: Complex, frequency: npt.ArrayLike) -> Complex:
+        """Response under direct compensation, from the one without it."""
         if self._piezo is None or not self._piezo.feedback:
             return alone
         reaction = self._piezo.stack.linear.response(frequency) * self._of(_CARRIAGE, frequency, command=False)
@@ -312,6 +315,7 @@ class ToolDrive:
 
 
 def _no_stack(step: float) -> Stack:
+    """Stack for the table of a drive without a piezo; the kernels do not step it."""
     return Stack(
         stroke=1.0, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
         step=step, method="foh",

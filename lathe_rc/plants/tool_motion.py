@@ -7,9 +7,8 @@ The equations are those of `lathe_rc.plants.tool_drive`.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, put
 from lathe_rc.compiled.struct_view import sized
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
@@ -29,8 +28,6 @@ from lathe_rc.plants.coil import CoilTable, applied
 from lathe_rc.plants.electrodynamic import between_stops
 from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
 from lathe_rc.signals.noise import quantise
-
-Array = npt.NDArray[np.float64]
 
 _ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
 _TURN = 2.0 * np.pi
@@ -103,7 +100,7 @@ class MotionTable(NamedTuple):
 
 @inlined
 def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
-    """Fill what the drives do without the extension and the force of sample ``n``; returns the delayed command [m]."""
+    """Fill the motion without extension and force of sample ``n``; returns the delayed command [m]."""
     line, weights, state = drive.line, drive.weights, drive.state
     transition, coarse, fine, load = weights.transition, weights.coarse, weights.fine, weights.load
     size, delay, part = line.size, drive.delay, drive.part
@@ -113,6 +110,7 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     if drive.coil.on:
         wanted = (1.0 - part) * u1 + part * u2
         asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        # The voltage stands through the step: its whole effect is that of one weight.
         d0, d1, d2 = applied(drive.coil, n, asked, state[state.size - 1]), 0.0, 0.0
     order = transition.shape[0]  # known to the compiler, as that of `free` is not
     for i in range(order):
@@ -181,6 +179,8 @@ def _solve(
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
         return e, chip
+    # Each round shrinks the error by the coupling within a sample, which `ToolDrive` keeps below a half; the last one
+    # changes no bit. The stack has a memory: a round begins from that of the sample before, not from its predecessor's.
     x1 = _carriage(drive, free, drive.before[0], 0.0)
     for _ in range(_ROUNDS):
         guess = x1
@@ -200,7 +200,7 @@ def _solve(
 
 @inlined
 def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: float) -> None:
-    """Where the drives are at the end of the sample, with its extension and its radial force."""
+    """Set the state of the drives at the end of a sample, by its extension and its radial force."""
     state, fine, load = drive.state, drive.weights.fine, drive.weights.load
     for i in range(fine.shape[0]):
         state[i] = free[i] + fine[i, 0] * e + load[i, 0] * pushes
@@ -308,7 +308,7 @@ def advance_loaded(
 
 
 def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
-    """Why drives and cut cannot go on, see `lathe_rc.plants.chip.failure`."""
+    """Return the error of drives and cut that cannot go on, see `lathe_rc.plants.chip.failure`."""
     if reason == _TORN_OFF:
         return LatheError(
             f"the tool's acceleration tears the stack off its preload at {angle:.6g} rad; allowed: more preload, or a "
