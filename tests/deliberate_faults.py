@@ -79,21 +79,9 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "        return all(self.members[name].state != MemberState.JOINING for name in self.master.members)\n",
-        "        return True\n",
-        "members whose topics are not known yet are not waited for",
-    ),
-    Fault(
-        "member",
         "        if self.phase is None:  # the cell may be running already\n            return False\n",
         "",
         "a latecomer does not wait for the state of the cell",
-    ),
-    Fault(
-        "member",
-        '            self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))\n',
-        "            self._leave_due = now\n",
-        "a shutdown in the middle of a run is not told",
     ),
     Fault(
         "member",

@@ -214,6 +214,17 @@ def test_the_schedule_makes_up_half_a_window_and_slips_by_more():
     assert pace.figures()["late"] == 1
 
 
+def test_a_pace_that_is_lost_is_known_after_the_first_second():
+    pace = Pace(block=0.1, window=3, judged=10)
+    for _ in range(9):
+        pace.count(0.2, 1)
+        pace.slip(0.1)
+        assert pace.lag() == 0.0
+    pace.count(0.2, 1)
+    assert pace.lag() == pytest.approx(0.9 / 1.9)
+    assert pace.lag() == 0.0  # said once
+
+
 def test_blocks_come_in_order_whatever_is_repeated():
     """After a restart a source repeats blocks; each counts once."""
     draw, order = np.random.default_rng(3), BlockOrder("/t", "run")

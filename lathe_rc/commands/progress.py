@@ -192,5 +192,6 @@ TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     "not_reached": lambda event: f"{event['node']}: the run ends before {'; '.join(event['events'])}",
     "unchecked": lambda event: f"not checked: {event['message']}",
     "warning": lambda event: f"warning: {event['message']}",
+    "behind": lambda event: str(event["message"]),
     "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
 }  #: what is said of an event in any case

@@ -118,7 +118,7 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
 
 
 def bound_the_end() -> None:
-    """Let SIGALRM end this process if it does not leave: Fast DDS waits for itself for ever in one of some hundred ends."""
+    """Let SIGALRM end this process if it does not leave: in one of some hundred ends Fast DDS waits for itself."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(_LONGEST_END)
 

@@ -23,6 +23,7 @@ from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMaste
 
 _LOOK = 0.02  # [s] between looks at the members
 _BURST = 64  # blocks released before other work gets its turn
+_JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is judged [s], and the part of it that may be lost
 
 
 class SpindleRole(StageRole):
@@ -43,7 +44,9 @@ class SpindleRole(StageRole):
                 "allowed: a speed_factor above 0, or a window"
             )
         block = table.block_size * table.step
-        self.pace = Pace(block / table.speed_factor if table.speed_factor else 0.0, table.window)
+        self.pace = Pace(
+            block / table.speed_factor if table.speed_factor else 0.0, table.window, round(_JUDGED / block)
+        )
         self._reported: deque[Progress] = deque()  # of members in this process
         self._cell: Cell | None = None
 
@@ -184,7 +187,24 @@ class SpindleRole(StageRole):
         self.pace.count(now - due, blocks)
         if now - due > self.pace.most_late:
             self.fall_behind(now - due)
+        if (lag := self.pace.lag()) > _MOST_LAG:
+            self._tell_lag(lag)
         return self.leads.may_release
+
+    def _tell_lag(self, lag: float) -> None:
+        """Say early that the members cannot hold the pace, and a grouping that costs less: fewer processes."""
+        members = self.leads.members.values()
+        processes = {member.process for member in members}
+        recorders = [member.name for member in members if not member.publishes]
+        together = "+".join(m.name.rpartition("/")[2] for m in members if m.name not in recorders)
+        cure = (
+            f"--group {together}"
+            if len(processes) > 1 + len(recorders)
+            else "a smaller speed_factor, a larger block_size"
+        )
+        text = f"the cell holds {1.0 - lag:.0%} of its pace; {self.leads.slowest} is the slowest member; try {cure}"
+        self.node.get_logger().warning(text)
+        self.node.reporter("behind", self.node.get_name(), message=text)
 
     def fall_behind(self, late: float) -> None:
         """Put the schedule off: the members are too slow for the pace."""

@@ -10,6 +10,7 @@ class Pace:
     Args:
         block: wall time that a block takes [s]; 0: as fast as the members follow.
         window: blocks that may be in flight.
+        judged: blocks after which `lag` judges the pace.
 
     Attributes:
         block: see the arguments.
@@ -18,8 +19,8 @@ class Pace:
         lateness: of all blocks, by size.
     """
 
-    def __init__(self, block: float, window: int) -> None:
-        self.block = block
+    def __init__(self, block: float, window: int, judged: int = 0) -> None:
+        self.block, self._judged = block, judged
         self.most_late = max(1, window // 2) * block
         self.schedule = self.slipped = 0.0
         self.lateness = Durations()
@@ -36,6 +37,13 @@ class Pace:
             self.lateness.add(behind)
             self._percentiles.add(behind)
             self._late += behind > self.block
+
+    def lag(self) -> float:
+        """Part of the wanted pace that the first blocks have lost to slips; 0 before and after they are judged."""
+        if self._percentiles.count < self._judged or not self._judged:
+            return 0.0
+        elapsed, self._judged = self._judged * self.block, 0
+        return self.slipped / (elapsed + self.slipped)
 
     def slip(self, late: float) -> None:
         """Put the schedule off [s]: the next blocks would make up for less, and no long burst shall catch up."""
