@@ -56,7 +56,7 @@ def ignore(event: Event) -> None:
 
 @contextlib.contextmanager
 def free_domain(number: int | None = None) -> Iterator[int]:
-    """A ROS domain that no other program on this machine uses; ``number`` if it is given: others leave it alone then."""
+    """A ROS domain that no other program on this machine uses; ``number`` if it is given, and left alone then."""
     from domain_coordinator import domain_id
     from domain_coordinator.impl import PORT_BASE
 
