@@ -28,8 +28,8 @@ class Fault(NamedTuple):
 FAULTS = (
     Fault(
         "member",
-        "        if self.ready:\n            return MemberState.READY\n",
-        "",
+        "            return MemberState.READY  # for",
+        "            return MemberState.WIRED  # for",
         "a member is ready and does not say so",
     ),
     Fault(
@@ -164,12 +164,6 @@ FAULTS = (
         'self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)',
         "self._lose({next(iter(self.completed)): why}, now)",
         "the wrong member is named",
-    ),
-    Fault(
-        "time_master",
-        '        if not self.running:\n            raise ForeignMessage("progress", name, progress.run_id,',
-        '        if False:\n            raise ForeignMessage("progress", name, progress.run_id,',
-        "progress before the run is taken for this run's",
     ),
     Fault(
         "time_master",

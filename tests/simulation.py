@@ -343,8 +343,8 @@ class Process:
             case actions.CheckCell():
                 assert isinstance(self.protocol, TimeMasterProtocol)
                 self.protocol.start(now)
-            case actions.Lose(lost, _, end, _):
-                self._lose(lost, end // SIZE)
+            case actions.Lose():
+                self._lose(action)
             case actions.Leave(patience):
                 # It waits until the others have its messages; or none of them is needed any more.
                 acknowledged = net.acknowledged(self.identity) if patience else now
@@ -395,7 +395,10 @@ class Process:
 
     # ---- role
 
-    def _lose(self, lost: frozenset[str], end: int) -> None:
+    def _lose(self, action: actions.Lose) -> None:
+        if not action.again and self.blocks * SIZE > action.first:
+            self.cell.overrun = f"{self.identity} hears of the safe state after its first sample"
+        lost, end = action.lost, action.end // SIZE
         for name, order in self.orders.items():
             if name in lost and order.held_from is None:
                 self.held[name] = len(self.taken[name])
@@ -566,7 +569,7 @@ class Simulation:
             and not (process.design.restarts or process.namesake)  # one that goes on for another computes blocks again
         ]
         slowest = min(counted, default=master.blocks)
-        if master.blocks - slowest > self.window and not self.overrun:
+        if master.blocks - slowest > self.window:
             self.overrun = f"{master.blocks - slowest} blocks are in flight"
 
     def leave(self, process: Process) -> None:
@@ -767,9 +770,7 @@ class Schedule:
 
 def violations(cell: Simulation) -> list[str]:
     """Promises that a cell has broken, after `Simulation.run`."""
-    # A node whose time master is gone waits for another one, and says so: an operator ends it, or starts that.
-    left = [process for process in cell.processes.values() if process.protocol.master or cell.process_of(cell.master)]
-    found = [f"{process.identity} hangs" for process in left if not process.namesake]
+    found = [f"{process.identity} hangs" for process in cell.processes.values() if not _waits_for_another(process)]
     found += [cell.overrun] if cell.overrun else []
     expected = cell.expected()
     safe = next((values["sample"] // SIZE for _, _, event, values in cell.reports if event == "safe"), cell.length)
@@ -801,6 +802,16 @@ def violations(cell: Simulation) -> list[str]:
     if causes and not any(name in text for name in to_blame for text in causes):
         found.append(f"none of {causes} names {sorted(to_blame)}")
     return found
+
+
+def _waits_for_another(process: Process) -> bool:
+    """Whether the time master of a process is gone, or it is a second node of a name, for which no cell waits.
+
+    It says so, and an operator ends it, or starts another time master.
+    """
+    master = process.protocol.master
+    named = master is not None and process.design.name in master.members
+    return process.namesake or not (named or process.cell.process_of(process.cell.master))
 
 
 def play(seed: int) -> tuple[Simulation, list[str]]:

@@ -155,8 +155,8 @@ class MemberProtocol:
             return MemberState.FAILED
         if self.safe:
             return MemberState.SAFE
-        if self.ready:
-            return MemberState.READY
+        if self.ready and self.master is not None and self.own.name in self.master.members:
+            return MemberState.READY  # for a time master that names others alone this one is an observer
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
     def hear_member(self, member: Announcement, now: float) -> None:
