@@ -151,12 +151,6 @@ FAULTS = (
         "a safe state has no end of its own",
     ),
     Fault(
-        "time_master",
-        "        if first and self._started:\n            self._say(Phase.FAILED, self.samples, str(error))\n",
-        "",
-        "the time master fails and does not say so",
-    ),
-    Fault(
         "time_master", "        self._say(Phase.ENDED, self.samples, self._why)\n", "", "the end of the run is not told"
     ),
     Fault(
