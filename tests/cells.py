@@ -17,8 +17,9 @@ import numpy as np
 from hypothesis import strategies as st
 
 from lathe_rc import harness, messages
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.parameters import remapped
-from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.scenario import TABLES, Scenario, load
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell, Unknown
 
@@ -67,6 +68,17 @@ def announced(cell: Scenario, *names: str) -> Cell:
 def run(shared: Values | None = None, **nodes: Values) -> harness.Result:
     """Run that cell offline."""
     return harness.run(scenario(shared, **nodes))
+
+
+def config(name: str, *overrides: str) -> Scenario:
+    """A scenario that comes with lathe_rc, with changes as ``--set`` takes them."""
+    return load(SCENARIOS[0].with_stem(name), list(overrides))
+
+
+def assert_resimulated(bag: Path) -> None:
+    """A re-simulation of a bag gives all of its signals to the bit."""
+    found = resimulate(bag)
+    assert (found.changed, found.different, found.missing) == (False, [], [])
 
 
 def told_until_all_have_ended(processes: harness.Processes) -> list[harness.Event]:
