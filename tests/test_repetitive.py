@@ -50,27 +50,24 @@ def exponential(width):
     return lambda cycle: Exponential(width * GRID / TURN, cycle)
 
 
+def turn(controller, angle, past, error, *, turning=SPEED, lengths=None):
+    """The command for measured angles, the ones of ``DELAY`` samples earlier and their error; and the cycles."""
+    command, cycles = np.empty(angle.size), []
+    for start, stop in spans(lengths or [angle.size]):
+        part = slice(start, stop)
+        signals = {"angle": angle[part], "past_angle": past[part], "error": error[part], "command": command[part]}
+        cycles += controller.block(start, speed=np.full(stop - start, turning), **signals)
+    return command, cycles
+
+
 def learn(error, revolutions, controller=None, *, turning=SPEED, lengths=None, delay=DELAY):
     """Turn at a steady speed past an error that is a function of the angle.
 
     Returns the angle, the command and the cycles.
     """
-    controller = controller or make()
-    samples = int(revolutions * TURN / (turning * STEP))
-    angle = np.arange(samples) * (turning * STEP)
-    past = np.concatenate((np.zeros(delay), angle))[:samples]
-    late = np.concatenate((np.zeros(delay), error(angle)))[:samples]
-    command, cycles = np.empty(samples), []
-    for start, stop in spans(lengths or [samples]):
-        cycles += controller.block(
-            start,
-            angle=angle[start:stop],
-            speed=np.full(stop - start, turning),
-            past_angle=past[start:stop],
-            error=late[start:stop],
-            command=command[start:stop],
-        )
-    return angle, command, cycles
+    angle = np.arange(int(revolutions * TURN / (turning * STEP))) * (turning * STEP)
+    past, late = (np.concatenate((np.zeros(delay), signal))[: angle.size] for signal in (angle, error(angle)))
+    return angle, *turn(controller or make(), angle, past, late, turning=turning, lengths=lengths)
 
 
 # --- the interpolators
@@ -110,19 +107,13 @@ def test_error_is_added_once_a_cycle_and_read_ahead_by_the_lead(law, turning):
     assert_allclose(command[within(read)], expected[within(read)], atol=3e-7)
 
 
-def test_gain_scales_what_is_learned():
-    angle, command, _ = learn(np.cos, 2.5, make(gain=0.25, lead_time=0.0))
-    expected = np.floor(angle / TURN) * 0.25 * np.cos(angle)
-    assert_allclose(command[within(angle)], expected[within(angle)], atol=1e-8)
-
-
 def test_q_smooths_what_is_kept_but_not_what_is_new():
     gain = exponential(0.05)(GRID).response(np.array([8 * TURN / GRID]))[0]
-    controller = make(q=exponential(0.05), lead_time=0.0)
+    controller = make(q=exponential(0.05), lead_time=0.0, gain=0.25)
     angle, command, _ = learn(lambda a: np.sin(8 * a), 3.9, controller)
     for cycle in (1, 2, 3):
         middle = (angle > (cycle + 0.4) * TURN) & (angle < (cycle + 0.6) * TURN)
-        learned = sum(gain**k for k in range(cycle))
+        learned = 0.25 * sum(gain**k for k in range(cycle))
         assert_allclose(command[middle], learned * np.sin(8 * angle[middle]), atol=1e-5)
 
 
@@ -158,15 +149,18 @@ def test_cycle_is_reported_at_the_sample_that_completes_it():
     assert cycles[0].sample_index == sample
 
 
-@given(cuts, st.sampled_from(list(LeadLaw)))
-def test_cuts_change_nothing(lengths, law):
+@given(cuts, st.sampled_from(list(LeadLaw)), st.integers(1, 3), st.sampled_from([64, 100, 1024]), st.floats(0.0, 0.007))
+def test_cuts_change_nothing(lengths, law, revolutions, grid, width):
+    """Neither in the command nor in the memory, wherever its ring wraps."""
     lengths = [20 * n for n in lengths]
-    revolutions = (sum(lengths) + 0.5) * SPEED * STEP / TURN
-    q = exponential(0.0067)
-    _, whole, cycles = learn(np.sin, revolutions, make(lead_law=law, q=q))
-    _, parts, cycles_of_parts = learn(np.sin, revolutions, make(lead_law=law, q=q), lengths=lengths)
-    assert np.array_equal(whole, parts)
-    assert [cycle.sample_index for cycle in cycles] == [cycle.sample_index for cycle in cycles_of_parts]
+    total = (sum(lengths) + 0.5) * SPEED * STEP / TURN
+    found = []
+    for cut in (None, lengths):
+        controller = make(lead_law=law, grid=grid, revolutions=revolutions, q=exponential(width))
+        _, command, cycles = learn(np.sin, total, controller, lengths=cut)
+        found.append((command.tobytes(), controller.memory().tobytes(), repr(cycles)))
+    assert found[0] == found[1]
+    assert controller.memory().size == grid * revolutions
 
 
 # --- refusals
@@ -185,35 +179,18 @@ def test_largest_delay_runs_and_a_longer_one_does_not(turning, grid, revolutions
         turn(delay + LEARNING_DELAY + int(np.ceil(2 * TURN / grid / (turning * STEP))))
 
 
-def test_jump_of_the_angle_is_named():
-    controller = make(delay=1)
-    angle = np.array([0.0, 0.1, 0.2, 4.0, 4.1])
+@pytest.mark.parametrize(
+    ("angle", "said"),
+    [
+        (np.array([0.0, 0.1, 0.2, 4.0, 4.1]), "sample 4: the spindle angle jumps to 4 rad"),
+        # A spindle that turns back, before the memory is read where it is forgotten.
+        (20.0 - np.abs(np.linspace(-20.0, 20.0, 24_000)), r"at 19\.\d+ rad the memory is no longer kept"),
+    ],
+)
+def test_an_angle_that_cannot_be_is_named(angle, said):
     late = np.concatenate(([0.0], angle[:-1]))
-    with pytest.raises(LatheError, match="sample 4: the spindle angle jumps to 4 rad"):
-        list(
-            controller.block(0, angle=angle, speed=np.ones(5), past_angle=late, error=np.zeros(5), command=np.empty(5))
-        )
-
-
-def wrong(at, by, lengths, delay):
-    """The command until the angle is lost, and the sample; from sample ``at`` on the angle is wrong by up to ``by``."""
-    controller, samples = make(delay=delay), sum(lengths)
-    angle = np.arange(samples) * (SPEED * STEP)
-    late = np.concatenate((np.zeros(delay), angle))[:samples]
-    measured = angle + np.where(np.arange(samples) >= at, by * np.sin(np.arange(samples)), 0.0)
-    command, speeds, error = np.empty(samples), np.full(samples, SPEED), np.sin(late)
-    for start, stop in spans(lengths):
-        part = slice(start, stop)
-        try:
-            list(
-                controller.block(
-                    start, angle=measured[part], speed=speeds[part], past_angle=late[part], error=error[part],
-                    command=command[part],
-                )
-            )  # fmt: skip
-        except AngleLostError as lost:
-            return command[: start + lost.reached].tobytes(), start + lost.reached
-    return command.tobytes(), samples
+    with pytest.raises(AngleLostError, match=said):
+        turn(make(delay=1), angle, late, np.sin(late))
 
 
 @given(
@@ -223,27 +200,22 @@ def wrong(at, by, lengths, delay):
 def test_a_wrong_angle_is_lost_at_the_same_sample_whatever_the_blocks(at, by, delay, lengths):
     """Overwritten points of the memory are not read, so it does not matter how far learning has come in a block."""
     total = max(25_000, sum(lengths))
-    expected = wrong(at, by, [total], delay)
-    assert wrong(at, by, [*lengths, total - sum(lengths)], delay) == expected
-    assert expected[1] < total or by < 1.0
+    angle = np.arange(total) * (SPEED * STEP)
+    late = np.concatenate((np.zeros(delay), angle))[:total]
+    wrong = angle + np.where(np.arange(total) >= at, by * np.sin(np.arange(total)), 0.0)
 
+    def until_lost(lengths):
+        controller, found = make(delay=delay), b""
+        for start, stop in spans(lengths):
+            part, command = slice(start, stop), np.empty(stop - start)
+            signals = {"angle": wrong[part], "past_angle": late[part], "error": np.sin(late[part]), "command": command}
+            try:
+                list(controller.block(start, speed=np.full(stop - start, SPEED), **signals))
+            except AngleLostError as lost:
+                return found + command[: lost.reached].tobytes()
+            found += command.tobytes()
+        return found
 
-def test_a_spindle_that_turns_back_is_named_before_the_memory_is_read_where_it_is_forgotten():
-    controller, angle = make(delay=1), np.concatenate((np.linspace(0.0, 20.0, 12_000), np.linspace(20.0, 0.0, 12_000)))
-    late = np.concatenate(([0.0], angle[:-1]))
-    with pytest.raises(AngleLostError, match=r"at 19\.\d+ rad the memory is no longer kept"):
-        list(
-            controller.block(
-                0, angle=angle, speed=np.full(angle.size, SPEED), past_angle=late, error=np.sin(late),
-                command=np.empty(angle.size),
-            )
-        )  # fmt: skip
-
-
-@pytest.mark.parametrize("delay", [1, 60, 700])
-def test_a_block_longer_than_the_delay_is_taken_in_pieces_of_it(delay):
-    """Else the memory would be written over before it is read."""
-    _, whole, _ = learn(np.sin, 6.0, make(delay=delay), delay=delay)
-    lengths = [delay] * (whole.size // delay) + [whole.size % delay]
-    _, pieces, _ = learn(np.sin, 6.0, make(delay=delay), delay=delay, lengths=lengths)
-    assert whole.tobytes() == pieces.tobytes()
+    expected = until_lost([total])
+    assert until_lost([*lengths, total - sum(lengths)]) == expected
+    assert len(expected) < 8 * total or by < 1.0
