@@ -7,37 +7,25 @@ from cells import cuts, spans
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from test_identification import respond
+from test_repetitive import GRID, STEP, TURN, make
 
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import derivative_responses, read_derivatives
-from lathe_rc.control.lead import LeadLaw, Preview
-from lathe_rc.control.q_filter import Exponential
-from lathe_rc.control.repetitive import RepetitiveController
+from lathe_rc.control.lead import LeadLaw
 from lathe_rc.errors import InputError
-from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.signals import speed
 
-TURN = 2 * np.pi
-GRID, STEP, NOMINAL = 1024, 1 / 64000, 1000 * np.pi / 30
+NOMINAL = 1000 * np.pi / 30
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3
 SWING = speed.harmonic(NOMINAL, np.array([0.1]), np.array([213.0]), np.zeros(1))
 
 
-def follow(law, lead_law, *, points, lead_time=TAU, constant=0.0, spindle=SWING, seconds=0.4, lengths=None):
+def follow(law, lead_law, *, points, constant=0.0, spindle=SWING, seconds=0.4, lengths=None):
     """Read a frozen memory through a correction and a drive; returns angle and position."""
-    controller = RepetitiveController(
-        grid=GRID,
-        revolutions=1,
-        q=Exponential(0.0, GRID),
-        gain=1.0,
-        soft_start=0.0,
-        preview=Preview(lead_law, lead_time, spindle, STEP, 1, constant),
-        correction=Correction(law, WN, ZETA, lead=1e-3, lag=0.3e-3),
-        nominal=NOMINAL,
-        delay=1000,
-        join_below=np.inf,
-        step=STEP,
-    )
+    correction = Correction(law, WN, ZETA, lead=1e-3, lag=0.3e-3)
+    ahead = {"lead_law": lead_law, "lead_time": TAU, "speed_law": spindle, "constant": constant}
+    controller = make(**ahead, correction=correction, nominal=NOMINAL, delay=1000)
     controller.remember(points)
     controller.learning = False
     samples = int(seconds / STEP)
@@ -48,18 +36,7 @@ def follow(law, lead_law, *, points, lead_time=TAU, constant=0.0, spindle=SWING,
         part = slice(start, min(stop, samples))
         given = {"angle": angle[part], "speed": rate[part], "past_angle": past[part]}
         list(controller.block(start, **given, error=np.zeros(angle[part].size), command=command[part]))
-    plant = discretise(*second_order(WN, ZETA), TAU, STEP, "foh")
-    return angle, command, respond(plant, command)
-
-
-def respond(plant, command):
-    padded = np.concatenate((np.zeros(plant.delay + 2), command))
-    state, position = np.zeros(2), np.empty(command.size)
-    for n in range(command.size):
-        u = padded[[n + 2, n + 1, n]]
-        state = plant.transition @ state + plant.weights @ u
-        position[n] = state[0]
-    return position
+    return angle, command, respond(command)
 
 
 def profile(angle):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness, messages
+from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, supremum
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
@@ -56,12 +56,6 @@ def test_steady_error_of_the_paper():
     assert_allclose(error, np.abs((1 - q) / (z + 1 - q)), rtol=2e-3)
 
 
-def test_supremum_is_the_largest_over_all_waves():
-    loop = learning_loop(lead_time=2e-3)
-    waves = np.linspace(0.0, 512.0, 10_001)
-    assert loop.supremum(NOMINAL) == pytest.approx(np.abs(loop.operator(waves, NOMINAL)).max(), rel=1e-4)
-
-
 @pytest.mark.parametrize("place", [0.0, 3.3, 256.25, 511.9, 512.0])
 def test_supremum_finds_a_peak_wherever_it_is(place):
     """Beside two that are nearly as high, and between the points that are looked at first."""
@@ -101,12 +95,6 @@ def test_supremum_is_computed_once_for_loops_that_are_alike(monkeypatch):
     assert other.worst(speed) != found
 
 
-def test_supremum_rises_with_the_speed():
-    loop = learning_loop()
-    suprema = [loop.supremum(part * NOMINAL) for part in (0.8, 0.9, 1.0, 1.1, 1.2)]
-    assert suprema == sorted(suprema)
-
-
 # --- the simulated cell
 
 
@@ -114,14 +102,9 @@ def test_last_revolution_agrees_with_the_formula():
     """Harmonic by harmonic; at 1000 rpm a revolution is 3840 samples."""
     order = np.array([1, 2, 4, 8, 12, 16, 19])
     amplitude, phase = 200e-6 / order**2, 0.3 * order
-    result = run(
-        spindle_encoder={"revolutions": 60.0},
-        tool={
-            "harmonic_order": order.tolist(),
-            "harmonic_amplitude": amplitude.tolist(),
-            "harmonic_phase": phase.tolist(),
-        },
-    )
+    form = {"harmonic_order": order, "harmonic_amplitude": amplitude, "harmonic_phase": phase}
+    form = {name: values.tolist() for name, values in form.items()}
+    result = run(spindle_encoder={"revolutions": 60.0}, tool=form)
     spectrum = np.fft.rfft(form_error(result)[-3840:])[order] * 2 / 3840
     q, z = smooth(order * NOMINAL), corrected(order * NOMINAL)
     desired = -1j * amplitude * np.exp(1j * phase)
@@ -163,43 +146,7 @@ def test_status_tells_each_cycle():
     assert_allclose(status["contraction"][1:], np.divide(status["rms_error"][1:], status["rms_error"][:-1]))
     assert np.isnan(status["contraction"][0])
     assert status["learning"] == [True] * 5
-
-
-def test_status_tells_the_stability_margin_from_the_first_cycle_on():
-    margin = run(spindle_encoder={"revolutions": 4.0}).recording.sparse[STATUS].values["stability_margin"]
-    assert_allclose(margin, 1 - learning_loop().supremum(NOMINAL), atol=1e-3)
-
-
-def largest_error_after_freezing(lead_law, frequency):
-    """Issue 2's protocol: learn at constant speed, freeze, then let the speed swing by 10 %."""
-    start = 2.0
-    result = run(
-        spindle_encoder={
-            "revolutions": 60.0,
-            "deviation_amplitude": [0.1],
-            "deviation_frequency": [frequency],
-            "deviation_start": start,
-        },
-        learning_controller={
-            "lead_law": lead_law,
-            "lead_time": 2e-3,
-            "q_time": 130e-6,
-            "events": [f"second {start}: freeze"],
-        },
-    )
-    speed, error = encoder(result)["speed_true"], np.abs(form_error(result))
-    first = int(start * 64000)
-    assert np.ptp(speed[:first]) == 0.0
-    assert np.ptp(speed[first:]) == pytest.approx(0.2 * NOMINAL, rel=1e-3)
-    return error[first:].max()
-
-
-@pytest.mark.parametrize("frequency", [10.7, 106.0, 213.0])
-def test_variable_lead_beats_constant_lead_fivefold(frequency):
-    constant, variable = (largest_error_after_freezing(law, frequency) for law in ("constant_angle", "variable"))
-    assert constant >= 5 * variable
-    # T0·ΔΩ of 2 ms · 10.5 rad/s is 0.021 rad, on a slope of 450 µm/rad.
-    assert constant == pytest.approx(9.4e-6, rel=0.1)
+    assert_allclose(status["stability_margin"], 1 - learning_loop().supremum(NOMINAL), atol=1e-3)
 
 
 # --- feedback delay
@@ -207,15 +154,10 @@ def test_variable_lead_beats_constant_lead_fivefold(frequency):
 
 def largest_delay(shared=None, *, spindle=None, controller=None):
     """The delay that the refusal of an impossible one allows."""
-    asked = scenario(
-        shared, spindle_encoder=spindle or {}, learning_controller={**(controller or {}), "feedback_delay": 100_000}
-    )
-    with pytest.raises(InputError) as refusal:
-        harness.run(asked)
-    figures = r"feedback_delay = 100000 samples: at .* rad/s the cycle leaves (\d+); allowed: 64 up to (\d+)$"
-    leaves, allowed = re.search(figures, str(refusal.value)).groups()
-    assert leaves == allowed
-    return int(allowed)
+    asked = {**(controller or {}), "feedback_delay": 100_000}
+    with pytest.raises(InputError, match=r"feedback_delay = 100000 samples: at .* rad/s the cycle leaves") as refusal:
+        run(shared, spindle_encoder=spindle or {}, learning_controller=asked)
+    return int(re.search(r"the cycle leaves (\d+); allowed: 64 up to \1$", str(refusal.value))[1])
 
 
 @cache
@@ -239,14 +181,9 @@ def test_delay_beyond_what_the_cycle_leaves_is_refused_with_the_figures(lead_law
     run(spindle_encoder=spindle, learning_controller={**controller, "feedback_delay": largest})
     with pytest.raises(InputError, match=rf"= {largest + 1} samples: at 115\.2 rad/s the cycle leaves {largest};"):
         run(spindle_encoder=spindle, learning_controller={**controller, "feedback_delay": largest + 1})
-
-
-def test_where_no_delay_fits_the_refusal_says_what_to_change():
-    cell = Cell(scenario(learning_controller={"lead_time": 0.9}).nodes)
-    with pytest.raises(InputError) as refusal:
-        cell.check()
-    leaves = "at 104.7 rad/s the cycle leaves 0; allowed: a longer cycle, a shorter lead, or a spindle that"
-    assert leaves in str(refusal.value)
+    leaves = r"at 104\.7 rad/s the cycle leaves 0; allowed: a longer cycle, a shorter lead, or a spindle that"
+    with pytest.raises(InputError, match=leaves):
+        run(learning_controller={"lead_time": 0.9})
 
 
 @pytest.mark.parametrize("rpm", [300.0, 1000.0, 1900.0])
@@ -269,10 +206,9 @@ def test_setting_that_diverges_is_refused_with_the_figures(q_time, lead_time):
     controller = {"q_time": q_time, "lead_time": lead_time}
     supremum = learning_loop(**controller).supremum(NOMINAL)
     assert supremum > 1
-    with pytest.raises(InputError) as refusal:
+    settings = f"lead_time = {lead_time * 1e3:.4g} ms, q_time = {q_time * 1e6:.4g} µs"
+    with pytest.raises(InputError, match=rf"(?s)(?=.*sup\|Q - Z\| = {supremum:.4g} at ).*{settings}"):
         run(learning_controller=controller)
-    assert f"sup|Q - Z| = {supremum:.4g} at " in str(refusal.value)
-    assert f"lead_time = {lead_time * 1e3:.4g} ms, q_time = {q_time * 1e6:.4g} µs" in str(refusal.value)
 
 
 def test_refused_setting_diverges_when_forced():
@@ -297,9 +233,7 @@ def test_stability_counts_at_the_highest_speed():
     """Learning that converges at 1000 rpm may diverge at the top of a swing."""
     controller = {"q_time": 104e-6, "lead_time": 2e-3}
     run(learning_controller=controller)
-    with pytest.raises(
-        InputError, match=r"learning diverges with .*: sup\|Q - Z\| = 1\.\d+ at .* waves at 115\.2 rad/s\)"
-    ):
+    with pytest.raises(InputError, match=r"learning diverges with .*: sup\|Q - Z\| = 1\.\d+ at .* at 115\.2 rad/s\)"):
         run(spindle_encoder={"revolutions": 20.0, **SWING}, learning_controller=controller)
 
 
