@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from lathe_papers.formulas.hyperstability import NOMINAL, plant, popov_bound
 from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
-from lathe_rc.control.periodic import PRESETS, PeriodicController, samples_in
+from lathe_rc.control.periodic import _SWITCH, PRESETS, PeriodicController, samples_in
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import LinearSystem
 
@@ -22,21 +22,22 @@ SAMPLES = 100
 GAINS = dataclasses.replace(PRESETS["published"], switch_time=0.5)
 
 
-def make(gains=GAINS, *, samples=SAMPLES, limit=1e9, memory_filter=0.0, **options):
-    return PeriodicController(
-        gains, period=samples * STEP, limit=limit, step_s=STEP, memory_filter=memory_filter, **options
-    )
+#: δ̃·h0·v alone: the other terms are off, or too small to be seen
+MEMORY_ALONE = dataclasses.replace(GAINS, h11=1e-12, h12=0.0, lead=0.02, lag=0.02)
+
+
+def make(gains=GAINS, *, samples=SAMPLES, **options):
+    options = {"limit": 1e9, "memory_filter": 0.0, **options}
+    return PeriodicController(gains, period=samples * STEP, step_s=STEP, **options)
 
 
 def drive(controller, wanted, measured, lengths=None, first=0):
     command = np.empty(wanted.size)
-    in_blocks(
-        lengths or [wanted.size],
-        lambda start, *parts: controller.block(first + start, *parts),
-        wanted,
-        measured,
-        command,
-    )
+
+    def block(start, *parts):
+        controller.block(first + start, *parts)
+
+    in_blocks(lengths or [wanted.size], block, wanted, measured, command)
     return command
 
 
@@ -76,33 +77,22 @@ def test_law_is_eq_16_written_out():
 
 
 def test_memory_repeats_after_exactly_a_period():
-    """A pulse of the error; then no error, and h11 is too small to be seen."""
-    gains = dataclasses.replace(GAINS, h11=1e-12, h12=0.0, lead=0.02, lag=0.02)
+    """A pulse of the error; then no error."""
     wanted = np.zeros(4 * SAMPLES)
     wanted[30] = 1.0
-    command = drive(make(gains), wanted, np.zeros(wanted.size))
+    command = drive(make(MEMORY_ALONE), wanted, np.zeros(wanted.size))
     assert command[30] != 0.0
     assert_allclose(command[SAMPLES:].reshape(3, -1), np.tile(command[:SAMPLES], (3, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.037, 0.1])
 def test_memory_is_read_through_a_gaussian_without_delay(sigma):
-    gains = dataclasses.replace(GAINS, h11=1e-12, h12=0.0, lead=0.02, lag=0.02)
     samples = 300
     wanted = np.zeros(2 * samples)
-    wanted[:samples] = np.random.default_rng(3).normal(size=samples)
-    wanted[:60] = wanted[240:300] = 0.0
-    command = drive(make(gains, samples=samples, memory_filter=sigma), wanted, np.zeros(wanted.size))
+    wanted[60:240] = np.random.default_rng(3).normal(size=180)
+    command = drive(make(MEMORY_ALONE, samples=samples, memory_filter=sigma), wanted, np.zeros(wanted.size))
     expected = gaussian_filter1d(command[:samples], sigma / STEP, truncate=8.0, mode="constant")
     assert_allclose(command[samples:], expected, atol=2e-5 * np.abs(command).max())
-
-
-def test_filter_leaves_a_constant_memory_alone():
-    gains = dataclasses.replace(GAINS, h11=1e-12, h12=0.0, lead=0.02, lag=0.02, switch_time=1e-3)
-    wanted = np.ones(3 * SAMPLES)
-    plain, smooth = (drive(make(gains, memory_filter=sigma), wanted, 0 * wanted) for sigma in (0.0, 0.02))
-    middle = slice(2 * SAMPLES + 45, 2 * SAMPLES + 80)  # beyond the reach of the memory's steps
-    assert_allclose(smooth[middle], plain[middle], rtol=1e-9)
 
 
 # --- limits
@@ -119,15 +109,6 @@ def test_command_is_limited_and_counted():
     assert_allclose(command[:first], free[:first])
 
 
-def test_switch_falls_while_the_limit_works_against_the_error():
-    """Without zeros in the filter u has the sign of v: each limited sample is one against the error, δ is δ0."""
-    gains = dataclasses.replace(GAINS, lead=0.02, lag=0.02)
-    wanted = np.ones(50 * SAMPLES)
-    controller = make(gains, anti_windup=False, limit=0.1)
-    drive(controller, wanted, 0.0 * wanted)
-    assert controller.saturated > 4900
-
-
 def test_anti_windup_stops_integrator_and_memory():
     """The error stays, the limit is reached: the paper's law winds up, this one does not."""
     wanted, measured = np.full(20 * SAMPLES, 0.8), np.full(20 * SAMPLES, 0.5)
@@ -136,6 +117,7 @@ def test_anti_windup_stops_integrator_and_memory():
         assert drive(controller, wanted, measured)[-1] == 1.0
     assert real.integrator < 0.1 * paper.integrator
     assert paper.largest_memory > 50.0
+    assert paper.state.values[_SWITCH] == pytest.approx(GAINS.switch_low, abs=1e-2), "the limit works against the error"
     # Before the switch has opened, the transient of the filters may store a sample that is within the limit.
     assert np.abs(real.state.ring).max() <= 1.0
 
@@ -203,16 +185,9 @@ def test_without_ideal_the_command_of_a_period_before_stands_for_it():
 @given(cuts, st.sampled_from([0.0, 0.02, 0.15]), st.booleans(), st.sampled_from([0.0, 1e-3]), st.integers(0, 10**9))
 def test_cuts_change_nothing(lengths, sigma, anti_windup, quantisation, first):
     wanted, measured = signals(sum(lengths))
-    options = {
-        "limit": 4.0,
-        "memory_filter": sigma,
-        "anti_windup": anti_windup,
-        "measurement_step": quantisation,
-        "command_step": quantisation,
-    }
-    whole, cut = make(**options), make(**options)
+    steps = {"measurement_step": quantisation, "command_step": quantisation}
+    whole, cut = (make(limit=4.0, memory_filter=sigma, anti_windup=anti_windup, **steps) for _ in range(2))
     assert np.array_equal(drive(cut, wanted, measured, lengths, first), drive(whole, wanted, measured, first=first))
-    assert cut.saturated == whole.saturated
     assert np.array_equal(cut.state.values, whole.state.values)
 
 
@@ -232,11 +207,6 @@ def test_kernel_closes_the_loop_as_blocks_of_one_sample_do():
 # --- refusals
 
 
-@pytest.mark.parametrize("step", [1 / 1000, 0.005, 1 / 64000])
-def test_period_of_whole_steps_is_taken(step):
-    assert samples_in(25.0, step) == round(25.0 / step)
-
-
 @pytest.mark.parametrize(
     ("period", "step", "nearest"),
     [
@@ -246,9 +216,10 @@ def test_period_of_whole_steps_is_taken(step):
     ],
 )
 def test_period_of_broken_steps_is_refused(period, step, nearest):
-    with pytest.raises(InputError, match=f"a whole number of steps, {nearest}") as refusal:
+    with pytest.raises(InputError, match=f"a whole number of steps, {nearest}$"):
         samples_in(period, step)
-    assert len(str(refusal.value).splitlines()) == 1
+    for whole in (1 / 1000, 0.005, 1 / 64000):
+        assert samples_in(25.0, whole) == round(25.0 / whole)
 
 
 @pytest.mark.parametrize(
@@ -267,9 +238,8 @@ def test_period_of_broken_steps_is_refused(period, step, nearest):
     ],
 )
 def test_what_cannot_be_is_refused(gains, options, message):
-    with pytest.raises(InputError, match=message) as refusal:
+    with pytest.raises(InputError, match=message):
         make(dataclasses.replace(GAINS, **gains), **options)
-    assert len(str(refusal.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("memory_filter", [0.0, 0.03])

@@ -46,8 +46,7 @@ def test_integrator_with_a_gain_is_analytic():
     assert loop.phase_frequency == pytest.approx(6.0, rel=1e-6)
 
 
-@settings(max_examples=10)
-@given(st.floats(1e-4, 0.05))
+@pytest.mark.parametrize("wait", [1e-4, 0.05])
 def test_delay_takes_its_part_of_the_phase_margin(wait):
     """K·e^{-pτ}/p: margin π/2 - Kτ, gain margin π/(2Kτ) at π/(2τ)."""
     loop = evaluate(TransferFunction((10.0,), (1.0, 0.0)), PidGains(1.0, 0.0, 0.0, 1.0), wait)
@@ -64,19 +63,13 @@ def test_loop_with_too_much_delay_is_not_stable():
     assert np.isnan(loop.rise)
 
 
-plants = st.builds(
-    lambda size, times, integrator: (
-        gain(size) * lags(*times) * (TransferFunction((1.0,), (1.0, 0.0)) if integrator else gain(1.0))
-    ),
-    st.floats(0.1, 1e4),
-    st.lists(st.floats(0.01, 0.5), min_size=1, max_size=3),
-    st.booleans(),
-)
-
-
 @settings(max_examples=25)
-@given(plants, st.floats(1.0, 40.0), st.floats(0.5, 1.2), st.floats(0.0, 0.01))
-def test_tuned_loop_crosses_over_as_asked(plant, crossover, margin, wait):
+@given(
+    st.floats(0.1, 1e4), st.lists(st.floats(0.01, 0.5), min_size=1, max_size=3), st.booleans(), st.floats(1.0, 40.0),
+    st.floats(0.5, 1.2), st.floats(0.0, 0.01),
+)  # fmt: skip
+def test_tuned_loop_crosses_over_as_asked(size, times, integrator, crossover, margin, wait):
+    plant = gain(size) * lags(*times) * (TransferFunction((1.0,), (1.0, 0.0)) if integrator else gain(1.0))
     try:
         gains = tune(plant, crossover=crossover, phase_margin=margin, wait=wait)
     except InputError:
@@ -92,9 +85,8 @@ def test_systems_of_python_control_are_plants_too():
     plant = control.tf([1188.9], [1.0]) * control.tf([1.0], [0.2, 1.0]) * control.tf([1.0], [0.1, 1.0])
     same = gain(1188.9) * lags(0.2, 0.1)
     assert_allclose(response(plant, [1.0, 9.0]), response(same, [1.0, 9.0]), rtol=1e-12)
-    assert tune(plant, crossover=9.0, phase_margin=1.0).proportional == pytest.approx(
-        tune(same, crossover=9.0, phase_margin=1.0).proportional
-    )
+    theirs, ours = (tune(each, crossover=9.0, phase_margin=1.0).proportional for each in (plant, same))
+    assert theirs == pytest.approx(ours)
     assert evaluate(plant, FORCE).overshoot == pytest.approx(evaluate(same, FORCE).overshoot)
 
 
@@ -118,9 +110,8 @@ def test_fastest_keeps_both_margins():
     ],
 )
 def test_what_cannot_be_tuned_is_refused(options, message):
-    with pytest.raises(InputError, match=message) as refusal:
+    with pytest.raises(InputError, match=message):
         tune(FULL_W1, **options)
-    assert len(str(refusal.value).splitlines()) == 1
 
 
 def test_realisation_is_the_transfer_function():

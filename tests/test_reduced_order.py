@@ -3,8 +3,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc.analysis.reduced_order import ChannelStep, fit, fit_inverse, read_csv, step_of
@@ -45,17 +43,9 @@ def test_known_plant_comes_back(plant, orders):
     assert_allclose(found.transfer.response(FREQUENCY), plant.response(FREQUENCY), rtol=1e-3)
 
 
-@settings(max_examples=6)
-@given(st.floats(0.02, 0.3), st.floats(0.02, 0.3), st.floats(-50.0, 50.0).filter(lambda k: abs(k) > 0.1))
-def test_two_lags_come_back(first, second, size):
-    plant = gain(size) * lags(first, second)
-    found = fit(measured(plant), zeros=0, poles=2, oscillating=False)
-    assert found.rms < 1e-5 * abs(size)
-
-
 def test_reduced_order_of_the_full_plant():
     """The best model of this order has a small residual, a zero more helps, and no denominator near it does better."""
-    channel = measured(FULL_W1, np.arange(401) * 5e-3)
+    channel = measured(FULL_W1, np.arange(201) * 1e-2)
     two = fit(channel, zeros=0, poles=2)
     assert two.rms < 0.01 * channel.response[-1]
     assert fit(channel, zeros=1, poles=3).rms < 0.1 * two.rms
@@ -97,10 +87,9 @@ def test_inverse_of_a_model_suits_the_plant_better_than_the_exact_inverse_of_the
 
 
 def test_csv_gives_the_same_as_arrays(tmp_path):
-    channel = measured(PAPER.w1)
-    path = tmp_path / "step.csv"
-    rows = "\n".join(f"{t!r},{y!r}" for t, y in zip(channel.time.tolist(), channel.response.tolist(), strict=True))
-    path.write_text(f"time_s,response\n{rows}\n")
+    channel, path = measured(PAPER.w1), tmp_path / "step.csv"
+    rows = np.stack((channel.time, channel.response), axis=1)
+    np.savetxt(path, rows, "%.17g", delimiter=",", header="time_s,response", comments="")
     read = read_csv(path)
     assert np.array_equal(read.time, channel.time)
     assert np.array_equal(read.response, channel.response)
@@ -121,17 +110,13 @@ def test_csv_gives_the_same_as_arrays(tmp_path):
     ],
 )
 def test_what_is_no_response_is_refused(time, response, message):
-    with pytest.raises(InputError, match=message) as refusal:
+    with pytest.raises(InputError, match=message):
         ChannelStep(time, response)
-    assert len(str(refusal.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(("zeros", "poles", "integrator"), [(2, 2, False), (0, 0, False), (0, 9, False), (-1, 2, True)])
-def test_orders_that_make_no_model_are_refused(zeros, poles, integrator):
+def test_orders_that_make_no_model_and_coarse_records_are_refused(zeros, poles, integrator):
     with pytest.raises(InputError, match=f"{zeros} zeros, {poles} poles"):
         fit(measured(PAPER.w1), zeros=zeros, poles=poles, integrator=integrator)
-
-
-def test_coarse_record_is_refused_for_an_inverse():
     with pytest.raises(InputError, match=r"steps of 0\.01 s, lags from 0\.001 s"):
         fit_inverse(PAPER.w1, measured(PAPER.w1, TIME * 10))
