@@ -29,7 +29,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety import state_machine
-from lathe_rc.safety.monitors import Below, Clearance, Growth, IndexPulses, Lookout, Rate, Threshold
+from lathe_rc.safety.monitors import Clearance, Lookout, Monitor, below, growth, index_pulses, rate, threshold
 from lathe_rc.safety.rules import walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
@@ -283,7 +283,11 @@ def test_an_alarm_is_told_in_words_whatever_a_bag_says():
 class Looking:
     """Monitors that look at pieces of signals, and what they have found so far: name, sample, value."""
 
-    def __init__(self, *monitors):
+    def __init__(self, rules):
+        monitors = [
+            Monitor(name, "s", 0.0, Reaction.STOP, rule=rule, signal=signal, other=other)
+            for name, (rule, signal, other) in rules.items()
+        ]
         places = dict.fromkeys(place for each in monitors for place in (each.signal, each.other) if place)
         self.numbers = {place: number for number, place in enumerate(places)}
         self.lookout, self.found = Lookout(monitors, self.numbers), []
@@ -370,24 +374,24 @@ def test_all_monitors_at_once_find_what_their_definitions_say(data, size, seed, 
     for broken in data.draw(st.lists(st.integers(0, size - 1), max_size=3)):
         random.choice([speed, error, angle])[broken] = random.choice([np.nan, np.inf, -5.0, 30.0])
         pulse[random.integers(size)] ^= 1
-    monitors = [
-        Threshold("speed", "e", 3.0, Reaction.STOP, signal=(0, "speed"), offset=0.5, samples=3),
-        Threshold("gap", "e", 4.0, Reaction.STOP, signal=(1, "measured_error"), other=(0, "speed")),
-        Threshold("late", "t", 2.0, Reaction.STOP, signal=(1, "measured_error"), after=1.5),
-        Below("low", "e", -2.0, Reaction.STOP, signal=(0, "speed"), samples=2, after=1.5),
-        Rate("rate", "e", 5.0, Reaction.STOP, signal=(0, "speed"), window=5, step=1 / 5, before=0.0),
-        IndexPulses(0.7, Reaction.STOP, encoder=0),
-        Growth(1.2, Reaction.STOP, tool=1, cycles=2, floor=0.1),
-    ]
+    rules = {
+        "speed": (threshold(3.0, offset=0.5, samples=3), (0, "speed"), None),
+        "gap": (threshold(4.0), (1, "measured_error"), (0, "speed")),
+        "late": (threshold(2.0, after=1.5), (1, "measured_error"), None),
+        "low": (below(-2.0, samples=2, after=1.5), (0, "speed"), None),
+        "rate": (rate(5.0, window=5, step=1 / 5, before=0.0), (0, "speed"), None),
+        "index_pulses": (index_pulses(0.7), (0, "angle"), None),
+        "error_growth": (growth(1.2, cycles=2, floor=0.1), (1, "measured_error"), None),
+    }
     inputs = [{"angle": angle, "speed": speed, "index_pulse": pulse}, {"measured_error": error}]
-    looking = Looking(*monitors)
+    looking = Looking(rules)
     looking.look(inputs, sorted({0, size, *data.draw(st.lists(st.integers(0, size), max_size=6))}))
     expected = [(name, sample, float(value)) for name, sample, value in taken_one_by_one(angle, speed, pulse, error)]
     assert repr(sorted(looking.found)) == repr(expected)
 
 
 def test_an_alarm_comes_again_after_a_reset_alone():
-    looking = Looking(Threshold("speed", "e", 3.0, Reaction.STOP, signal=(0, "speed")))
+    looking = Looking({"speed": (threshold(3.0), (0, "speed"), None)})
     inputs = [{"angle": np.zeros(8), "speed": np.arange(8.0), "index_pulse": np.zeros(8, np.uint8)}]
     looking.look(inputs, [0, 5, 8])
     looking.lookout.reset()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors: signals against thresholds, each by a rule of `lathe_rc.safety.rules`, or in plain Python."""
+"""Monitors: watch signals by a rule of `lathe_rc.safety.rules`, or in plain Python."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,13 +13,15 @@ from lathe_rc.extensions import code_of_others
 from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Array, Watch, clear
 from lathe_rc.safety.state_machine import Reaction
 
+Place = tuple[int, str]  # of an input, and its field
+
 _LONGEST_NAME = 64  # of a monitor [B], as SafetyStatus.msg says
 _NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """A monitor that found something.
+    """Alarm of a monitor.
 
     Attributes:
         place: sample in the block.
@@ -32,7 +34,7 @@ class Alarm:
 
 @dataclass(eq=False)
 class Watcher:
-    """Watches signals; raises one alarm, and no other before it is reset.
+    """Base of the monitors, which raise one alarm, and no other before a reset.
 
     Attributes:
         name: of the monitor.
@@ -50,133 +52,91 @@ class Watcher:
         """Watch as from the first sample."""
 
 
-@dataclass(eq=False, kw_only=True)
-class Monitor(Watcher):
-    """Watches by one of the `rules`.
+class Rule(NamedTuple):
+    """One of the `rules` with its limits; made by `threshold`, `below`, `rate`, `index_pulses` and `growth`.
 
     Attributes:
-        rule: which.
-        signal: place of the input and field.
-        other: the same of a second signal; None: there is none.
-        memory: what the rule knows, its limits among it; its `Lookout` has it from then on.
+        number: of the rule.
+        start: its memory before the first sample, the limits among it.
+        unit: what the rule finds is divided by it; the quotient has the unit of the limit.
+        restarts: False where the samples before a reset count after it as well.
     """
 
-    rule: ClassVar[int]
-    signal: tuple[int, str]
-    other: tuple[int, str] | None = None
-
-    def __post_init__(self) -> None:
-        self.memory: Array = np.array(self.start(), np.float64)
-
-    @abstractmethod
-    def start(self) -> Sequence[float] | Array:
-        """The memory before the first sample."""
-
-    def told(self, value: float) -> float:
-        """The alarm's text for the rule's finding, in the unit of the limit."""
-        return value
-
-    def reset(self) -> None:
-        """See `Watcher`."""
-        self.memory[:] = self.start()
+    number: int
+    start: Sequence[float]
+    unit: float = 1.0
+    restarts: bool = True
 
 
-@dataclass(eq=False, kw_only=True)
-class Threshold(Monitor):
-    """|signal - other - offset| beyond the limit for some samples in a row.
+def threshold(limit: float, *, offset: float = 0.0, samples: int = 1, after: float = 0.0) -> Rule:
+    """Rule for |signal - other - offset| beyond the limit for some samples in a row.
 
-    Attributes:
-        offset: subtracted as well.
+    Args:
+        limit: to both sides.
+        offset: subtracted from the signal.
         samples: how many; 1: at once.
         after: revolutions of the encoder, the first input, until it watches.
     """
-
-    rule = THRESHOLD
-    offset: float = 0.0
-    samples: int = 1
-    after: float = 0.0
-
-    def start(self) -> Sequence[float]:
-        """See `Monitor`."""
-        return self.offset, -self.limit, self.limit, self.samples, 0.0, self.after * TURN, np.nan
-
-    def told(self, value: float) -> float:
-        """See `Monitor`."""
-        return abs(value - self.offset)
+    return Rule(THRESHOLD, (offset, -limit, limit, samples, 0.0, after * TURN, np.nan))
 
 
-class Below(Threshold):
-    """A signal below the limit for some samples in a row; nothing is subtracted from it."""
-
-    def start(self) -> Sequence[float]:
-        """See `Monitor`."""
-        return 0.0, self.limit, np.inf, *super().start()[3:]
-
-    def told(self, value: float) -> float:
-        """See `Monitor`."""
-        return value
+def below(limit: float, *, samples: int = 1, after: float = 0.0) -> Rule:
+    """Rule for a signal below the limit for some samples in a row; arguments as of `threshold`."""
+    return Rule(THRESHOLD, (0.0, limit, np.inf, samples, 0.0, after * TURN, np.nan))
 
 
-@dataclass(eq=False, kw_only=True)
-class Rate(Monitor):
-    """How fast a signal changes, over a window of samples; the limit is a rate.
+def rate(limit: float, *, window: int, step: float, before: float) -> Rule:
+    """Rule for the change of a signal over a window of samples.
 
-    Attributes:
+    Args:
+        limit: rate of change [unit of the signal/s].
         window: over so many samples.
         step: sampling step [s].
         before: the signal before the first sample.
     """
-
-    rule = RATE
-    window: int
-    step: float
-    before: float
-
-    def start(self) -> Array:
-        """See `Monitor`."""
-        return np.concatenate(((self.limit * (self.window * self.step), np.nan), np.full(self.window, self.before)))
-
-    def told(self, value: float) -> float:
-        """See `Monitor`."""
-        return value / (self.window * self.step)
-
-    def reset(self) -> None:
-        """See `Watcher`; the samples before it count on."""
+    seconds = window * step
+    return Rule(RATE, (limit * seconds, np.nan, *[before] * window), unit=seconds, restarts=False)
 
 
-class IndexPulses(Monitor):
-    """One revolution of the measured angle from index pulse to index pulse, and never backwards."""
-
-    rule = INDEX
-
-    def __init__(self, limit: float, reaction: Reaction, *, encoder: int) -> None:
-        super().__init__("index_pulses", "encoder", limit, reaction, signal=(encoder, "angle"))
-
-    def start(self) -> Sequence[float]:
-        """See `Monitor`."""
-        return self.limit, np.nan, np.nan, 0.0
+def index_pulses(limit: float) -> Rule:
+    """Rule for one revolution of the measured angle from index pulse to index pulse, and never backwards."""
+    return Rule(INDEX, (limit, np.nan, np.nan, 0.0))
 
 
-class Growth(Monitor):
-    """The RMS error grows from revolution to revolution, which begin at index pulses.
+def growth(limit: float, *, cycles: int, floor: float) -> Rule:
+    """Rule for an RMS error that grows from revolution to revolution, which begin at index pulses.
 
     Args:
         limit: factor from one to the next.
-        reaction: what it asks for.
-        tool: place of the input.
         cycles: so many times in a row.
         floor: RMS error below which it does not count [m].
     """
+    return Rule(GROWTH, (limit, floor, cycles, -1.0, np.nan, 0.0, np.nan, *[0.0] * SUMS))
 
-    rule = GROWTH
 
-    def __init__(self, limit: float, reaction: Reaction, *, tool: int, cycles: int, floor: float) -> None:
-        self._cycles, self._floor = cycles, floor
-        super().__init__("error_growth", "tool", limit, reaction, signal=(tool, "measured_error"))
+@dataclass(eq=False, kw_only=True)
+class Monitor(Watcher):
+    """Watches by a rule.
 
-    def start(self) -> Sequence[float]:
-        """See `Monitor`; nothing is known of the growth."""
-        return self.limit, self._floor, self._cycles, -1.0, np.nan, 0.0, np.nan, *[0.0] * SUMS
+    Attributes:
+        rule: with its limits.
+        signal: place of the input and its field.
+        other: the same of a second signal; None: there is none.
+        memory: what the rule knows now.
+    """
+
+    rule: Rule
+    signal: Place
+    other: Place | None = None
+
+    def __post_init__(self) -> None:
+        # The `Lookout` puts a view in its place: the kernel has one array for the memories of all rules.
+        self.memory: Array = np.array(self.rule.start, np.float64)
+
+    def reset(self) -> None:
+        """Watch as from the first sample, but for samples that still count."""
+        if self.rule.restarts:
+            self.memory[:] = self.rule.start
 
 
 class PlainMonitor(ABC):
@@ -226,7 +186,7 @@ class Plain(Watcher):
         limit: float,
         reaction: Reaction,
         *,
-        signals: Sequence[tuple[int, str]],
+        signals: Sequence[Place],
         make: Callable[[], PlainMonitor],
     ) -> None:
         if len(name.encode()) > _LONGEST_NAME:
@@ -263,19 +223,20 @@ class Plain(Watcher):
         return alarm
 
     def reset(self) -> None:
-        """See `Watcher`."""
+        """Make the monitor anew."""
         with code_of_others(f"monitor {self.name}"):
             self._monitor = self._make()
 
 
 def _read_only(signal: Array) -> Array:
+    """View of a signal that third-party code cannot write to."""
     view: Array = signal.view()
     view.flags.writeable = False
     return view
 
 
 class Clearance:
-    """Whether the tool is out of the part.
+    """Condition that the tool is out of the part.
 
     Args:
         beyond: measured position of the drive beyond which it is [m].
@@ -289,11 +250,11 @@ class Clearance:
         self.memory = np.array([beyond, samples, 0.0])
 
     def begin(self) -> None:
-        """Look from the next sample on."""
+        """Look for it from the next sample on."""
         self.memory[2] = 0.0
 
     def first(self, position: Array) -> int | None:
-        """First sample at which it is."""
+        """First sample at which the tool is out; None: at none."""
         place, self.memory[2] = clear(position, self.memory)
         return place if place >= 0 else None
 
@@ -309,14 +270,14 @@ class Lookout:
         watch: for `lathe_rc.safety.rules.walk`.
     """
 
-    def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[tuple[int, str], int]) -> None:
+    def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[Place, int]) -> None:
         self._monitors = monitors
         memory = np.concatenate([np.empty(0), *(monitor.memory for monitor in monitors)])
         plan, count, end = np.zeros((len(monitors), 5), np.int64), len(monitors), 0
         for row, monitor in zip(plan, monitors, strict=True):
             begin, end = end, end + monitor.memory.size
             other = numbers[monitor.other] if monitor.other else -1
-            row[:] = monitor.rule, numbers[monitor.signal], other, begin, end
+            row[:] = monitor.rule.number, numbers[monitor.signal], other, begin, end
             monitor.memory = memory[begin:end]
         self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
 
@@ -327,7 +288,7 @@ class Lookout:
         for number, (monitor, place, value) in enumerate(zip(self._monitors, places, values, strict=True)):
             if place >= 0:
                 self.watch.raised[number] = 1
-                found.append((monitor, Alarm(place, monitor.told(value))))
+                found.append((monitor, Alarm(place, value / monitor.rule.unit)))
         return sorted(found, key=lambda one: one[1].place)
 
     def reset(self) -> None:

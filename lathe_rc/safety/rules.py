@@ -32,7 +32,7 @@ def _beyond(value: float, offset: float, low: float, high: float) -> bool:
 
 @kernel
 def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
-    """0 if so many samples in a row may be beyond here or from the last one on, or -1.
+    """0 if enough samples in a row may be beyond the limits here, or begin to be at the last one; otherwise -1.
 
     The memory: see `_lasting_beyond`. Where n are needed, every n-th one and the last tell: n in a
     row cannot pass between them, if the sample before the first was not beyond.
@@ -55,13 +55,13 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 
 @inlined
 def _over(memory: Array) -> bool:
-    """Whether nothing is forgiven any more, see `_lasting_beyond`."""
+    """Whether the time without alarms is over, see `_lasting_beyond`."""
     return bool(memory[5] == 0.0 or memory[6] == -np.inf)
 
 
 @kernel
 def _forgiven(angle: Array, memory: Array) -> int:
-    """How many samples of the block are forgiven, see `_lasting_beyond`."""
+    """Number of samples of the block without alarms, see `_lasting_beyond`."""
     if _over(memory) or not angle.size:
         return 0
     if np.isnan(memory[6]):
@@ -111,7 +111,7 @@ def _differ(after: float, before: float, limit: float) -> bool:
 
 @inlined
 def _how_many_differ(after: Array, before: Array, limit: float) -> int:
-    count = 0
+    count = 0  # without a branch, so that the compiler makes vectors of the loop
     for k in range(after.size):
         count += _differ(after[k], before[k], limit)
     return count
@@ -142,7 +142,7 @@ def _changing(signal: Array, memory: Array) -> int:
 
 @inlined
 def _next(pulse: Pulses, begin: int) -> int:
-    """The first index pulse from a sample on; the end if there is none."""
+    """First index pulse from a sample on; the end if there is none."""
     for start in range(begin, pulse.size, _STRETCH):
         piece, some = pulse[start : start + _STRETCH], np.uint8(0)
         for k in range(piece.size):
@@ -155,13 +155,13 @@ def _next(pulse: Pulses, begin: int) -> int:
 
 @inlined
 def _off(since: float, limit: float) -> bool:
-    """Whether no angle since an index pulse can be this, to the limit."""
+    """Whether an angle since an index pulse is impossible, to the limit."""
     return since > TURN + limit or since < -limit
 
 
 @kernel
 def _first_off(angle: Array, last: float, limit: float) -> int:
-    """First sample that no angle since an index pulse can be, or -1."""
+    """First sample with an impossible angle since the index pulse, or -1."""
     count = 0
     for k in range(angle.size):
         count += _off(angle[k] - last, limit)
@@ -173,7 +173,7 @@ def _first_off(angle: Array, last: float, limit: float) -> int:
 
 @kernel
 def _index(angle: Array, pulse: Pulses, at: int, memory: Array) -> int:
-    """First sample that does not fit the pulses, the first of which is ``at``, or -1.
+    """First sample whose angle does not fit the index pulses, the first of which is ``at``, or -1.
 
     The memory: limit, angle of the last pulse, what was found, whether there was a pulse: before, the first angle
     stands for one that may come early.
@@ -202,7 +202,8 @@ SUMS = 128  # of squares, each of every 128th error: one would wait for itself, 
 
 @inlined
 def _add(error: Array, memory: Array) -> None:
-    """Add the squares of more errors of the same revolution, see `_growing`; the same whatever the blocks."""
+    """Add the squares of more errors of the same revolution, see `_growing`."""
+    # Sum k has every 128th error from the pulse on, wherever blocks begin: each is summed in the same order.
     sums = memory[7:]
     start = int(memory[3]) % sums.size
     head = min(sums.size - start, error.size)
@@ -270,7 +271,7 @@ class Watch(NamedTuple):
 
 @kernel
 def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
-    """Fill in where each monitor finds something, and what, and say how many do.
+    """Fill in the place and value of each monitor's finding; return their number.
 
     Args:
         watch: the monitors.
@@ -288,6 +289,8 @@ def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) 
                 place = _lasting_beyond(signal, other, angle, own)
                 if place >= 0:
                     value = signal[place] - (other[place] if other.size else 0.0)
+                    if own[1] == -own[2]:  # limits to both sides are told by the magnitude
+                        value = abs(value - own[0])
         elif rule == RATE:
             place, value = _changing(signal, own), own[1]
         elif rule == INDEX:

@@ -4,7 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,17 +21,19 @@ from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import (
     Alarm,
-    Below,
     Clearance,
-    Growth,
-    IndexPulses,
     Lookout,
     Monitor,
+    Place,
     Plain,
     PlainMonitor,
-    Rate,
-    Threshold,
+    Rule,
     Watcher,
+    below,
+    growth,
+    index_pulses,
+    rate,
+    threshold,
 )
 from lathe_rc.safety.rules import Watch, clear, walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
@@ -237,37 +239,40 @@ class Supervisor(Stage):
         return asked
 
     def _watch(
-        self, kind: type[Monitor], name: str, subject: str, limit: float, asked: str = "", **options: Any
+        self, name: str, subject: str, limit: float, rule: Rule, asked: str, signal: Place, other: Place | None = None
     ) -> None:
-        """Add a monitor; ``asked``: first word of the parameter with its reaction, if not its own name."""
-        self.monitors.append(kind(name, subject, limit, self._reaction(f"{asked or name}_reaction"), **options))
+        """Add a monitor; ``asked``: first word of the parameter with its reaction."""
+        reaction = self._reaction(f"{asked}_reaction")
+        self.monitors.append(Monitor(name, subject, limit, reaction, rule=rule, signal=signal, other=other))
 
     def _watch_spindle(self) -> None:
         table, nominal = self.parameters, self.parameters.nominal_speed
         if limit := table.speed_limit:
-            self._watch(Threshold, "speed", "encoder", limit, signal=(0, "speed"), offset=nominal)
+            self._watch("speed", "encoder", limit, threshold(limit, offset=nominal), "speed", (0, "speed"))
         if limit := table.acceleration_limit:
-            over: dict[str, Any] = {"window": table.acceleration_window, "step": table.step, "before": nominal}
-            self._watch(Rate, "acceleration", "encoder", limit, signal=(0, "speed"), **over)
-        if table.index_limit:
-            self.monitors.append(IndexPulses(table.index_limit, self._reaction("index_reaction"), encoder=0))
+            rule = rate(limit, window=table.acceleration_window, step=table.step, before=nominal)
+            self._watch("acceleration", "encoder", limit, rule, "acceleration", (0, "speed"))
+        if limit := table.index_limit:
+            self._watch("index_pulses", "encoder", limit, index_pulses(limit), "index", (0, "angle"))
 
     def _watch_error(self) -> None:
         table = self.parameters
-        tool = self._reads("tool", messages.TOOL, ("measured_error",)) if table.error_limit or table.growth_limit else 0
+        if not (table.error_limit or table.growth_limit):
+            return
+        signal = self._reads("tool", messages.TOOL, ("measured_error",)), "measured_error"
         if limit := table.error_limit:
-            self._watch(Threshold, "error", "tool", limit, signal=(tool, "measured_error"), after=table.error_after)
+            self._watch("error", "tool", limit, threshold(limit, after=table.error_after), "error", signal)
         if limit := table.growth_limit:
-            how: dict[str, Any] = {"cycles": table.growth_cycles, "floor": table.growth_floor}
-            self.monitors.append(Growth(limit, self._reaction("growth_reaction"), tool=tool, **how))
+            rule = growth(limit, cycles=table.growth_cycles, floor=table.growth_floor)
+            self._watch("error_growth", "tool", limit, rule, "growth", signal)
 
     def _watch_drives(self) -> None:
         table = self.parameters
         for drive, limit in self._each("following_limit", table.drives):
             state = self._reads(f"{drive}/state", messages.STATE, _SENSOR), "measured_position"
             command = self._reads(f"{drive}/command", messages.COMMAND, _COMMAND), "position"
-            samples = self._samples(table.following_time)
-            self._watch(Threshold, "following", drive, limit, signal=command, other=state, samples=samples)
+            rule = threshold(limit, samples=self._samples(table.following_time))
+            self._watch("following", drive, limit, rule, "following", command, state)
         for what, of, field, seconds in (
             ("stroke", table.drives, "measured_position", 0.0),
             ("effort", table.drives, "effort", table.effort_time),
@@ -275,24 +280,26 @@ class Supervisor(Stage):
         ):
             for subject, limit in self._each(f"{what}_limit", of):
                 signal = self._reads(f"{subject}/state", messages.STATE, _SENSOR), field
-                self._watch(Threshold, what, subject, limit, signal=signal, samples=self._samples(seconds))
+                self._watch(what, subject, limit, threshold(limit, samples=self._samples(seconds)), what, signal)
 
     def _watch_margins(self) -> None:
         for drive, limit in self._each("margin_limit", self.parameters.drives):
             signal = (self._reads(f"{drive}/margin", messages.MARGIN, _MARGIN), *_MARGIN)
-            after = self.parameters.margin_after
-            self._watch(Below, "stability_margin", drive, limit, "margin", signal=signal, after=after)
+            rule = below(limit, after=self.parameters.margin_after)
+            self._watch("stability_margin", drive, limit, rule, "margin", signal)
 
     def _watch_cut(self) -> None:
         table = self.parameters
         if not (table.force_limit or table.force_low):
             return
         signal = self._reads("cut", messages.CUT, ("measured_force",)), "measured_force"
-        lasts: dict[str, Any] = {"signal": signal, "samples": self._samples(table.force_time)}
+        samples = self._samples(table.force_time)
         if limit := table.force_limit:
-            self._watch(Threshold, "force", "cut", limit, **lasts)
+            self._watch("force", "cut", limit, threshold(limit, samples=samples), "force", signal)
         if limit := table.force_low:
-            self._watch(Below, "force_low", "cut", limit, "force", after=table.force_after, **lasts)
+            self._watch(
+                "force_low", "cut", limit, below(limit, samples=samples, after=table.force_after), "force", signal
+            )
 
     def _watch_for_others(self) -> None:
         table, own = self.parameters, ("monitor_signals", "monitor_limits", "monitor_reactions")
