@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a form error: runs with causes switched off, split so that the parts add up.
+"""Budget of a form error by its causes, from runs in which some of them are switched off; the parts add up.
 
 f(S) is the form error over the angle of a run in which the causes S act and the others are switched off; N are all of
 them. The form error e = f(N) is the sum of
@@ -99,7 +99,7 @@ class Budget:
 
 
 class Decomposition:
-    """Which runs a budget takes, and what comes of them.
+    """Runs that a budget takes, and the budget that they give.
 
     Args:
         needs: of each cause the one without which it does nothing, empty if it acts alone; such a cause comes first.
@@ -109,15 +109,15 @@ class Decomposition:
         self._needs = needs
 
     def acting(self, causes: Causes) -> Causes:
-        """Those of some causes that act: whose need is among them."""
+        """Causes of these that act: the one that each needs is among them."""
         return frozenset(cause for cause in causes if self._needs[cause] in ("", *causes))
 
     def _context(self, *causes: str) -> Causes:
-        """Values that some causes need."""
+        """Causes that others need, beside those themselves."""
         return frozenset(self._needs[cause] for cause in causes if self._needs[cause]) - set(causes)
 
     def _couples(self) -> Iterator[tuple[str, str]]:
-        """The pairs of causes; one that needs the other is on top of it already."""
+        """Pairs of causes, but for a cause and the one it needs, which act together already."""
         return (pair for pair in combinations(self._needs, 2) if self._needs[pair[1]] != pair[0])
 
     def alone(self) -> set[Causes]:
@@ -126,7 +126,7 @@ class Decomposition:
         return {frozenset(), frozenset(self._needs), *singles}
 
     def together(self) -> set[Causes]:
-        """The further ones for the pairs."""
+        """Further runs, for the pairs."""
         runs = set[Causes]()
         for first, second in self._couples():
             context = self._context(first, second)

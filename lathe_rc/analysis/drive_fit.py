@@ -82,7 +82,7 @@ def _named(values: Array) -> dict[str, float]:
 
 
 class _Record:
-    """Command and position, and how far a drive with given parameters is off."""
+    """Recorded command and position, against which drives are compared."""
 
     def __init__(self, command: Array, position: Array, step: float, method: Discretisation, stroke: float) -> None:
         self.command, self.position = command, position
@@ -114,13 +114,14 @@ class _Record:
         pulse = np.zeros((2, length))
         pulse[0, 0] = pulse[1, 1] = 1.0
         poles = [1.0, -np.trace(transition), np.linalg.det(transition)]
+        # Orthonormal columns, so that a product takes away what they explain.
         base, _ = np.linalg.qr(scipy.signal.lfilter([1.0], poles, pulse).T)
         error[:length] -= base @ (base.T @ error[:length])
         return error
 
 
 def _busiest(command: Array) -> slice:
-    """Where in the record the command moves most."""
+    """Part of the record in which the command moves most."""
     if command.size <= _START:
         return slice(0, command.size)
     travel = np.append(0.0, np.cumsum(np.diff(command) ** 2))
@@ -205,6 +206,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
     linear = min(inside, key=lambda start: float(np.mean(record.residual(start, skip) ** 2)))
     scale = 1.0 / linear[0]  # of the delay
 
+    # Logarithms of ωn and ζ: both stay positive, and a step of the search is relative.
     def values(x: Array) -> Array:
         return np.array([np.exp(x[0]), np.exp(x[1]), x[2] * scale])
 
@@ -228,7 +230,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
     )
     best, jacobian = values(found.x), np.asarray(found.jac)
     lengths = np.linalg.norm(jacobian, axis=0)
-    lengths[lengths == 0.0] = np.inf
+    lengths[lengths == 0.0] = np.inf  # a parameter without any effect is unknown, not a division by 0
     _, sizes, directions = np.linalg.svd(jacobian / lengths, full_matrices=False)
     condition = float(sizes[0] / sizes[2]) if sizes[2] > 0.0 else np.inf
     worst = tuple(name for name, part in zip(PARAMETERS, directions[2], strict=True) if abs(part) > _TOGETHER)

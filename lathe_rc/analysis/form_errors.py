@@ -73,7 +73,7 @@ def that_count(angle: Array, error: Array) -> npt.NDArray[np.intp] | slice:
 
 @inlined
 def _close(row: Array, start: float, square: float, weight: float, high: float, low: float) -> None:
-    """Hand over a revolution: first sample, RMS, largest and smallest error."""
+    """Fill the row of a revolution: first sample, RMS, largest and smallest error."""
     row[0], row[1], row[2], row[3] = start, np.sqrt(square / weight), high, low
     if not row[1] < np.inf:  # comparisons pass over what is no number
         row[2] = row[3] = row[1]
@@ -86,6 +86,7 @@ def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> t
     Returns:
         Samples that have been taken; rows that have been filled, or -1 if a revolution has no sample.
     """
+    # In locals, which the compiler keeps in registers: of arrays it could not know that they do not overlap.
     samples, last, before, held = state[_SAMPLES], state[_TURNS], state[_BEFORE], state[_ERROR]
     number, begin = state[_NUMBER], state[_START]
     square, weight, high, low = state[_SQUARE], state[_WEIGHT], state[_HIGH], state[_LOW]
@@ -123,7 +124,7 @@ def _end(state: Array, row: Array) -> None:
 
 
 def _plain(samples: Array) -> Array:
-    """Samples as the kernel takes them."""
+    """Samples as the kernel takes them, copied if need be; for others it would be compiled once more."""
     fits = samples.flags.carray and samples.dtype == np.float64
     return samples if fits else np.require(samples, np.float64, ["C", "W"])
 
@@ -164,7 +165,7 @@ class RunningErrors:
                 self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
 
     def found(self) -> FormErrors:
-        """Of all complete revolutions, if the run ends with the samples that have come."""
+        """Form errors of all complete revolutions, if the run ends with the samples so far."""
         state, filled = self._state, self._filled
         if state[_SAMPLES] < 2.0:
             return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))

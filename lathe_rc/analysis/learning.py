@@ -43,9 +43,9 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
 
 @kernel
 def _near_peaks(waves: Array, size: Array) -> Array:
-    """Waves around the highest peaks of a size, the ends among them; one wave alone: there it is not finite."""
+    """Waves around the highest peaks of a size, ends included; the first wave where it is not finite, if any, alone."""
     last = waves.size - 1
-    heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order
+    heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order, by insertion
     for k in range(last + 1):
         if not size[k] < np.inf:
             return np.array([waves[k]])
@@ -135,11 +135,12 @@ class LearningLoop:
 
         Over all waves up to the Nyquist limits of grid and sampling. It is computed once for loops that are alike.
         """
+        # A bound method of constants never changes, so that the loop may be a key of the cache.
         is_constant = isinstance(getattr(self.drive, "__self__", None), Constant)
         return (_worst_of_alike if is_constant else _worst)(self, speed)
 
     def supremum(self, speed: float) -> float:
-        """See `worst`."""
+        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s]."""
         return self.worst(speed)[0]
 
     def steady_error(self, waves: Array, speed: float) -> Complex:
@@ -149,7 +150,7 @@ class LearningLoop:
 
 
 def _worst(loop: LearningLoop, speed: float) -> tuple[float, float]:
-    """See `LearningLoop.worst`."""
+    """Supremum of a loop at a speed, without a cache."""
     highest = min(loop.grid / 2, np.pi / (loop.step * speed))
     return supremum(lambda waves: loop.operator(waves, speed), highest)
 

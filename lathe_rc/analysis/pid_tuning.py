@@ -62,7 +62,7 @@ def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
 
 @dataclass(frozen=True)
 class Loop:
-    """The behaviour of a closed loop.
+    """Margins of a loop, and its step response when closed.
 
     Attributes:
         rise: from 10 to 90 % of a step [s].

@@ -112,7 +112,7 @@ class Fit:
         transfer: what was found.
         time: [s], shape (n,).
         wanted: what its output shall be, shape (n,).
-        found: what it is, shape (n,).
+        found: what its output is, shape (n,).
     """
 
     transfer: TransferFunction
@@ -177,7 +177,7 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
         bottom = np.append(_denominator(logarithms, pairs), np.zeros(int(integrator)))
         powers = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
         basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in powers], axis=1)
-        size = np.abs(basis).max(axis=0)
+        size = np.abs(basis).max(axis=0)  # columns differ by orders of magnitude, which would spoil the solution
         top = np.linalg.lstsq(basis / size, response, rcond=None)[0] / size
         return top, bottom, basis @ top
 

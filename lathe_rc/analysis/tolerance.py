@@ -124,7 +124,7 @@ def judge(largest: Array, tolerance: float, before: int = 0) -> Verdict:
 
 
 def growth(largest: Array, before: int = 0) -> Growth | None:
-    """Find out whether the form error of a run grows; None if it does not, in a step, or in too few revolutions.
+    """Growth of the form error of a run; None if there is none, if it is a step, or in too few revolutions.
 
     Args:
         largest: largest magnitude of the form error of each complete revolution [m], shape (revolutions,).

@@ -56,7 +56,7 @@ class AngleFilterTable(NamedTuple):
 
 
 def angle_filter(step: float, counts: int, nominal: float, deviation: float, frequency: float) -> AngleFilterTable:
-    """A filter before its first sample.
+    """Filter before its first sample.
 
     Args:
         step: sampling step [s].
@@ -81,7 +81,7 @@ def counts_per_sample(filter_: AngleFilterTable, speed: float) -> float:
 
 
 def followed_ratio(filter_: AngleFilterTable, low: float, high: float, ratios: Collection[Fraction]) -> Fraction | None:
-    """Ratio near which the rounding of the counts beats so slowly that the filter follows it.
+    """Ratio of counts per sample whose beat is so slow that the filter follows it.
 
     Args:
         filter_: before its first sample.
@@ -106,7 +106,8 @@ def followed_ratio(filter_: AngleFilterTable, low: float, high: float, ratios: C
 
 @inlined
 def _advance(step: float, p: Array) -> None:
-    """Covariance of the next sample: each derivative adds to what it is the derivative of, in rows and columns."""
+    """Covariance of the next sample, F·P·Fᵀ in place."""
+    # A row takes up rows below it alone, which are still those of before; then the columns likewise.
     half, sixth = 0.5 * step * step, step * step * step / 6.0
     for j in range(4):
         p[0, j] += step * p[1, j] + half * p[2, j] + sixth * p[3, j]
@@ -120,10 +121,10 @@ def _advance(step: float, p: Array) -> None:
 
 @kernel
 def follow(m: AngleFilterTable, measured: float) -> None:
-    """Take the measured angle of the next sample [rad]; the state is then that of this sample."""
+    """Update the state with the measured angle of the next sample [rad]."""
     step, state, p = m.step, m.state, m.covariance
     if np.isnan(m.before[0]):
-        state[0] = measured + 0.5 * m.quantum
+        state[0] = measured + 0.5 * m.quantum  # the middle of the count
         m.before[0] = measured
         return
     state[0], state[1], state[2] = at(m, step)
@@ -132,11 +133,13 @@ def follow(m: AngleFilterTable, measured: float) -> None:
     passed = state[1] * step
     every = m.quantum <= abs(passed)
     if every or measured != m.before[0]:
+        # Where a count lasts several samples, its edge tells the angle to the way of one sample.
         width = m.quantum if every else passed
         spread = p[0, 0] + width * width / 12.0 + _ROUNDING
         off = (measured + 0.5 * width - state[0]) / spread
         for i in range(4):
             state[i] += p[i, 0] * off
+        # From the last element to the first: row 0, which all others read, changes last.
         for i in range(3, -1, -1):
             for j in range(3, i - 1, -1):
                 p[i, j] -= p[0, i] * p[0, j] / spread
@@ -146,7 +149,7 @@ def follow(m: AngleFilterTable, measured: float) -> None:
 
 @kernel
 def at(m: AngleFilterTable, later: float) -> tuple[float, float, float]:
-    """Angle [rad], speed [rad/s] and acceleration [rad/s²] so much ``later`` than the last sample [s], or earlier."""
+    """Angle [rad], speed [rad/s] and acceleration [rad/s²] at a time ``later`` than the last sample [s]."""
     angle, speed, acceleration, jerk = m.state[0], m.state[1], m.state[2], m.state[3]
     turned = later * (speed + later * (acceleration / 2.0 + later * jerk / 6.0))
     return angle + turned, speed + later * (acceleration + later * jerk / 2.0), acceleration + later * jerk

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stepping the memory of repetitive control: what is learned at the grid points, what is read between them.
+"""Kernels of the memory of repetitive control: learning at the grid points, reading between them.
 
 Samples come as blocks, grid points as they fall between samples. So a block is taken in passes: which points fall
 between which samples (`find`), what they learn (`_learn_piece`), and what the drive is told (`_send`). The passes do
@@ -34,7 +34,7 @@ SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE
     0, 1, 2, 3, 4, 7, 10, 12, 13, 14,
 )  # fmt: skip
 REALS = 15
-NO_CHUNK = -(1 << 62)
+NO_CHUNK = -(1 << 62)  # further back than any grid point
 
 DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: why `advance` stopped
 LOG = 64  #: cycles that end until somebody reads of them, at most
@@ -45,7 +45,7 @@ ROOM = _BACK + 8  #: grid points that a memory keeps beside a cycle, for what is
 
 @inlined
 def soft(u: float) -> float:
-    """Rises smoothly from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
+    """Smooth step from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
     return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
 
 
@@ -140,11 +140,12 @@ def find(
     sample, place = m.sample, m.work[6]
     for j in range(stop - point):
         place[j] = (point + j) / per_radian
-    place[stop - point] = np.inf
+    place[stop - point] = np.inf  # ends the search below without a test of the count
     count = 0
     to_end = cycle - point % cycle
     for k in range(start, angle.size):
         before, now = angles[k + 1], angles[k + 2]
+        # A spindle that turned half a revolution in a sample could not be learned from; it is a wrong angle.
         if abs(angles[k + 3] - now) > np.pi:
             return k, count, JUMPED, ended
         if now > before:
@@ -155,6 +156,7 @@ def find(
                     ended = 1
         if point + count == stop:
             return k, count, SMOOTH, ended
+        # Points that are read have to be learned by now, and not yet be written over by the next cycle.
         if np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point + count:
             return k, count, AHEAD, ended
         if np.floor((angle[k] + lead[k]) * per_radian) + _BACK < point + count:
@@ -170,6 +172,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
     cycle, gain, ramp, sample, place, work = m.cycle, m.gain, m.ramp, m.sample, m.work[6], m.work
     chunk, memory, whole, real = m.chunk, m.memory, m.whole, m.real
     mask = memory.size - 1
+    # Gathered first, so that the compiler can make vectors of the loop after it.
     for j in range(count):
         k = sample[j]
         work[0, j], work[1, j] = angles[k + 1], angles[k + 2]
@@ -188,6 +191,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
     else:
         for j in range(count):
             memory[(point + j) & mask] = memory[(point + j - cycle) & mask]
+    # Summed one after the other: the order must not depend on how the points fall into pieces.
     squares, largest = real[SQUARES], real[LARGEST]
     end = cycle - 1 - point % cycle
     for j in range(count):
@@ -224,7 +228,7 @@ def _learn(
     cycle, memory, chunk, whole = m.cycle, m.memory, m.chunk, m.whole
     k = max(start, min(arrives, angle.size))
     reason = DONE
-    last = whole[NEXT] + memory.size - cycle - ROOM
+    last = whole[NEXT] + memory.size - cycle - ROOM  # beyond it, points would be lost that are still to be read
     while reason == DONE and k < angle.size and whole[NEXT] < last:
         point = whole[NEXT]
         stop = min(point + PIECE, last)
@@ -270,7 +274,7 @@ def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
 
 @inlined
 def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> None:
-    """Fill the set points of the drive ``told`` of some samples of the block.
+    """Fill the set points of the drive, ``told``, for some samples of the block.
 
     The memory may be ahead of them by a block: it holds more than the cycle that they read.
     """

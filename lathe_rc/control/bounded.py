@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions that keep within velocity, acceleration and jerk, and a command that is taken over and given back by them."""
+"""Motions within bounds of velocity, acceleration and jerk, and commands that are taken over and given back by them."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Bounds:
     jerk: float
 
     def reach(self, time: float) -> float:
-        """As far as a motion from rest gets in some time [m].
+        """Longest way of a motion from rest to rest in some time [m].
 
         The peaks of a way s in the time T are 1.875·s/T, 10/√3·s/T² and 60·s/T³.
         """
@@ -45,7 +45,7 @@ class Bounds:
 
 
 def motion(start: float, velocity: float, end: float | None, bounds: Bounds, step: float) -> Array:
-    """A motion to rest: a polynomial of fifth degree, as short as the bounds allow to 5 %.
+    """Motion to rest: a polynomial of fifth degree, as short as the bounds allow to 5 %.
 
     Args:
         start: where it begins [m], without acceleration.
@@ -77,12 +77,12 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
         duration *= _LONGER
     samples = int(np.ceil(duration / step))
     positions: Array = start + path(np.minimum(np.arange(1, samples + 1) * step, duration))
-    positions[-1] = start + way if end is None else end
+    positions[-1] = start + way if end is None else end  # without rounding: there a command stands still
     return positions
 
 
 def prepare() -> None:
-    """Load what motions need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
+    """Load the part of SciPy that motions use: its import at their first use would stall a run."""
     motion(0.0, 0.0, 0.0, Bounds(1.0, 1.0, 1.0), 1.0)
 
 
@@ -120,6 +120,7 @@ def follows(takeover: TakeoverTable) -> bool:
 
 @inlined
 def _keep_last(last: Array, samples: Array) -> None:
+    """Keep the last two samples, of the blocks before if this one has less."""
     if samples.size > 1:
         last[0], last[1] = samples[-2], samples[-1]
     elif samples.size == 1:
@@ -128,7 +129,7 @@ def _keep_last(last: Array, samples: Array) -> None:
 
 @kernel
 def take_over(takeover: TakeoverTable, command: Array) -> None:
-    """Make of what the controller wants what the drive gets; in place, shape (n,) [m]."""
+    """Replace the command of the controller by that for the drive; in place, shape (n,) [m]."""
     path, whole = takeover.path, takeover.whole
     _keep_last(takeover.wanted, command)
     if not follows(takeover):

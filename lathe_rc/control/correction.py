@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 
 class CorrectionLaw(IntEnum):
-    """See the module."""
+    """Law between memory and drive; the module describes them."""
 
     NONE = 0
     LEAD_LAG = 1
@@ -73,7 +73,7 @@ class Correction:
 def invariant(
     y: float, before: float, distance: float, rate: float, bend: float, a1: float, a2: float, nominal: float, v: Array
 ) -> float:
-    """One sample of Wk2 then Wk1; returns the set point.
+    """Set point of one more sample, by Wk2 and then Wk1.
 
     Wk2: a2Ω0²·v'' + a1Ω0·v' + v = Y in the angle (Runge-Kutta of fourth order, Y linear from ``before`` to ``y``
     over ``distance`` [rad]). Wk1: v + a1·dv/dt + a2·d²v/dt² with d/dt of the angle ``rate`` and ``bend``; v' and v''

@@ -39,7 +39,7 @@ def lags(*times: float) -> TransferFunction:
 
 
 def gain(value: float) -> TransferFunction:
-    """A constant, to multiply others by."""
+    """Transfer function of a constant."""
     return TransferFunction((value,), (1.0,))
 
 

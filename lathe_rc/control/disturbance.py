@@ -119,7 +119,7 @@ def disturbance(
     identify: bool,
     identification_forgetting: float,
 ) -> DisturbanceTable:
-    """Nothing is known yet.
+    """Law before its first sample, without any knowledge.
 
     Args:
         step: sampling step [s].
@@ -189,7 +189,7 @@ def observed(
     position: float,
     learning: bool,  # noqa: FBT001 - kernels take their arguments by position
 ) -> float:
-    """Take the measured position of ``late`` samples ago; what the observer finds beyond the memory [m].
+    """Take the measured position of ``late`` samples ago; return the disturbance beyond the memory [m].
 
     Args:
         m: of the drive.
@@ -233,10 +233,11 @@ def observed(
 
 @inlined
 def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -> None:
+    """Add a sample to its grid point; grid points that the spindle has left before are ended."""
     low, point, state = m.learner, m.point, m.state
     first, second = derivatives(low.position, low.bandwidth)
     beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second - low.command[STAGES]
-    lag = STAGES / low.bandwidth
+    lag = STAGES / low.bandwidth  # of a slow signal behind the low-pass: it belongs to the angle of that time before
     place = int(np.floor((angle - speed * lag) * (m.memory.value.size / _TURN)))
     low = m.identifier
     if not state[_BEGUN]:
@@ -254,7 +255,7 @@ def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -
 
 @kernel
 def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """A grid point has been measured: learn those that S can smooth now, and look at the model."""
+    """End a grid point: learn the points that S can smooth by now, and sum up for the model."""
     state, point, points = m.state, m.point, m.memory.value.size
     here = state[_POINT] & (points - 1)
     reach = m.memory.smoothing.size // 2
@@ -277,12 +278,13 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
 
 @inlined
 def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """Take the identified model; what the one before explained otherwise is in the memory, and goes along."""
+    """Adopt the identified model; the part of w that it explains in place of the memory moves from one to the other."""
     a1, a2 = fitted(m.fit)
     if not (a1 > 0.0 and a2 > 0.0):
         return
     more1, more2 = a1 - m.model[0], a2 - m.model[1]
     m.model[0], m.model[1] = a1, a2
+    # What has passed the low-passes belongs to the old model: unchanged, it would be a step of the disturbance.
     for low, known in ((m.observer, m.learned), (m.learner, m.learner.command)):
         first, second = derivatives(low.position, low.bandwidth)
         for place in range(known.size):

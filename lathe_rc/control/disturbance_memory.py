@@ -80,7 +80,7 @@ def smoothing(waves: float, points: int) -> Array:
 
 
 def empty_memory(nominal: float, gain: float, waves: float, points: int, *, follows_speed: bool) -> MemoryTable:
-    """Nothing is known yet; see `lathe_rc.control.disturbance.disturbance`."""
+    """Memory without any knowledge; arguments as of `lathe_rc.control.disturbance.disturbance`."""
     spread = np.zeros((3, points))
     spread[0] = _UNKNOWN
     return MemoryTable(
@@ -98,7 +98,7 @@ def empty_memory(nominal: float, gain: float, waves: float, points: int, *, foll
 
 
 def forget_all(m: MemoryTable) -> None:
-    """Know nothing again."""
+    """Forget all that was learned."""
     for array in (m.value, m.slope, m.fresh, m.spread):
         array[:] = 0.0
     m.spread[0] = _UNKNOWN
@@ -119,14 +119,15 @@ def expected(m: MemoryTable, angle: float, speed: float) -> float:
 
 @inlined
 def revolution_ended(m: MemoryTable, revolutions: int) -> None:
-    """So many ``revolutions`` have been learned from now."""
+    """End a revolution, after so many in all."""
+    # Before, the values themselves change from revolution to revolution, which would be taken for the speed's work.
     if revolutions == _SETTLED and m.follows_speed:
         m.spread[2] = _SLOPE
 
 
 @inlined
 def learn(m: MemoryTable, centre: int) -> None:
-    """Kalman filter of a grid point; the variance of what is measured is 1."""
+    """Update the Kalman filter of a grid point; the variance of a measurement is 1."""
     points, reach = m.value.size, m.smoothing.size // 2
     found = smooth = 0.0
     for k in range(m.smoothing.size):
@@ -136,7 +137,7 @@ def learn(m: MemoryTable, centre: int) -> None:
     j = centre & (points - 1)
     faster = m.speeds[j]
     p0, p1, p2 = m.spread[0, j] + m.drift, m.spread[1, j], m.spread[2, j]
-    if p2 > 0.0:
+    if p2 > 0.0:  # 0: it is not learned, or not yet
         p2 = min(p2 + _SLOPE_DRIFT * _SLOPE, _SLOPE)
     g0, g1 = p0 + p1 * faster, p1 + p2 * faster
     total = g0 + g1 * faster + 1.0

@@ -45,7 +45,7 @@ class LowPass(NamedTuple):
 
 
 def low_pass(bandwidth: float, step: float) -> LowPass:
-    """A low-pass of a ``bandwidth`` [rad/s] at rest at 0; ``step`` in s."""
+    """Low-pass of a ``bandwidth`` [rad/s], at rest at 0; ``step`` in s."""
     half = 0.5 * bandwidth * step
     return LowPass(
         bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(STAGES + 1), np.zeros(STAGES + 1)
@@ -65,14 +65,14 @@ def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
 
 @inlined
 def derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
-    """First two derivatives of what has passed a low-pass."""
+    """First two derivatives of the output of a low-pass."""
     first = bandwidth * (stages[STAGES - 1] - stages[STAGES])
     return first, bandwidth**2 * (stages[STAGES - 2] - 2.0 * stages[STAGES - 1] + stages[STAGES])
 
 
 @inlined
 def add_products(sums: Array, place: int, velocity: float, acceleration: float, rest: float) -> None:
-    """Add what a sample says of dx/dt, d²x/dt² and u - x to five ``sums``, ``place`` on: vv, va, aa, vr and ar."""
+    """Add the products of dx/dt, d²x/dt² and u - x to five ``sums``, ``place`` on: vv, va, aa, vr and ar."""
     sums[place] += velocity * velocity
     sums[place + 1] += velocity * acceleration
     sums[place + 2] += acceleration * acceleration
@@ -206,13 +206,13 @@ class DriveIdentifier:
         command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
-        """The estimate from the measurements so far, None while there are too few; older ones weigh less each time."""
+        """Estimate from the measurements so far, None while there are too few; those so far weigh less from then on."""
         s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
         if excited(s11, s12, s22):
             a1, a2 = coefficients(s11, s12, s22, s1, s2)
             if a1 > 0.0 and a2 > 0.0 and command > 0.0:
-                unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)
+                unexplained = max(rest - a1 * s1 - a2 * s2, 0.0)  # rounding may make it negative
                 frequency = float(1.0 / np.sqrt(a2))
                 found = Identified(frequency, float(a1 * frequency / 2.0), float(np.sqrt(unexplained / command)))
         self.table.sums[:] *= self._forgetting
@@ -242,12 +242,12 @@ class FitTable(NamedTuple):
 
 
 def no_measurements(given: Array, points: int, forgetting: float) -> FitTable:
-    """Nothing has been measured; ``points`` of the grid per revolution."""
+    """Fit without measurements; ``points`` of the grid per revolution."""
     return FitTable(given, np.zeros((3, points)), np.zeros(10), np.zeros(5), forgetting)
 
 
 def forget_measurements(m: FitTable) -> None:
-    """Nothing has been measured again."""
+    """Forget all measurements."""
     for array in (m.before, m.sums, m.means):
         array[:] = 0.0
 
@@ -278,9 +278,10 @@ def sum_up(
 
 @inlined
 def fitted(m: FitTable) -> tuple[float, float]:
-    """a1 [s] and a2 [s²]; not above 0 if the measurements say nothing."""
+    """Least-squares a1 [s] and a2 [s²]; not above 0 if the measurements do not determine them."""
     count, v, a, r, rr = m.means[0], m.means[1], m.means[2], m.means[3], m.means[4]
     whole, s = m.sums[5:].copy(), m.sums[:5].copy()
+    # About their means: a steady force is no lag.
     for k, mean in enumerate((v * v, v * a, a * a, v * r, a * r)):
         whole[k] -= mean / count
     if not excited(whole[0], whole[1], whole[2]):
@@ -299,6 +300,6 @@ def fitted(m: FitTable) -> tuple[float, float]:
 
 @inlined
 def fade(m: FitTable) -> None:
-    """A revolution has ended: what was measured before counts less."""
+    """End a revolution: measurements so far count less."""
     put_scaled(m.sums, m.forgetting, m.sums)
     put_scaled(m.means, m.forgetting, m.means)

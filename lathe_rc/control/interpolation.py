@@ -16,7 +16,7 @@ Complex = npt.NDArray[np.complex128]
 def linear(places: Array, values: Array, place: float) -> float:
     """Linear between the rising ``places``, the same beyond their ends; both of shape (n,)."""
     last = places.size - 1
-    if not place > places[0]:
+    if not place > places[0]:  # NaN has to end here: below it would index beyond the table
         return float(values[0])
     if place >= places[last]:
         return float(values[last])
@@ -106,7 +106,7 @@ def cubic_response(radians: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def _cubic_response(content: bytes) -> Array:
-    """The same of the bytes of ``radians``: loops that are alike ask for the same frequencies."""
+    """Cached `cubic_response` of the bytes of ``radians``, which can be hashed: similar loops share frequencies."""
     radians = np.frombuffer(content)
     phase = np.cos(_DISTANCE[None] * radians[:, None, None])
     return np.asarray((phase * _TAPS * _WEIGHT).sum(axis=(1, 2)))

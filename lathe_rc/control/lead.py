@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 
 class LeadLaw(IntEnum):
-    """See the module."""
+    """Law of the lead angle; the module describes them."""
 
     CONSTANT_ANGLE = 0
     VARIABLE = 1
@@ -63,7 +63,7 @@ def look_ahead(
     rate: Array,
     bend: Array,
 ) -> None:
-    """Fill lead, rate and bend, the latter two if they are wanted; see `Preview.block`."""
+    """Fill lead [rad], rate [rad/s] and bend [rad/s²] of a block, shape (n,), the latter two if they are wanted."""
     step, law, lead_time, constant = preview.step, preview.law, preview.lead_time, preview.constant
     nominal, lines, tachogram, history = preview.nominal, preview.lines, preview.tachogram, preview.history
     if law < 2 and not wanted:
@@ -94,7 +94,7 @@ def look_ahead(
 
 
 class Preview:
-    """Looks ahead by a lead time.
+    """Look ahead of the spindle by a lead time.
 
     Args:
         law: lead law.

@@ -51,7 +51,7 @@ def _clip(value: float, limit: float) -> float:
 
 @kernel
 def _stopping(limits: CommandLimits, step: float, distance: float) -> float:
-    """A velocity from which a stop within a distance is possible."""
+    """Velocity from which a stop within a distance is possible."""
     if distance <= 0.0:
         return 0.0  # not inf · 0
     curved = float(np.cbrt(limits.jerk * distance * distance / 9.0))
@@ -60,7 +60,7 @@ def _stopping(limits: CommandLimits, step: float, distance: float) -> float:
 
 @kernel
 def _reach(jerk: float, change: float) -> float:
-    """An acceleration that the jerk can take back within a change of the velocity."""
+    """Acceleration that the jerk can take back within a change of the velocity."""
     return float(np.sqrt(jerk * change)) if change > 0.0 else 0.0
 
 
@@ -70,6 +70,7 @@ def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float
 
     ``before`` is the acceleration of the sample before.
     """
+    # Further velocity gained while the jerk takes the acceleration back; half a step of it is in v already.
     rise = max(abs(a) * (0.5 * abs(a) / limits.jerk - 0.5 * step), 0.0) if v * a > 0.0 else 0.0
     return (
         abs(v) <= limits.velocity * _CLOSE
@@ -92,7 +93,7 @@ def _can_stop(limits: CommandLimits, step: float, coming: float, v: float, a: fl
 
 @kernel
 def _towards(limits: CommandLimits, step: float, v_wanted: float, pulling: float, v: float, a: float) -> float:
-    """The acceleration of a sample that goes as fast as the limits allow for a velocity that itself changes."""
+    """Acceleration of a sample that approaches a changing velocity as fast as the limits allow."""
     change, jerk = v_wanted - v, limits.jerk
     a_wanted = pulling + np.sign(change) * min(_reach(0.5 * jerk, abs(change)), abs(change) / step)
     if v * a_wanted > 0.0:
@@ -132,6 +133,7 @@ def _next(
         room = limits.stroke - np.sign(v_wanted) * coming
         allowed = min(allowed, _stopping(limits, step, room), max(0.5 * room / step, 0.0))
     found = _towards(limits, step, _clip(v_wanted, _SHORT_OF * allowed), pulling, v, a)
+    # What would pass a limit later, with the acceleration taken back at once, brakes now.
     after = v + found * step
     too_fast = abs(after + 0.5 * found * abs(found) / limits.jerk) > limits.velocity
     if too_fast or not _can_stop(limits, step, coming, after, found):
@@ -151,6 +153,7 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
         wanted: the command.
     """
     p, v, a, goal_before, moving_before = state[0], state[1], state[2], state[3], state[4]
+    # Velocity and acceleration of what is wanted are fed forward; only what is left of them has to be caught up.
     goal = _clip(wanted, limits.stroke)
     moving = _clip((goal - goal_before) / step, limits.velocity)
     pulling = _clip((moving - moving_before) / step, limits.acceleration)
@@ -159,7 +162,7 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
     v_goal = (goal - p) / step
     free, found = _next(limits, step, v_goal, v_wanted, pulling, p, v, a)
     if free:
-        p, v = goal, v_goal
+        p, v = goal, v_goal  # not p + v·step: it goes through to the bit
     else:
         v += found * step
         p += v * step

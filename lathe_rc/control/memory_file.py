@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The memory of a controller, in a file that survives a crash."""
+"""Memory of a controller in a file that survives a crash."""
 
 import errno
 import io
@@ -93,11 +93,12 @@ def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
-    """An array of an archive; what its header says of its size is compared with what there is of it.
+    """Array of an archive, whose header has to agree with the size of its data.
 
     Raises:
         ValueError: it is none; zipfile and NumPy raise others.
     """
+    # Not np.load: it would make room for as many numbers as the header says, before any is there.
     with archive.open(name) as stream:
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("another format of arrays than `save` writes")
@@ -108,7 +109,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
 
 
 def _number(array: npt.NDArray[Any]) -> int:
-    """The one whole number of an array.
+    """Whole number that is the only element of an array.
 
     Raises:
         ValueError: it holds something else.

@@ -80,7 +80,7 @@ PRESETS = {
 }  # fmt: skip
 
 
-def check_law(
+def _check(
     gains: PeriodicGains, *, limit: float, step_s: float, memory_filter: float, quantisation: tuple[float, float]
 ) -> None:
     """Refuse numbers that make no law."""
@@ -186,7 +186,7 @@ def _smooth(law: PeriodicLaw, state: PeriodicState, n: int) -> None:
 
 @kernel
 def _monitor(law: PeriodicLaw, state: PeriodicState, n: int, wanted: float, v: float, applied: float) -> None:
-    """Go on with the integral of eq. 15 and its bound.
+    """Update the integral of eq. 15 and its bound.
 
     With θ = χ*·r̂ + u° the integrand is -μ·v = (S(u) - u° - χ*·v)·v, where u° is the input that keeps y at r.
     """
@@ -203,7 +203,7 @@ def _monitor(law: PeriodicLaw, state: PeriodicState, n: int, wanted: float, v: f
 
 @kernel
 def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float) -> float:
-    """One sample of the law: the limited command; counts the samples in which the limit was in use.
+    """Limited command of one sample; samples in which the limit was in use are counted.
 
     Args:
         law: its constants.
@@ -217,6 +217,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     output = step(law.filter, state.output, quantise(measurement, law.measurement_step))
     v = wanted - output
     s = min(max(output, -1.0), 1.0)
+    # Chunks begin at multiples of their size, so that the cutting into blocks changes no bit.
     place = n % state.smoothed.size
     if place == 0:
         _smooth(law, state, n)
@@ -228,7 +229,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     winding = (applied - demand) * v < 0.0
     frozen = values[_FROZEN] > 0.0
     if frozen:
-        stored = state.ring[(n - law.samples) % state.ring.size]
+        stored = state.ring[(n - law.samples) % state.ring.size]  # not what is read, which the filter would flatten
     elif winding and law.anti_windup:
         stored = min(max(read, -law.limit), law.limit)
     else:
@@ -253,7 +254,7 @@ def _block(
 
 @kernel
 def freeze(state: PeriodicState, on: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
-    """Let memory and I change no more, or again."""
+    """Freeze memory and I, or let them change again."""
     state.values[_FROZEN] = 1.0 if on else 0.0
 
 
@@ -318,7 +319,7 @@ class PeriodicController:
         ideal: Array | None = None,
     ) -> None:
         sigma = gains.memory_filter if memory_filter is None else memory_filter
-        check_law(gains, limit=limit, step_s=step_s, memory_filter=sigma, quantisation=(measurement_step, command_step))
+        _check(gains, limit=limit, step_s=step_s, memory_filter=sigma, quantisation=(measurement_step, command_step))
         samples = samples_in(period, step_s)
         reach = int(np.ceil(_REACH * sigma / step_s))
         if reach >= samples:

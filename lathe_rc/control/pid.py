@@ -105,13 +105,14 @@ class PidTable(NamedTuple):
 
 @inlined
 def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: float) -> float:
-    """The command of sample ``n``; ``state`` is changed, and counts samples at a limit."""
+    """Command of sample ``n``; ``state`` is changed, and counts samples at a limit."""
     if n % pid.divisor:
         return float(state[_COMMAND])
     way = set_point - state[_SET_POINT]
     move = pid.approach * way
     if pid.ramp > 0.0:
         move = min(max(move, -pid.ramp), pid.ramp)
+    # Not by the sum: its rounding could keep the set point from ever being reached.
     wanted = set_point if move == way else state[_SET_POINT] + move
     read = quantise(measurement, pid.adc)
     if state[_WAITS] > 0.0 and (pid.ramp > 0.0 or pid.approach < 1.0):
@@ -138,7 +139,7 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
 
 @kernel
 def enable_integrator(state: Array, on: bool, waits: bool) -> None:  # noqa: FBT001 - kernels take them by position
-    """Set in the state of a `Pid` whether it integrates, and whether another gives the command."""
+    """Set whether a `Pid` integrates, and whether it waits for another that gives the command."""
     state[_STANDS], state[_WAITS] = 0.0 if on else 1.0, 1.0 if waits else 0.0
 
 
@@ -210,17 +211,17 @@ class Pid:
 
     @property
     def saturated(self) -> int:
-        """Computations so far whose command was cut off."""
+        """Number of computations whose command was cut off."""
         return int(self.state[SATURATED])
 
     @property
     def clamped(self) -> int:
-        """Computations so far in which the integral stood still."""
+        """Number of computations in which the integral stood still."""
         return int(self.state[CLAMPED])
 
     @property
     def slowed(self) -> int:
-        """Computations so far whose set point was held back by ramp or smoothing."""
+        """Number of computations whose set point was held back by ramp or smoothing."""
         return int(self.state[SLOWED])
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:

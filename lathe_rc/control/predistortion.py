@@ -49,7 +49,7 @@ def proportional(stiffness: float | Array) -> ForceLaw:
 
 
 def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) -> Array:
-    """The radius that a path leaves, y [m], shape (m,).
+    """Radius y that a path leaves, by bisection [m], shape (m,).
 
     Args:
         compliance: C at each height [m/N], shape (m,).
@@ -59,6 +59,7 @@ def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) 
     """
     # F never falls with the depth: there is one root, and the deflection is at most that of a rigid shaft's cut.
     low, high = path, path + compliance * law(depth - path)
+    # To the last bit of the radius, which takes some fifty halvings.
     least = np.spacing(np.maximum(np.abs(low), np.abs(high)))
     while np.any(high - low > least):
         middle = (low + high) / 2.0
@@ -68,7 +69,7 @@ def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) 
 
 
 def cancelling(compliance: Array, law: ForceLaw, depth: float | Array, wanted: float | Array = 0.0) -> Array:
-    """The path x [m] whose deflection leaves the ``wanted`` radius w [m], shape (m,); otherwise as `turned`."""
+    """Path x [m] whose deflection leaves the ``wanted`` radius w [m], shape (m,); other arguments as of `turned`."""
     target = np.broadcast_to(wanted, compliance.shape)
     return np.asarray(target - compliance * law(depth - target))
 
@@ -139,7 +140,7 @@ class Predistortion:
         offset_along(self.table, height, set_point)
 
     def corrected(self, heights: Array, error: Array, gain: float = 1.0) -> "Predistortion":
-        """The path for the next part.
+        """Path for the next part.
 
         Args:
             heights: at which the last part was measured, rising [m], shape (k,); linear between them, and beyond

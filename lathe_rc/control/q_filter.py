@@ -99,11 +99,11 @@ class Exponential(QFilter):
         super().__init__(ceil(np.log(_TAIL) / np.log(self.ratio)) if self.ratio > 0.0 else 0, cycle)
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """See `QFilter`."""
+        """Filter by both recursions."""
         two_sided(self.ratio, self.reach, points, np.empty_like(points), smoothed)
 
     def response(self, radians: Array) -> Array:
-        """See `QFilter`."""
+        """Real response at ``radians`` per grid point, shape (n,)."""
         return np.asarray(1.0 / (1.0 + 4.0 * self._square * np.sin(radians / 2.0) ** 2))
 
 
@@ -133,14 +133,14 @@ class MovingAverage(QFilter):
         self._end = float(side - (self.reach - 1)) if self.reach else 0.0
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """See `QFilter`."""
+        """Filter by a running sum."""
         if self.reach:
             _running_mean(self.reach, self._end, points, smoothed)
         else:
             smoothed[:] = points
 
     def response(self, radians: Array) -> Array:
-        """See `QFilter`."""
+        """Real response at ``radians`` per grid point, shape (n,)."""
         if not self.reach:
             return np.ones_like(radians)
         inner = 2 * self.reach - 1
@@ -171,13 +171,13 @@ class Weights(QFilter):
         self._weights = weights
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """See `QFilter`."""
+        """Filter by transforms of a fixed length."""
         spectrum = scipy.fft.rfft(points, self._length)
         spectrum *= self._spectrum
         smoothed[:] = scipy.fft.irfft(spectrum, self._length)[self.reach : self.reach + self.chunk]
 
     def response(self, radians: Array) -> Array:
-        """See `QFilter`."""
+        """Real response at ``radians`` per grid point, shape (n,)."""
         # cos(jν) by Horner's rule for Chebyshev polynomials: memory does not grow with the kernel.
         series = np.concatenate((self._weights[:1], 2.0 * self._weights[1:]))
         return np.asarray(np.polynomial.chebyshev.chebval(np.cos(radians), series))

@@ -109,7 +109,8 @@ class RepetitiveController:
             law=int(correction.law),
             looks_ahead=correction.looks_ahead,
             settings=np.zeros(7),
-            memory=np.zeros(memory_size(self._cycle, q)),
+            # With what Q needs of the cycle before; a power of two, for indices by a mask.
+            memory=np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()),
             chunk=np.empty(q.chunk),
             scratch=np.empty((2, q.chunk + 2 * q.reach)),
             **{name: np.empty(shape) for name, shape in _ROOM.items()},
@@ -133,7 +134,7 @@ class RepetitiveController:
         return {**self.__dict__, "table": table}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """See `__getstate__`."""
+        """Restore the state, with new scratch arrays."""
         self.__dict__.update(state)
         room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
         self.table = self.table._replace(**room)
@@ -178,6 +179,7 @@ class RepetitiveController:
         self._replaced()
 
     def _replaced(self) -> None:
+        """Note that smoothed points, and errors that are on their way, belong to another memory."""
         self.table.whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
         self.table.whole[angle_memory.REPLACED] = 1
 
@@ -244,7 +246,7 @@ class RepetitiveController:
 
     @staticmethod
     def lost(reason: int, first: int, reached: int, angle: Array, speed: Array, past_angle: Array) -> AngleLostError:
-        """Why the memory cannot be read at sample ``reached`` of a block; its arrays are those of `block`."""
+        """Error that explains why the memory cannot be read at sample ``reached`` of a block, whose arrays it takes."""
         if reason == angle_memory.AHEAD:
             why = (
                 f"the memory is read at {angle[reached]:.6g} rad before it is learned; the spindle turns at "
@@ -260,7 +262,7 @@ class RepetitiveController:
         return AngleLostError(f"sample {first + reached}: {why}", reached)
 
     def smooth(self) -> None:
-        """Apply Q to the cycle before, for the chunk of grid points that learning has come to."""
+        """Apply Q to the cycle before, for the chunk of grid points that is learned next."""
         table, size, reach = self.table, self._q.chunk, self._q.reach
         base = int(table.whole[angle_memory.NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
@@ -268,7 +270,7 @@ class RepetitiveController:
         table.whole[angle_memory.CHUNK] = base
 
     def ended(self) -> list[Cycle]:
-        """The cycles that have ended since the last call."""
+        """Cycles that have ended since the last call."""
         if not self.table.whole[angle_memory.LOGGED]:
             return []
         logged = self.table.log[: self.table.whole[angle_memory.LOGGED]].tolist()
@@ -281,11 +283,6 @@ class RepetitiveController:
         self._cycles += 1
         self._rms_before = rms
         return Cycle(self._cycles, int(sample), rms, largest, contraction, bool(learning), bool(joined))
-
-
-def memory_size(cycle: int, q: QFilter) -> int:
-    """Grid points that the memory of a ``cycle`` holds: with what Q needs before it, a power of two for the index."""
-    return 1 << (cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()
 
 
 def largest_feedback_delay(

@@ -120,7 +120,7 @@ def _link(numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Link:
 
 
 def towards(drive: SampledDrive, ratio: float) -> Link:
-    """The link that makes D·W the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
+    """Link that makes D·W the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
 
     Wd = K·(1 - jλ·T/2)·(1 + jλ·Te)/(jλ·(1 + jλ·T/2)) = (K·T/2)·((1 + ratio)·z + 1 - ratio)/(z·(z - 1))
     """
@@ -134,7 +134,7 @@ def paper(drive: SampledDrive) -> Link:
 
 
 def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
-    """The link whose command for a step ends with the second period.
+    """Link whose command for a step ends with the second period.
 
     Args:
         drive: what it is for.
@@ -152,7 +152,7 @@ def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
 
 
 def design(law: Law, drive: SampledDrive, delay: float = 0.0) -> Link:
-    """The link of a law, see `paper` and `ripple_free`; the paper's does not know of a delay [s]."""
+    """Link of a law, by `paper` or `ripple_free`; the paper's makes no allowance for a delay [s]."""
     return paper(drive) if law == "paper" else ripple_free(drive, delay)
 
 
@@ -160,8 +160,8 @@ def closed_loop(drive: SampledDrive, link: Link, delay: float = 0.0) -> Array:
     """Characteristic polynomial of the closed loop, falling powers of z; nothing is cancelled.
 
     Args:
-        drive: what there is.
-        link: before it.
+        drive: of the loop.
+        link: before the drive.
         delay: by which the measurement comes late [s].
 
     Raises:
@@ -204,7 +204,7 @@ def rest(link: Link) -> Array:
 
 @kernel
 def correct(link: LinkTable, state: Array, error: float) -> tuple[float, bool]:
-    """The command of one more period, and whether it was cut off.
+    """Command of one more period, and whether it was cut off.
 
     The link remembers the command that it gave, not the one that it would have liked to give.
     """

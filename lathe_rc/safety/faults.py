@@ -50,7 +50,7 @@ class Value:
     below: float = math.inf
 
     def takes(self, value: float) -> bool:
-        """Whether it is allowed."""
+        """Whether a number is allowed."""
         return abs(value) <= _LARGEST and (value > self.low if self.above else value >= self.low) and value < self.below
 
 
@@ -132,7 +132,7 @@ class Fault:
 
     @property
     def text(self) -> str:
-        """How it is written."""
+        """The fault as it is written."""
         given = [f"{name}={value!r}" for name, value in self.values.items()]
         return " ".join([self.target, self.kind, *given])
 
@@ -205,6 +205,7 @@ class Disturbance:
     def __init__(self, fault: Fault, *, seed: int, step: float, whose: str) -> None:
         self._field, self._step = fault.target.rpartition(".")[2], step
         self._values = dict(fault.values)
+        # Not hash(), which differs from process to process.
         entropy = [seed, zlib.crc32(f"{whose} {fault.text}".encode())]
         self._random = np.random.default_rng(np.random.SeedSequence(entropy))
 
@@ -213,11 +214,11 @@ class Disturbance:
         self.change(signals[self._field])
 
     def change(self, signal: Array) -> None:
-        """Change those of the field that the fault is of; kinds of more than one field have their own `during`."""
+        """Change the samples of the faulty field; kinds with several fields override `during`."""
         raise NotImplementedError
 
     def after(self, signals: Signals) -> None:
-        """Change those that come when the fault is over."""
+        """Change the samples after the end of the fault."""
 
 
 class _Off(Disturbance):
@@ -251,7 +252,7 @@ class _Slow(Disturbance):
 
     def change(self, signal: Array) -> None:
         pole = math.exp(-self._step / self._values["time"])
-        if self._state is None:
+        if self._state is None:  # at rest at the first sample, without a jump
             self._state = np.array([pole * signal[0]])
         signal[:], self._state = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], signal, zi=self._state)
 
@@ -275,6 +276,7 @@ class _Intermittent(Disturbance):
             if not self._left:
                 self._dead = not self._dead
                 mean = self._values["off" if self._dead else "good"] / self._step
+                # Rounded up: a spell has a sample at least, or the loop would not end.
                 self._left = math.ceil(self._random.exponential(mean))
             stop = min(place + self._left, signal.size)
             if self._dead:
@@ -342,5 +344,5 @@ DISTURBANCES: Mapping[str, type[Disturbance]] = {
 
 
 def prepare() -> None:
-    """Load what faults need of SciPy, which is loaded when it is first used: else that would be in mid-run."""
+    """Load the part of SciPy that faults use: its import at their first use would stall a run."""
     scipy.signal.lfilter([1.0], [1.0], np.zeros(1))

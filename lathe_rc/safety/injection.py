@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults at the ports of a stage: which there may be, and what they do to the blocks that go through."""
+"""Faults at the ports of a stage, applied to the blocks that go through."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class Port:
     out: bool
 
     def targets(self, kind: Kind) -> set[str]:
-        """The fields of this port that a kind of fault can be of."""
+        """Targets at this port that a kind of fault can have."""
         if kind.what == "encoder":
             return {self.topic} if self.out and self.type == messages.ENCODER else set()
         if kind.what != "field":
@@ -58,7 +58,7 @@ class _Injected:
 
     def apply(self, first: int, signals: Signals) -> None:
         """Change samples ``first`` on of the node's time in place."""
-        first -= self.port.delay
+        first -= self.port.delay  # a fault is of the topic: a late reader meets it late
         samples = next(iter(signals.values())).size
         begin = min(max(self.start - first, 0), samples)
         stop = int(min(max(self.end - first, begin), samples))
@@ -69,7 +69,7 @@ class _Injected:
 
 
 class Injection:
-    """The faults of a stage's ports, and which its devices can have.
+    """Faults at the ports of a stage, and those that its devices can have.
 
     Args:
         node: its name.
@@ -104,10 +104,10 @@ class Injection:
         return {target for port in self._ports for target in port.targets(kind)}
 
     def check(self, fault: Fault) -> None:
-        """Refuse a fault of what cannot have it.
+        """Refuse a fault whose target cannot have it.
 
         Raises:
-            InputError: says what can.
+            InputError: names the targets that can.
         """
         allowed = self._targets(KINDS[fault.kind])
         if fault.target in allowed:
@@ -123,7 +123,7 @@ class Injection:
         """Refuse a target that no fault can have.
 
         Raises:
-            InputError: says which there are.
+            InputError: names the targets.
         """
         allowed = {each for kind in KINDS.values() for each in self._targets(kind)}
         if target not in allowed:
@@ -153,11 +153,11 @@ class Injection:
 
     @property
     def any(self) -> bool:
-        """Whether there is a fault, or has been: some leave something."""
+        """Whether there is a fault, or has been: lost counts stay lost after a repair."""
         return bool(self._injected)
 
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:
-        """The inputs of the stage; arrays that others read as well stay as they are."""
+        """Inputs of the stage with their faults; faulty signals are copies, since other stages read the originals."""
         changed = list(inputs)
         for place, port in enumerate(self._inputs):
             mine = [injected for injected in self._injected if injected.port is port]

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class State(IntEnum):
-    """How the cell is."""
+    """State of the cell."""
 
     NOMINAL = 0
     DEGRADED = 1
@@ -40,7 +40,7 @@ RETRACTED, RESET = "retracted", "reset"  #: what else changes the state: the too
 
 
 def after(state: State, cause: Reaction | str) -> State | None:
-    """The state that a cause leads to.
+    """State that a cause leads to.
 
     Args:
         state: before.
