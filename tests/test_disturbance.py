@@ -280,7 +280,7 @@ def test_a_law_that_senses_gets_the_measured_position():
         "coarse/state", ("measured_position",), 64,
     )  # fmt: skip
     fields = np.random.default_rng(0).standard_normal((6, 64))
-    law.step(law.memory, 0, 0, tuple(fields), (), (np.empty(64),))
+    law.step(law.memory, 0, 0, tuple(fields), (np.zeros(64, np.uint8),), (np.empty(64),))
     assert_array_equal(law.law.positions, fields[-1])
 
 
