@@ -52,6 +52,16 @@ def program():
         yield
 
 
+@pytest.fixture(scope="module")
+def client():
+    """A client of Dask whose worker is a thread of this process: to start others takes seconds."""
+    import distributed
+
+    options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.Client(**options, set_as_default=False) as client:
+        yield client
+
+
 @pytest.fixture
 def domain(monkeypatch):
     """A ROS domain of its own, for this process and those that it starts."""

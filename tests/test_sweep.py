@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps: which cells, what is kept of them, and going on where one was stopped."""
+"""Sweeps: their cells, the rows of the table, and continuation after a stop."""
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
-import distributed
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -18,7 +15,6 @@ import lathe_rc
 from lathe_papers import best_law, drive_tolerance, speed_deviation
 from lathe_rc import harness
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import NUMBERS, row, space, workers
@@ -31,22 +27,13 @@ PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
 
 
 @pytest.fixture(scope="module")
-def piston() -> Scenario:
+def piston():
     """Four revolutions of the piston."""
     return scenarios.load(PISTON, ["spindle_encoder.revolutions=4", "tool.tolerance=4e-6"])
 
 
-@pytest.fixture(scope="module")
-def client() -> Iterator[distributed.Client]:
-    """Workers in this process."""
-    with distributed.Client(
-        processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None, set_as_default=False
-    ) as found:
-        yield found
-
-
-def cells(scenario: Scenario, **of: Any) -> list[dict[str, Any]]:
-    """The cells of a space that has been checked."""
+def cells(scenario, **of):
+    """Cells of a checked space."""
     made = Space(**of)
     made.check(scenario)
     return list(made.cells(scenario))
@@ -55,7 +42,7 @@ def cells(scenario: Scenario, **of: Any) -> list[dict[str, Any]]:
 # ---- which cells -----------------------------------------------------------------------------------------------------
 
 
-def test_ranges_lists_and_parts_of_the_scenarios_value(piston: Scenario) -> None:
+def test_ranges_lists_and_parts_of_the_scenarios_value(piston):
     assert cells(piston, grid={LEAD: "1e-3:2e-3:3", "block_size": "64,128"}) == [
         {LEAD: lead, "block_size": size} for lead in (1e-3, 1.5e-3, 2e-3) for size in (64, 128)
     ]
@@ -66,22 +53,20 @@ def test_ranges_lists_and_parts_of_the_scenarios_value(piston: Scenario) -> None
     assert [each["learning_controller.lead_law"] for each in laws] == ["variable", "constant_angle"]
 
 
-def test_elements_of_lists_are_varied_and_tied(piston: Scenario) -> None:
-    base = piston.varied(
-        {"spindle_encoder.deviation_amplitude": [0.0, 0.1], "spindle_encoder.deviation_frequency": [9.0, 9.0]}
-    )
-    place = "spindle_encoder.deviation_amplitude[0]"
-    ties = {"spindle_encoder.deviation_frequency[1]": "spindle_encoder.deviation_amplitude[0] * 100"}
-    (cell,) = cells(base, grid={place: [0.05]}, ties=ties)
+def test_elements_of_lists_are_varied_and_tied(piston):
+    amplitude, frequency = "spindle_encoder.deviation_amplitude", "spindle_encoder.deviation_frequency"
+    base = piston.varied({amplitude: [0.0, 0.1], frequency: [9.0, 9.0]})
+    ties = {f"{frequency}[1]": f"{amplitude}[0] * 100"}
+    (cell,) = cells(base, grid={f"{amplitude}[0]": [0.05]}, ties=ties)
     table = base.varied(cell).nodes["spindle_encoder"]
     assert (table.deviation_amplitude, table.deviation_frequency) == ([0.05, 0.1], [9.0, 5.0])
     with pytest.raises(InputError, match="a list of 2 there"):
-        cells(base, grid={"spindle_encoder.deviation_amplitude[2]": [0.05]})
+        cells(base, grid={f"{amplitude}[2]": [0.05]})
     with pytest.raises(InputError, match="no list there"):
         cells(base, grid={f"{LEAD}[0]": [1e-3]})
 
 
-def test_models_follow_the_drives_or_stay(client: distributed.Client, tmp_path: Path) -> None:
+def test_models_follow_the_drives_or_stay(client, tmp_path):
     two = scenarios.load(PISTON.with_name("two_channel.yaml"), ["spindle_encoder.revolutions=6"])
     space_ = Space(grid={"electrodynamic_actuator.natural_frequency": ["80%"]})
     own = two.nodes["electrodynamic_actuator"].natural_frequency
@@ -95,7 +80,7 @@ def test_models_follow_the_drives_or_stay(client: distributed.Client, tmp_path: 
         lathe_rc.run_sweep(two, space_, tmp_path / "nominal", client=client)
 
 
-def test_ties_follow_what_they_depend_on_in_whatever_order_they_are_given(piston: Scenario) -> None:
+def test_ties_follow_what_they_depend_on_in_whatever_order_they_are_given(piston):
     ties = {Q: f"{DAMPING} * 1e-4", DAMPING: f"sqrt({LEAD} * 1e3) / 2 + 0 * nominal_rpm"}
     (cell,) = cells(piston, grid={LEAD: [1.44e-3]}, ties=ties)
     assert cell[DAMPING] == pytest.approx(0.6)
@@ -105,12 +90,12 @@ def test_ties_follow_what_they_depend_on_in_whatever_order_they_are_given(piston
 
 
 @pytest.mark.parametrize("sampler", space.SAMPLERS)
-def test_draws_have_their_law(piston: Scenario, sampler: str) -> None:
+def test_draws_have_their_law(piston, sampler):
     drawn = {DAMPING: "normal:5%", LEAD: "1e-3:2e-3", Q: "1e-6:1e-4:log"}
     found = cells(piston, sampled=drawn, sample=f"{sampler}:1024")
     damping, lead, q = (np.array([each[target] for each in found]) for target in drawn)
     nominal = piston.nodes["electrodynamic_actuator"].damping
-    # 1024 independent draws: five standard deviations of what is estimated.
+    # Each tolerance is five standard deviations of the estimate from 1024 independent draws.
     assert damping.mean() == pytest.approx(nominal, abs=5 * 0.05 * nominal / 32)
     assert damping.std() == pytest.approx(0.05 * nominal, rel=5 / math.sqrt(2 * 1024))
     assert 1e-3 <= lead.min() < lead.max() <= 2e-3
@@ -119,15 +104,14 @@ def test_draws_have_their_law(piston: Scenario, sampler: str) -> None:
 
 
 @pytest.mark.parametrize("sampler", ["sobol", "halton", "random"])
-def test_more_points_begin_with_the_same_ones(piston: Scenario, sampler: str) -> None:
+def test_more_points_begin_with_the_same_ones(piston, sampler):
     few, many = (cells(piston, sampled={LEAD: "1e-3:2e-3"}, sample=f"{sampler}:{n}") for n in (8, 5000))
     assert many[:8] == few
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(1e-4, 1e-2), min_size=1, max_size=4), st.integers(1, 4), st.integers(0, 3), st.integers(1, 3))
-def test_cells_are_as_many_as_are_counted_and_differ(leads: list[float], most: int, points: int, seeds: int) -> None:
-    piston = scenarios.load(PISTON)
+def test_cells_are_as_many_as_are_counted_and_differ(piston, leads, most, points, seeds):
     made = Space(
         grid={LEAD: leads, Q: f"1e-5:1e-4:{most}"},
         sampled={DAMPING: "uniform:0.5:1"} if points else {},
@@ -163,12 +147,12 @@ def test_cells_are_as_many_as_are_counted_and_differ(leads: list[float], most: i
         ({"given": [{LEAD: 1e-3}, {LEAD: 1e-3}]}, "the same; allowed: each once"),
     ],
 )
-def test_what_is_no_space_is_refused_in_a_line(piston: Scenario, of: dict[str, Any], said: str) -> None:
+def test_what_is_no_space_is_refused_in_a_line(piston, of, said):
     with pytest.raises(InputError, match=said):
         cells(piston, **of)
 
 
-def test_cells_of_a_file(piston: Scenario, tmp_path: Path) -> None:
+def test_cells_of_a_file(piston, tmp_path):
     (tmp_path / "cells.csv").write_text(f"{LEAD}, block_size\n1e-3,64\n2e-3,128\n")
     (tmp_path / "cells.yaml").write_text(f"- {{{LEAD}: 1e-3, block_size: 64}}\n- {LEAD}: 2e-3\n  block_size: 128\n")
     found = [space.given(tmp_path / name) for name in ("cells.csv", "cells.yaml")]
@@ -178,10 +162,10 @@ def test_cells_of_a_file(piston: Scenario, tmp_path: Path) -> None:
         space.given(tmp_path / "short.csv")
 
 
-# ---- what is kept of them --------------------------------------------------------------------------------------------
+# ---- rows of the table -----------------------------------------------------------------------------------------------
 
 
-def test_a_row_says_what_the_run_says(piston: Scenario) -> None:
+def test_a_row_says_what_the_run_says(piston):
     values = {LEAD: 1.3e-3, DAMPING: 0.8}
     asked = row.measure("coarse/state.effort:max", piston)
     found = row.compute(piston, values, [LEAD, DAMPING], [asked])
@@ -196,7 +180,7 @@ def test_a_row_says_what_the_run_says(piston: Scenario) -> None:
     assert found["tool.in_tolerance_from"] == result.verdict.since > 1
 
 
-def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston: Scenario) -> None:
+def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston):
     refused = row.compute(piston, {LEAD: 3e-3}, [LEAD], [])
     assert refused["status"] == row.REFUSED
     assert "learning diverges" in refused["reason"]
@@ -219,7 +203,7 @@ def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston: Scenario) -> None
         ("coarse/state.effort:most", "no statistic 'most'"),
     ],
 )
-def test_measures_that_cannot_be(piston: Scenario, text: str, said: str) -> None:
+def test_measures_that_cannot_be(piston, text, said):
     with pytest.raises(InputError, match=said):
         row.measure(text, piston)
 
@@ -227,17 +211,15 @@ def test_measures_that_cannot_be(piston: Scenario, text: str, said: str) -> None
 # ---- the sweep -------------------------------------------------------------------------------------------------------
 
 
-def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(
-    piston: Scenario, client: distributed.Client, tmp_path: Path
-) -> None:
-    told: list[dict[str, Any]] = []
+def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, client, tmp_path):
+    told = []
 
-    def stop(event: Any) -> None:
-        told.append(dict(event))
+    def stop(event):
+        told.append(event)
         if event["event"] == "rows":
             raise KeyboardInterrupt
 
-    def sweep(count: str, watch: Any = told.append) -> Sweep:
+    def sweep(count, watch=told.append):
         return lathe_rc.run_sweep(piston, Space(grid={LEAD: count}), tmp_path / "leads", client=client, watch=watch)
 
     leads = "1.2e-3,1.3e-3,3e-3"
@@ -262,7 +244,7 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(
     assert row.digest(harness.run(both.scenario(4)).recording, []) == both.row(4)["digest"]
 
 
-def test_a_folder_of_something_else_is_refused(piston: Scenario, client: distributed.Client, tmp_path: Path) -> None:
+def test_a_folder_of_something_else_is_refused(piston, client, tmp_path):
     space_ = Space(grid={LEAD: [1.3e-3]})
     lathe_rc.run_sweep(piston, space_, tmp_path / "one", client=client)
     longer = piston.varied({"spindle_encoder.revolutions": 5.0})
@@ -280,7 +262,7 @@ def test_a_folder_of_something_else_is_refused(piston: Scenario, client: distrib
         lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.4e-3]}), tmp_path / "one", scheduler="tcp://127.0.0.1:9")
 
 
-def test_the_command_of_a_finished_sweep(piston: Scenario, client: distributed.Client, tmp_path: Path) -> None:
+def test_the_command_of_a_finished_sweep(piston, client, tmp_path):
     lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3, 3e-3]}), tmp_path / "leads", client=client)
     show = ["sweep", "show", str(tmp_path / "leads"), "--cell"]
     done = CliRunner().invoke(main, [*show, "0", "--bag", str(tmp_path / "bag")])
@@ -291,7 +273,7 @@ def test_the_command_of_a_finished_sweep(piston: Scenario, client: distributed.C
 
 
 @pytest.mark.parametrize(("words", "listed"), [("sweep run", row.STATISTICS), ("tune", (*NUMBERS, *row.STATISTICS))])
-def test_help_lists_what_a_row_has(words: str, listed: Iterable[str]) -> None:
+def test_help_lists_what_a_row_has(words, listed):
     shown = CliRunner(env={"COLUMNS": "400"}).invoke(main, [*words.split(), "--help"]).stdout
     assert [name for name in listed if name not in shown] == []
 
@@ -300,13 +282,13 @@ def test_help_lists_what_a_row_has(words: str, listed: Iterable[str]) -> None:
 
 
 @pytest.fixture
-def own_workers(client: distributed.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Studies compute in this process: to start others takes seconds."""
+def own_workers(client, monkeypatch):
+    """Let studies compute in this process: to start others takes seconds."""
     monkeypatch.setattr(workers, "client_of", lambda *_: contextlib.nullcontext(client))
 
 
 @pytest.mark.usefixtures("own_workers")
-def test_all_laws_are_compared_at_the_same_conditions(tmp_path: Path) -> None:
+def test_all_laws_are_compared_at_the_same_conditions(tmp_path):
     asked = best_law.BestLawParameters(points=4, seeds=1, encoder_counts=[10_000], folder=str(tmp_path))
     found = best_law.run(asked)
     assert set(found.error) == set(speed_deviation.LAWS) - {speed_deviation.OURS}  # that is another stage
@@ -327,8 +309,8 @@ def test_all_laws_are_compared_at_the_same_conditions(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("own_workers")
-def test_a_larger_tolerance_of_drives_costs_more() -> None:
-    """And a drive with which learning would diverge counts as one that never gets there."""
+def test_a_larger_tolerance_of_drives_costs_more():
+    """A drive with which learning would diverge counts as one with an infinite error."""
     asked = drive_tolerance.DriveToleranceParameters(tolerance=[0.01, 0.15], drives=16, revolutions=10.0)
     found = drive_tolerance.run(asked)
     narrow, wide = found.error

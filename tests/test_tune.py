@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning: what is searched and wanted, that the search is the same however it is computed, and what it gives."""
+"""Tuning: search spaces, objectives, searches that are reproducible however they are computed, and results."""
 
 import json
 import math
 from pathlib import Path
 
-import distributed
 import numpy as np
 import optuna
 import pytest
@@ -45,19 +44,12 @@ def piston():
     return load("piston", 3, f"{LEAD}=0.9e-3", f"{Q}=200e-6")
 
 
-@pytest.fixture(scope="module")
-def client():
-    options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
-    with distributed.Client(**options, set_as_default=False) as made:
-        yield made
-
-
 WITH = {"subjects": ["margin>=0.1"], "batch": 4}
 
 
 @pytest.fixture(scope="module")
 def search(piston, client, tmp_path_factory):
-    """Searches the piston's lead and Q in a folder of this module by its name, or in a given one."""
+    """Search the piston's lead and Q in a folder of this module, given by its name."""
     place = tmp_path_factory.mktemp("tune")
 
     def go(folder, trials, goals=("tool.rms_error",), *, free=FREE, **more):
@@ -66,13 +58,9 @@ def search(piston, client, tmp_path_factory):
     return go
 
 
-def told(tuning):
-    return [(trial.number, dict(trial.values), trial.score) for trial in tuning.trials]
-
-
-def same(one, other):
-    """NaN is NaN here."""
-    return repr(told(one)) == repr(told(other))
+def outcomes(tuning):
+    """The trials as texts, in which NaN equals NaN."""
+    return [repr((trial.number, dict(trial.values), trial.score)) for trial in tuning.trials]
 
 
 class TestAsking:
@@ -81,8 +69,7 @@ class TestAsking:
         [
             ({}, "nothing is free"),
             ({"learning_controller.lead_tim": "1:2"}, "unknown parameter; did you mean lead_time"),
-            ({LEAD: "2e-3:1e-3"}, "an empty range; allowed: LOW below HIGH"),
-            ({LEAD: "1e-3:1e-3"}, "an empty range"),
+            ({LEAD: "1e-3:1e-3"}, "an empty range; allowed: LOW below HIGH"),
             ({LEAD: "0.0:2e-3:log"}, "ends above 0"),
             ({LEAD: "1e-3:2e-3:5"}, "allowed: LOW:HIGH, LOW:HIGH:log, or values between commas"),
             ({LEAD: "0.9e-3"}, "one value is no choice"),
@@ -93,9 +80,8 @@ class TestAsking:
         ],
     )
     def test_what_cannot_be_searched_is_refused_in_one_line(self, piston, free, said):
-        with pytest.raises(InputError, match=said) as refused:
+        with pytest.raises(InputError, match=rf"^.*{said}.*$"):
             search_space(piston, free)
-        assert "\n" not in str(refused.value)
 
     def test_a_range_in_percent_is_of_the_start(self, piston):
         found = search_space(piston, {LEAD: "50%:200%"})[LEAD].distribution
@@ -114,7 +100,7 @@ class TestAsking:
         ],
     )
     def test_what_cannot_be_wanted_is_refused_in_one_line(self, piston, goals, subjects, said):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=rf"^.*{said}.*$"):
             objectives(piston, goals, subjects)
 
     @pytest.mark.parametrize(("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "nobody learns")])
@@ -122,9 +108,8 @@ class TestAsking:
         with pytest.raises(InputError, match=f"{why} in interrupted_cut"):
             objectives(load("interrupted_cut", 3), [goal])
 
-    def test_the_command_refuses_in_one_line(self, tmp_path):
-        asked = ["tune", "piston", "--free", f"{LEAD}=1e-3:2e-3", "--goal", "margin", "--out", str(tmp_path / "x")]
-        refused = CliRunner().invoke(cli.main, [*asked, "--worst"])
+    def test_the_command_refuses_in_one_line(self, command):
+        refused = command("--worst")
         assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
         assert "--worst of one cell; allowed: with --over or --seeds" in refused.stderr
 
@@ -147,6 +132,7 @@ class TestAsking:
 
 class TestScore:
     def cells(self, *errors, margin=0.3):
+        """Rows of cells that ran to their ends."""
         return [{"status": row.DONE, "tool.max_error": error, "margin": margin} for error in errors]
 
     def test_the_worst_or_a_percentile_of_the_cells_counts(self, piston):
@@ -159,12 +145,12 @@ class TestScore:
         score = objectives(piston, ["-margin"]).score(cells)
         assert (score.costs, score.margin) == ((-0.1,), 0.1)
 
+    def refused(self, margin):
+        return {"status": row.REFUSED, "tool.max_error": None, "margin": margin}
+
     def test_refused_and_diverged_cells_are_infeasible_the_more_the_farther_they_are(self, piston):
         wanted = objectives(piston, ["tool.max_error"], ["margin>=0.2"])
-        near, far = (
-            wanted.score([{"status": row.REFUSED, "tool.max_error": None, "margin": margin}, *self.cells(1e-6)])
-            for margin in (-0.01, -0.5)
-        )
+        near, far = (wanted.score([self.refused(margin), *self.cells(1e-6)]) for margin in (-0.01, -0.5))
         assert near.costs == far.costs == (math.inf,)
         assert not near.feasible
         assert all(a < b for a, b in zip(near.violations, far.violations, strict=True))
@@ -173,15 +159,15 @@ class TestScore:
         assert not objectives(piston, ["tool.in_tolerance_from"]).score(no_value).feasible
 
     def test_a_percentile_leaves_out_so_many_that_are_refused(self, piston):
-        refused = [{"status": row.REFUSED, "tool.max_error": None, "margin": -1.0}]
         wanted = objectives(piston, ["tool.max_error"], ["margin>=0.2"], percentile=95.0)
-        assert wanted.score(self.cells(*[1e-6] * 95) + refused * 5).feasible
-        assert not wanted.score(self.cells(*[1e-6] * 94) + refused * 6).feasible
+        for done, feasible in ((95, True), (94, False)):
+            rows = [*self.cells(*[1e-6] * done), *[self.refused(-1.0)] * (100 - done)]
+            assert wanted.score(rows).feasible == feasible
 
 
 @pytest.fixture(scope="module")
 def tuned(search):
-    """A search that nothing interrupted."""
+    """A search without an interruption."""
     return search("whole", 20, **WITH)
 
 
@@ -197,11 +183,8 @@ class TestSearch:
         assert scenario.load(tuned.folder.path / "best.yaml").identity == tuned.scenario(best).identity
 
     def test_each_trial_is_a_row_that_runs_again_to_its_digest(self, tuned):
-        table = tuned.sweep.table()
-        assert table.column("cell").to_pylist() == list(range(20))
-        for trial in tuned.trials:
-            found = tuned.sweep.row(trial.number)
-            assert {target: found[target] for target in FREE} == trial.values
+        rows = tuned.sweep.table().select(["cell", *FREE]).to_pylist()
+        assert rows == [{"cell": number, **trial.values} for number, trial in enumerate(tuned.trials)]
         best = tuned.best.number
         again = harness.run(tuned.sweep.scenario(best))
         assert row.digest(again.recording, []) == tuned.sweep.row(best)["digest"]
@@ -210,32 +193,28 @@ class TestSearch:
         events = []
         again = search("whole", 20, **WITH, watch=lambda event: events.append(event["event"]))
         assert events == ["began"]
-        assert same(again, tuned)
-        assert same(tune.load(tuned.folder.path), tuned)
+        assert outcomes(again) == outcomes(tune.load(tuned.folder.path)) == outcomes(tuned)
 
     def test_stopped_anywhere_and_begun_again_it_is_the_same_search(self, tuned, search, monkeypatch):
-        """It is stopped after some rows, and in the middle of asking; what was computed is kept."""
-        seen = []
+        """The search is stopped after some rows, and in the middle of asking; computed rows are kept."""
+        seen, stops = [], {"asked": {3, 20, 30}, "rows": {2, 7, 12}}
         suggest = Dimension.suggest
 
-        def stop(free, trial, target):
-            seen.append("asked")
-            if seen.count("asked") in {3, 20, 30}:
+        def note(event):
+            seen.append(event)
+            if seen.count(event) in stops.get(event, ()):
                 raise KeyboardInterrupt
+
+        def stop(free, trial, target):
+            note("asked")
             suggest(free, trial, target)
 
         monkeypatch.setattr(Dimension, "suggest", stop)
-
-        def watch(event):
-            seen.append(event["event"])
-            if event["event"] == "rows" and seen.count("rows") in {2, 7, 12}:
-                raise KeyboardInterrupt
-
         for _ in range(6):
             with pytest.raises(KeyboardInterrupt):
-                search("stopped", 20, **WITH, watch=watch)
+                search("stopped", 20, **WITH, watch=lambda event: note(event["event"]))
         found = search("stopped", 20, **WITH)
-        assert same(found, tuned)
+        assert outcomes(found) == outcomes(tuned)
         rows = tuned.sweep.table().drop_columns(["seconds"])
         assert found.sweep.table().drop_columns(["seconds"]).equals(rows)
 
@@ -257,14 +236,14 @@ class TestSearch:
             assert [trial.number for trial in asked] == [4, 5, 6, 7]
             beside = go(12, compute)
             assert [trial.number for trial in beside.trials] == list(range(12))
-            assert same(beside, state.tuning())
+            assert outcomes(beside) == outcomes(state.tuning())
             written = scenario.load(folder.path / "best.yaml")
             assert written.identity == beside.scenario(beside.best).identity
             assert len(state.ask(other, 16)) == 4
         assert [trial.number for trial in go(16).trials] == list(range(16))
 
     def test_the_best_is_written_while_no_other_program_can(self, search, monkeypatch):
-        """Or one that knows fewer trials would write it over a better one."""
+        """Otherwise a program that knows fewer trials could overwrite a better one."""
         write, written = Tuning.write, []
 
         def locked(tuning, trial, path):
@@ -289,15 +268,14 @@ class TestSearch:
     )
     def test_a_journal_of_something_else_is_one_line(self, journal, line):
         journal.write_bytes(line + b"\n")
-        with pytest.raises(InputError, match=r"trials\.log, line 1: no journal of Optuna, or damaged") as refused:
+        with pytest.raises(InputError, match=r"^.*trials\.log, line 1: no journal of Optuna, or damaged.*$"):
             tune.load(journal.parent)
-        assert "\n" not in str(refused.value)
 
-    def test_a_line_that_a_process_was_stopped_in_is_left_out_and_said(self, tuned, journal, capsys):
+    def test_an_incomplete_last_line_is_left_out_and_reported(self, tuned, journal, capsys):
         lines = journal.read_bytes().splitlines(keepends=True)
         last = max(number for number, line in enumerate(lines) if b'"op_code":6' in line)
         journal.write_bytes(b"".join(lines[:last]) + lines[last][:-30])
-        assert told(tune.load(journal.parent)) == told(tuned)[:-1]
+        assert outcomes(tune.load(journal.parent)) == outcomes(tuned)[:-1]
         assert f"{journal}: the last line is not whole" in capsys.readouterr().err
 
     def test_a_trial_of_another_program_is_refused(self, journal):
@@ -326,23 +304,22 @@ class TestSearch:
         assert found.start.score.feasible
         assert len({repr(trial.values) for trial in found.trials}) > 4
 
-    @pytest.mark.parametrize("sampler", ["tpe", "cmaes", "nsga2"])
+    @pytest.mark.parametrize("sampler", ["cmaes", "nsga2"])
     def test_other_samplers_go_on_where_they_were_stopped(self, search, sampler):
-        whole = search(sampler, 24, sampler=sampler)
+        whole = search(sampler, 16, sampler=sampler)
         search(f"{sampler} in parts", 8, sampler=sampler)
-        assert same(search(f"{sampler} in parts", 24, sampler=sampler), whole)
+        assert outcomes(search(f"{sampler} in parts", 16, sampler=sampler)) == outcomes(whole)
         assert whole.best.score.costs < whole.start.score.costs
 
     def test_two_goals_give_a_front_and_a_file_of_each(self, search):
-        found = search("front", 24, ["tool.rms_error", "-margin"])
+        found = search("front", 16, ["tool.rms_error", "-margin"])
         front = found.front
         assert len(front) > 1
         for trial in front:
             written = scenario.load(found.folder.path / "front" / f"trial-{trial.number}.yaml")
             assert written.identity == found.scenario(trial).identity
         costs = np.array([trial.score.costs for trial in front])
-        assert (np.diff(costs[:, 0]) > 0).all()
-        assert (np.diff(costs[:, 1]) < 0).all()
+        assert (np.diff(costs, axis=0) * (1.0, -1.0) > 0.0).all()
         feasible = [trial.score.costs for trial in found.trials if trial.score.feasible]
         assert not any(a <= c and b <= d and (a, b) != (c, d) for c, d in costs for a, b in feasible)
         assert found.best in front
@@ -350,18 +327,18 @@ class TestSearch:
     def test_the_goal_over_plants_is_that_of_the_worst(self, search):
         over = Space(sampled={"electrodynamic_actuator.natural_frequency": "uniform:90%:110%"}, sample="sobol:4")
         found = search("plants", 3, over=over)
-        errors = found.sweep.table().column("tool.rms_error").to_pylist()
-        assert len(errors) == 12
+        table = found.sweep.table()
+        assert table.num_rows == 12
         for trial in found.trials:
-            cells = errors[4 * trial.number : 4 * trial.number + 4]
-            worst = math.inf if None in cells else max(cells)
-            assert trial.score.costs == (worst,)
-        plants = found.sweep.table().column("electrodynamic_actuator.natural_frequency").to_pylist()
+            cells = table.slice(4 * trial.number, 4).column("tool.rms_error").to_pylist()
+            assert trial.score.costs == (math.inf if None in cells else max(cells),)
+        plants = table.column("electrodynamic_actuator.natural_frequency").to_pylist()
         assert plants[:4] == plants[4:8] == plants[8:]
 
     def test_a_cell_without_a_tool_is_tuned_by_what_is_measured_in_its_last_revolution(self, client, tmp_path):
         cut = load("interrupted_cut", 4, f"{PID[0]}=1e-3")
-        found = lathe_rc.tune(cut, {PID[0]: "1e-4:0.05:log"}, [ERROR], tmp_path / "x", trials=3, client=client)
+        free, options = {PID[0]: "1e-4:0.05:log"}, {"trials": 3, "ask_formulas": False, "client": client}
+        found = lathe_rc.tune(cut, free, [ERROR], tmp_path / "x", **options)
         again = harness.run(found.sweep.scenario(2))
         kept = found.sweep.row(2)
         assert row.digest(again.recording, found.folder.measures) == kept["digest"]
@@ -371,20 +348,21 @@ class TestSearch:
         assert kept[ERROR] == pytest.approx(math.sqrt(np.mean(last**2)), rel=1e-3)
 
 
+def factor(scenario):
+    """The largest factor of learning from cycle to cycle."""
+    cell = Cell(scenario.nodes)
+    cell.check()
+    return cell.factors["learning_controller"]
+
+
 class TestFormulas:
     @pytest.mark.parametrize("margin", [0.05, 0.2])
     def test_q_time_keeps_the_margin_and_is_the_shortest_that_does(self, piston, margin):
         found = formulas.settings(piston, [LEAD, Q, "learning_controller.learning_gain"], margin)
         values = {target: each.value for target, each in found.items()}
         assert values["learning_controller.learning_gain"] == 1.0
-
-        def margin_with(q_time):
-            cell = Cell(piston.varied({**values, Q: q_time}).nodes)
-            cell.check()
-            return 1.0 - cell.factors["learning_controller"]
-
-        assert margin_with(values[Q]) == pytest.approx(margin, abs=1e-4)
-        assert margin_with(0.98 * values[Q]) < margin
+        assert 1.0 - factor(piston.varied(values)) == pytest.approx(margin, abs=1e-4)
+        assert 1.0 - factor(piston.varied({**values, Q: 0.98 * values[Q]})) < margin
 
     def test_the_lead_is_the_drive_s_lag(self, piston):
         drive = piston.nodes["electrodynamic_actuator"]
@@ -394,16 +372,11 @@ class TestFormulas:
 
     def test_with_a_given_q_the_lead_has_the_largest_margin(self, piston):
         lead = formulas.settings(piston, [LEAD])[LEAD].value
-
-        def factor(value):
-            cell = Cell(piston.varied({LEAD: value}).nodes)
-            cell.check()
-            return cell.factors["learning_controller"]
-
-        assert factor(lead) < min(factor(0.97 * lead), factor(1.03 * lead))
+        at_lead, shorter, longer = (factor(piston.varied({LEAD: part * lead})) for part in (1.0, 0.97, 1.03))
+        assert at_lead < min(shorter, longer)
 
     def test_the_force_loop_has_the_margins_that_are_said(self):
-        """With W1 as paper 004 prints it, and a feedback delay of 1 ms."""
+        """The loop has W1 as paper 004 prints it, and a feedback delay of 1 ms."""
         found = formulas.settings(load("force_turning", 3), PID)
         loop = evaluate(PAPER.w1, PidGains(*(found[target].value for target in PID)), 64 / 64_000)
         assert loop.stable
@@ -427,16 +400,18 @@ def test_the_robust_setting_of_the_page_is_twice_as_good_on_the_worst_plant_as_t
     nominal = dict(zip(names, (1.28459e-3, 216.231e-6, 91.674e-6, 13.5154e-6), strict=True))
     robust = dict(zip(names, (1.7713e-3, 139.249e-6, 92.5337e-6, 9.94758e-6), strict=True))
 
-    def worst(setting):
-        cells = (two_channel.varied({**setting, **plant}) for plant in plants.cells(two_channel))
+    def worst(setting, plants):
+        cells = (two_channel.varied({**setting, **plant}) for plant in plants)
         return max(outcome.kept.largest[-1] for outcome in batch.run_many(cells, batch.Errors))
 
-    assert worst(robust) < 0.5 * worst(nominal)
+    plants = list(plants.cells(two_channel))
+    # The nominal setting is worst on plant 37. That one alone shows what it leaves at least, and halves the time.
+    assert worst(robust, plants) < 0.5 * worst(nominal, plants[37:38])
 
 
 @pytest.fixture
 def command(tmp_path, monkeypatch, client):
-    """Runs ``lathe tune piston`` in this process."""
+    """Run ``lathe tune piston`` in this process."""
     monkeypatch.setattr(sweep, "client_of", lambda *_: sweep.nullcontext(client))
 
     def run(*words):

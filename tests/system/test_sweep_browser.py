@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a sweep in a real browser: every figure is drawn, can be chosen and brushed, and nobody is asked."""
+"""The page of a sweep in a real browser: every figure is drawn, chosen and brushed, without a request."""
 
 import re
 import sys
@@ -10,15 +10,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from test_report_browser import Visit, by_hand
-from test_sweep_page import LAW, LEAD, Q, bowl, shown_page, swept
-
-from lathe_rc.sweep import page
-from lathe_rc.sweep.space import Space
+from test_sweep_page import GRID, bowl, shown_page, swept
 
 pytestmark = pytest.mark.system
 
-# Runs in the page once its figures stand: chooses another pair, drags along the first axis, and writes its findings
-# into the title.
+# Runs in the page once its figures are drawn: chooses another pair, drags along the first axis, and writes the results
+# into the title, which the test reads.
 _HAND = """<script>
 const VIEWS = {}, embed = vegaEmbed;
 vegaEmbed = async (place, ...rest) => (VIEWS[place.id] = await embed(place, ...rest));
@@ -50,11 +47,8 @@ addEventListener("load", async () => {
 
 
 def test_figures_are_drawn_chosen_and_brushed(tmp_path):
-    """Of seven leads with a result each has 14 cells; the brush lies over the second of them."""
-    space = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
-    folder = swept(tmp_path / "sweep", space, bowl)
-    page.write(folder)
-    shown = shown_page(folder)
+    """Each of the seven leads with a result has 14 cells; the brush lies over the second lead."""
+    shown = shown_page(swept(tmp_path / "sweep", GRID, bowl))
     visit = Visit(by_hand(shown.source, _HAND, tmp_path), tmp_path, "--window-size=900,900")
     assert visit.console == []
     assert visit.requests == []
