@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""lathe bench: the frame around the benchmarks. What they measure is nothing that a test could hold."""
+"""``lathe bench``: the frame around the benchmarks. Their figures depend on the machine and are not tested."""
 
 import json
 import sys
@@ -90,29 +90,22 @@ def test_a_stored_result_is_shown_beside(tmp_path, monkeypatch):
     ],
 )
 def test_what_is_not_there_is_one_line(arguments, words):
-    told = run(*arguments)
-    assert told.exit_code == 2
-    assert words in told.output
+    refused = run(*arguments)
+    assert (refused.exit_code, words in refused.output) == (2, True)
 
 
-def test_the_page_says_what_is_met_and_what_is_not():
-    text = page.page(RESULT)
-    assert "a processor" in text
-    assert "0.95 (0.9 … 1)" in text
-    assert "≥ 0.9: met" in text
-    assert "≥ 150: **not met**" in text
-
-
-def test_the_page_has_what_stands_in_groups():
+def test_the_page_has_figures_in_groups_and_says_which_targets_are_met():
     lines = page.page(RESULT).splitlines()
     for figure, found, goal in [
+        ("engine.c_ratio", "0.95 (0.9 … 1)", "≥ 0.9: met"),
+        ("engine.real_time_factor", "140 (120 … 160)", "≥ 150: **not met**"),
         ("engine.full_cell.c_ratio", "0.5 (0.4 … 0.6)", "≥ 0.85: **not met**"),
         ("ros.bare_transport.block_64.bare_transport_ratio", "0.45", "≥ 0.6: **not met**"),
         ("ros.piston_5_nodes.block_64.processes.real_time_factor", "4", "≥ 3: met"),
     ]:
         assert f"| `{figure}` | {found} | {goal} |" in lines
-    for heading in ("### full cell", "### piston 5 nodes", "### bare transport"):
-        assert heading in lines
+    assert {"### full cell", "### piston 5 nodes", "### bare transport"} <= {*lines}
+    assert any("a processor" in line for line in lines)
 
 
 @pytest.mark.system

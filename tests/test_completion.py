@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe completion``: what a shell completes, through the real bash, and how it is installed."""
+"""``lathe completion``: completed words, the script in a real bash, and its installation."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def completed(*words):
-    """The words that may take the place of the last one."""
+    """Completions of the last word."""
     shell = ShellComplete(cli.main, {}, "lathe", "_LATHE_COMPLETE")
     return [found.value for found in shell.get_completions(list(words[:-1]), words[-1])]
 
@@ -50,7 +50,7 @@ def test_completes(words, found):
 
 
 def test_nodes_of_a_scenario_are_completed_with_the_parameters_of_their_kind(tmp_path):
-    """A file that cannot be read breaks no completion: there are the nodes of all kinds then."""
+    """For a file that cannot be read the nodes of all kinds are completed."""
     own = tmp_path / "own.yaml"
     own.write_text("/mine:\n  ros__parameters: {stage: piezo_actuator}\n/**:\n  ros__parameters: {}\n")
     assert completed("run", str(own), "--set", "") == ["mine."]
@@ -61,25 +61,28 @@ def test_nodes_of_a_scenario_are_completed_with_the_parameters_of_their_kind(tmp
 
 
 def test_completing_imports_no_more_than_it_needs():
-    """Neither NumPy nor ROS 2, of which each takes longer than people wait."""
-    code = "import sys; from click.shell_completion import ShellComplete as S; from lathe_rc import cli; "
-    code += "S(cli.main, {}, 'lathe', 'X').get_completions(['sweep', 'piston', '--vary'], 'tool'); "
-    code += "S(cli.main, {}, 'lathe', 'X').get_completions(['tune', 'piston'], '--fr'); "
-    code += "S(cli.main, {}, 'lathe', 'X').get_completions(['run'], '--m'); "
-    code += "print(sorted({'numpy', 'rclpy', 'numba', 'pydantic', 'dask', 'rich'} & sys.modules.keys()))"
+    """Neither NumPy nor ROS 2 is imported: each takes longer than a user waits."""
+    code = """
+import sys
+from click.shell_completion import ShellComplete
+from lathe_rc import cli
+shell = ShellComplete(cli.main, {}, "lathe", "X")
+for words in ("sweep piston --vary tool", "tune piston --fr", "run --m"):
+    *before, last = words.split()
+    shell.get_completions(before, last)
+print(*{"numpy", "rclpy", "numba", "pydantic", "dask", "rich"} & sys.modules.keys())
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout == "\n"
 
 
 @pytest.mark.parametrize("program", [str(ROOT / "lathe"), "./lathe"])
 def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
-    """The printed script, in a real bash: what its function gives for a command line."""
+    """The function of the printed script completes command lines in a real bash."""
     script = CliRunner().invoke(completion, ["bash"]).output + "compopt() { echo compopt $@; }\n"
     for line in (f"{program} run pist", f"{program} run piston --set tool.tol", f"{program} se"):
-        words = line.split()
-        script += (
-            f"COMP_WORDS=({line}) COMP_CWORD={len(words) - 1}; _lathe_complete {program} {words[-1]} {words[-2]}; "
-        )
+        *before, last = line.split()
+        script += f"COMP_WORDS=({line}) COMP_CWORD={len(before)}; _lathe_complete {program} {last} {before[-1]}\n"
         script += "printf '%s\\n' \"${COMPREPLY[@]}\"\n"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stderr == ""
@@ -99,22 +102,23 @@ class TestInstall:
         ("shell", "rc"), [("bash", ".bashrc"), ("zsh", ".zshrc"), ("fish", ".config/fish/config.fish")]
     )
     def test_writes_one_line_once_and_takes_it_out_again(self, home, shell, rc):
-        rc = home / rc
+        def run(option):
+            return CliRunner().invoke(completion, [shell, option]).output
+
+        rc, mine = home / rc, "# mine, without an end of line"
         rc.parent.mkdir(parents=True, exist_ok=True)
-        rc.write_text("# mine, without an end of line")
-        done = CliRunner().invoke(completion, [shell, "--install"])
-        assert f"{rc}: one line added" in done.output
+        rc.write_text(mine)
+        assert f"{rc}: one line added" in run("--install")
         installed = rc.read_text()
         script = home / ".local/share/lathe_rc" / f"completion.{shell}"
-        assert installed.startswith("# mine, without an end of line\n")
+        assert installed.startswith(f"{mine}\n")
         assert installed.count(str(script)) == 2  # on one line: if it is there, read it
         assert script.read_text() == CliRunner().invoke(completion, [shell]).output
-        assert "has its line already" in CliRunner().invoke(completion, [shell, "--install"]).output
+        assert "has its line already" in run("--install")
         assert rc.read_text() == installed
-        assert "the line is gone" in CliRunner().invoke(completion, [shell, "--remove"]).output
-        assert rc.read_text() == "# mine, without an end of line\n"
-        assert not script.exists()
-        assert "nothing to remove" in CliRunner().invoke(completion, [shell, "--remove"]).output
+        assert "the line is gone" in run("--remove")
+        assert (rc.read_text(), script.exists()) == (f"{mine}\n", False)
+        assert "nothing to remove" in run("--remove")
 
     def test_a_new_bash_has_it(self, home):
         done = CliRunner().invoke(completion, ["--install"], env={"SHELL": "/bin/bash"})

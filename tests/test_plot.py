@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plot that ``lathe run`` ends with in a terminal, and only there."""
+"""The plot at the end of ``lathe run``, which appears only in a terminal."""
 
 import fcntl
 import io
@@ -11,12 +11,10 @@ import subprocess
 import sys
 import termios
 
-import numpy as np
 import pytest
-from cells import run, scenario
+from cells import run
 from rich.console import Console
 
-from lathe_rc import harness
 from lathe_rc.commands import plot
 
 COMMAND = [sys.executable, "-m", "lathe_rc", "run", "piston", "--revolutions", "4"]
@@ -25,7 +23,7 @@ COLOUR = "\x1b[96m"  # of the RMS
 
 
 def in_terminal(*options, width, **environment):
-    """The output of the command in a terminal of so many characters across."""
+    """Return the output of the command in a terminal that is ``width`` characters wide."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
     own = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
@@ -61,7 +59,7 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize(("kind", "width", "drawn"), [("xterm", 80, True), ("dumb", 80, False), ("xterm", 30, False)])
 def test_a_terminal_that_cannot_show_it_gets_none(kind, width, drawn):
-    """Others get it in colours, unless nobody wants any."""
+    """A dumb or a narrow terminal gets no plot; others get it in colours."""
     console = Console(file=Terminal(), width=width, _environ={"TERM": kind})
     plot.show(run(), console)
     assert (HEADING in console.file.getvalue()) == (COLOUR in console.file.getvalue()) == drawn
@@ -74,7 +72,7 @@ def test_neither_a_pipe_nor_json_has_it():
 
 
 def test_the_curves_are_where_the_errors_are():
-    """Between the decades that hold them; of a long run no more points than can be seen, and no peak is lost."""
+    """The axis spans the decades of the errors, and no peak of a long run is lost when its points are thinned."""
     result = run(spindle_encoder={"revolutions": 40.0}, tool={"tolerance": 2e-6})
     console = Console(width=60, force_terminal=True, color_system=None)
     with console.capture() as caught:
@@ -86,9 +84,10 @@ def test_the_curves_are_where_the_errors_are():
 
 
 def test_one_revolution_is_no_curve():
-    one = harness.run(scenario(spindle_encoder={"revolutions": 1.2}))
-    assert plot.drawn(one, 80) is None
-    round_ = harness.run(scenario(spindle_encoder={"revolutions": 3.0}))
-    round_.errors.rms[:] = 0.0
-    assert np.all(round_.errors.rms == 0.0)
-    assert plot.drawn(round_, 80) is None
+    assert plot.drawn(run(spindle_encoder={"revolutions": 1.2}), 80) is None
+
+
+def test_errors_of_0_have_no_logarithm_to_plot():
+    perfect = run()
+    perfect.errors.rms[:] = 0.0
+    assert plot.drawn(perfect, 80) is None

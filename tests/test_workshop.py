@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe measure`` and the profiles that are written: what was turned is what is measured."""
+"""``lathe measure`` and its profiles: the measurements of a bag agree with the turned part."""
 
 import json
 
@@ -18,7 +18,7 @@ ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]
 
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory):
-    """The bag and the result of six revolutions; the controller leaves the form as it is until it has learned."""
+    """The bag and the result of six revolutions."""
     bag = tmp_path_factory.mktemp("turned") / "bag"
     given = {"profile": "harmonics", "harmonic_order": ORDERS, "harmonic_amplitude": AMPLITUDES, "feed": 1e-3}
     result = harness.run(scenario(spindle_encoder={"revolutions": 6.2}, tool=given), bag=bag)
