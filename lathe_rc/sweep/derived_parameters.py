@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas that tie parameters of a cell to others."""
+"""Derived parameters of a cell: formulas that tie them to other parameters."""
 
 import ast
 import math
@@ -17,11 +17,12 @@ _FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.s
 
 
 def _names(formula: str) -> set[str]:
-    """The targets that a formula names."""
+    """Return the targets that a formula names."""
     try:
         tree = ast.parse(formula.strip(), mode="eval")
     except SyntaxError:
         raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
+    # NODE.PARAM parses as an attribute of a name: only the whole of it is a target, neither its NODE nor a function.
     inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
     named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
@@ -29,10 +30,10 @@ def _names(formula: str) -> set[str]:
 
 
 def ordered(ties: Mapping[str, str]) -> list[str]:
-    """The tied targets, each after those that it depends on.
+    """Return the tied targets, each after those that it depends on.
 
     Raises:
-        InputError: they depend on one another in a circle.
+        InputError: the formulas depend on one another in a circle.
     """
     depends = {target: _names(formula) & ties.keys() for target, formula in ties.items()}
     try:
@@ -44,19 +45,19 @@ def ordered(ties: Mapping[str, str]) -> list[str]:
 
 
 class Formulas:
-    """Adds what is tied to the values of a cell."""
+    """Formulas of the tied parameters, parsed once for all cells of a space."""
 
     def __init__(self, scenario: Scenario, ties: Mapping[str, str]) -> None:
         self._scenario, self._ties = scenario, {target: ties[target] for target in ordered(ties)}
-        for formula in ties.values():
-            for name in _names(formula):
-                scenario.parameter(name)
         self._named = {target: _names(formula) for target, formula in ties.items()}
+        for names in self._named.values():
+            for name in names:
+                scenario.parameter(name)  # refuses an unknown one
         self._evaluator = simpleeval.SimpleEval(functions=_FUNCTIONS)
         self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
 
     def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
-        """Values by target, the tied ones among them.
+        """Add the tied values to those of a cell, in place, and return them.
 
         Raises:
             InputError: a formula has no value.
@@ -65,10 +66,11 @@ class Formulas:
             known: dict[str, Any] = {"pi": math.pi}
             for name in self._named[target]:
                 node, dot, of = name.partition(".")
+                # The cell's values come first: they hold the tied targets that this one depends on.
                 found = values.get(name, self._scenario.value(name))
                 if isinstance(found, list):
                     found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])
-                if dot:
+                if dot:  # simpleeval reads NODE.PARAM as an entry of a mapping
                     known.setdefault(node, {})[of] = found
                 else:
                     known[node] = found

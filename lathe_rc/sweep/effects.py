@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effects on a goal from the rows of a sweep: which parameter it depends on, how much, and how many cells keep to it.
+"""Effects of parameters on a goal, from the rows of a sweep, and the yield: the share of cells within a limit.
 
 With y the goal of the n cells that have one and the parameter's values in m bins b of n_b cells each,
 
     between = Σ n_b·(mean_b(y) - mean(y))²      within = Σ_b Σ (y - mean_b(y))²      total = between + within
     share   = (between - (m - 1)·within/(n - m)) / total
 
-is the part of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935): what m bins of
-pure chance would explain is taken off, so that it may fall a little below 0. In a complete grid nothing is chance, and
-share = between/total with a bin a value is exact: the main effect. SALib's measures for given samples know neither
-texts nor grids, and are no nearer: of Ishigami's function with 64, 256 and 1024 points (Sobol) the RMS error of the
-shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 by RBD-FAST and 0.20, 0.13, 0.08 by DELTA.
+is the part of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935). The part that m
+bins of pure chance would explain is subtracted, so that the share may fall a little below 0. In a complete grid nothing
+is chance, and share = between/total with one bin for each value is exact: the main effect. SALib's measures for given
+samples support neither texts nor grids, and are no more accurate: of Ishigami's function with 64, 256 and 1024 points
+(Sobol) the RMS error of the shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 by RBD-FAST and 0.20, 0.13, 0.08 by
+DELTA.
 """
 
 from collections.abc import Sequence
@@ -24,21 +25,21 @@ Samples = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _MOST_BINS = 32  # of a variance share
-LEAST = 8  #: cells below which nothing is said of what depends on what
-_WIDE = 30.0  # largest by smallest value from which on a logarithm shows more
+LEAST = 8  #: fewest cells from which effects are computed
+_WIDE = 30.0  # ratio of the largest to the smallest value above which an axis is logarithmic
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A parameter and its values.
+    """A parameter and its values in the cells.
 
     Attributes:
-        name: its target.
-        label: with the unit.
-        values: of the cells, shape (n,); of a text, its place in ``texts``; NaN where there is none.
+        name: target of the parameter.
+        label: name with the unit.
+        values: values in the cells, shape (n,); of a text, its place in ``texts``; NaN where there is none.
         log: whether it was varied on a log range.
-        texts: that stand for 0, 1, ...; empty: the values are numbers.
-        tied: whether a formula gives it.
+        texts: texts for the values 0, 1, ...; empty: the values are numbers.
+        tied: whether a formula gives the values.
     """
 
     name: str
@@ -50,16 +51,16 @@ class Axis:
 
     @property
     def distinct(self) -> Samples:
-        """The values, ascending, each once."""
+        """Distinct values, ascending."""
         return np.unique(self.values[np.isfinite(self.values)])
 
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """The values of an axis in bins.
+    """Bins of the values of an axis.
 
     Attributes:
-        index: bin of each cell; -1 where it has no value.
+        index: bin of each cell; -1 where the cell has no value.
         low, mid, high: ends and middle of the bins.
     """
 
@@ -70,26 +71,27 @@ class Bins:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of bins."""
         return self.mid.size
 
 
 def is_wide(values: Samples) -> bool:
-    """Whether numbers span so much that their logarithm shows more."""
+    """Whether positive numbers span so wide a range that a logarithmic axis shows more."""
     known = values[np.isfinite(values)]
     return bool(known.size and known.min() > 0.0 and known.max() > _WIDE * known.min())
 
 
 def bins(axis: Axis, exact: int, most: int) -> Bins:
-    """A bin a value where there are at most ``exact`` of them, else at most ``most`` bins of equal width.
+    """Return one bin for each value if there are at most ``exact`` values, else ``most`` bins of equal width.
 
-    On a log range the width is that of the logarithm.
+    On a log range the widths of the logarithms are equal.
     """
     distinct = axis.distinct
     scaled = np.log(distinct) if axis.log else distinct
     if distinct.size <= exact or axis.texts:
         index = np.where(np.isfinite(axis.values), np.searchsorted(distinct, axis.values), -1)
         middle = scaled
+        # Edges lie half-way between values; the outer bins are as wide on their outer side as on their inner one.
         step = np.diff(middle) if middle.size > 1 else np.array([1.0])
         edges = np.concatenate(
             [[middle[0] - step[0] / 2], middle[:-1] + np.diff(middle) / 2, [middle[-1] + step[-1] / 2]]
@@ -99,7 +101,7 @@ def bins(axis: Axis, exact: int, most: int) -> Bins:
         edges = np.linspace(scaled[0], scaled[-1], most + 1)
         with np.errstate(invalid="ignore"):
             place = np.searchsorted(edges, np.log(axis.values) if axis.log else axis.values, side="right") - 1
-        index = np.where(np.isfinite(axis.values), np.minimum(place, most - 1), -1)
+        index = np.where(np.isfinite(axis.values), np.minimum(place, most - 1), -1)  # the last bin has both its ends
         low, high = edges[:-1], edges[1:]
         middle = (low + high) / 2
     if axis.log:
@@ -108,10 +110,11 @@ def bins(axis: Axis, exact: int, most: int) -> Bins:
 
 
 def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
-    """Whether the cells are all combinations of the values, each equally often, and each has a goal."""
+    """Whether the cells are all combinations of the values, each equally often, and every cell has a goal."""
     free = [axis for axis in axes if not axis.tied]
     if not free or not np.isfinite(goal).all() or not all(np.isfinite(axis.values).all() for axis in free):
         return False
+    # Most samples end here, before their rows are sorted. In floating point the product cannot overflow.
     if float(np.prod([float(axis.distinct.size) for axis in free])) > goal.size:
         return False
     combinations, counts = np.unique(np.stack([axis.values for axis in free]), axis=1, return_counts=True)
@@ -120,7 +123,7 @@ def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
 
 
 def _quantile_bins(values: Samples, count: int) -> Index:
-    """Bins of about as many cells each; equal values share one."""
+    """Return bins of about equal numbers of cells; equal values share a bin."""
     place = np.searchsorted(np.sort(values), values, side="left")
     return np.unique(place * count // values.size, return_inverse=True)[1].astype(np.int64)
 
@@ -130,8 +133,8 @@ class Effect:
     """The effect of a parameter on a goal.
 
     Attributes:
-        share: of the goal's variance that it explains by itself; None: too few cells, or a goal that does not vary.
-        rank: Spearman's correlation, -1 to 1; None also for texts that have no order.
+        share: share of the goal's variance that it explains by itself; None: too few cells, or a constant goal.
+        rank: Spearman's rank correlation, -1 to 1; None also for texts that have no order.
     """
 
     share: float | None
@@ -139,11 +142,11 @@ class Effect:
 
 
 def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
-    """The effect of a parameter on a goal.
+    """Return the effect of a parameter on a goal.
 
     Args:
         axis: the parameter.
-        goal: shape (n,); NaN where a cell has none.
+        goal: goal of the cells, shape (n,); NaN where a cell has none.
         exact: whether the cells are a complete grid, see `is_grid`.
     """
     known = np.isfinite(goal) & np.isfinite(axis.values)
@@ -152,7 +155,7 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
     if y.size < LEAST or levels < 2 or np.ptp(y) == 0.0:
         return Effect(None, None)
     limit = int(np.clip(np.sqrt(y.size) / 2.0, 2, _MOST_BINS))
-    exact = exact and not axis.tied
+    exact = exact and not axis.tied  # a tied parameter is no axis of the grid
     whole = exact or bool(axis.texts) or levels <= limit
     index = np.unique(x, return_inverse=True)[1] if whole else _quantile_bins(x, limit)
     counts = np.bincount(index)
@@ -160,7 +163,7 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
     total = float(((y - y.mean()) ** 2).sum())
     between = float((counts * (means - y.mean()) ** 2).sum())
     if not exact:
-        if counts.size >= y.size:
+        if counts.size >= y.size:  # one cell in each bin: no variance within them to estimate chance from
             return Effect(None, None)
         between -= (counts.size - 1) * max(total - between, 0.0) / (y.size - counts.size)
     ordered = not axis.texts or set(axis.texts) == {"false", "true"}
@@ -170,12 +173,12 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
 
 @dataclass(frozen=True, eq=False)
 class Yield:
-    """How many cells keep to a limit of the goal.
+    """Share of the cells that are within a limit of the goal.
 
     Attributes:
-        goal: of the cells that have one, ascending.
-        cells: all of them; a failed one keeps to no limit.
-        above: the goal is to be large, not small.
+        goal: goal of the cells that have one, ascending.
+        cells: number of all cells; a failed cell is within no limit.
+        above: whether the goal should be large, not small.
     """
 
     goal: Samples
@@ -183,11 +186,11 @@ class Yield:
     above: bool = False
 
     def share(self, limit: float) -> float:
-        """Of all cells, whose goal is at most, or at least, a limit."""
+        """Return the share of all cells whose goal is at most (if `above`, at least) a limit."""
         return self._within(limit) / self.cells
 
     def interval(self, limit: float) -> tuple[float, float]:
-        """Between which the share of all such cells is, with 95 % confidence, if these are a random sample (Wilson)."""
+        """Return the 95 % confidence interval (Wilson) of the share, for cells that are a random sample."""
         found = scipy.stats.binomtest(self._within(limit), self.cells).proportion_ci(0.95, method="wilson")
         return float(found.low), float(found.high)
 
@@ -197,14 +200,14 @@ class Yield:
         return int(np.searchsorted(self.goal, limit, side="right"))
 
     def point(self, share: float) -> float | None:
-        """The tightest limit that this share of all cells keeps to; None: not as many came to a goal."""
-        needed = int(np.ceil(share * self.cells - 1e-9))
+        """Return the tightest limit that this share of all cells is within; None: too few cells have a goal."""
+        needed = int(np.ceil(share * self.cells - 1e-9))  # rounding must not ask for one cell more
         if not 0 < needed <= self.goal.size:
             return None
         return float(self.goal[self.goal.size - needed] if self.above else self.goal[needed - 1])
 
     def curve(self, most: int) -> tuple[Samples, Samples]:
-        """Limits and shares, at most so many points, the first and the last cell among them."""
+        """Return limits and shares of at most ``most`` points, the first and the last cell among them."""
         place = np.unique(np.linspace(0, self.goal.size - 1, min(most, self.goal.size)).round().astype(np.int64))
         kept = self.goal.size - place if self.above else place + 1
         return self.goal[place], kept / self.cells

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a sweep as specifications of Vega-Lite, and the data sets that they share.
+"""Figures of a sweep as Vega-Lite specifications, and the data sets that they share.
 
-Data sets: ``pair-I-J`` (I < J) has a row for each pair of bins of two axes, ``one-I`` for each bin of one, ``bins-I``
-says where the bins are. In the rows, a and b are bins; n cells of which d have a goal; m, s and l are the median, the
-smallest and the largest goal, p and q its 5 and 95 % points.
+Data sets: ``pair-I-J`` (I < J) has a row for each pair of bins of two axes, ``one-I`` for each bin of one axis, and
+``bins-I`` has the positions of the bins. In the rows, a and b are bins; n cells, of which d have a goal; m, s and l are
+the median, the smallest and the largest goal, p and q its 5 and 95 % points.
 """
 
 import math
@@ -31,14 +31,14 @@ _STATISTICS = {"m": "median", "s": "smallest", "l": "largest"}
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A goal by which the cells are judged.
+    """A goal by which cells are judged.
 
     Attributes:
-        name: of its column.
-        label: with the unit.
-        unit: of the values; empty: none.
-        values: of the cells, shape (n,); NaN where there is none.
-        above: it is to be large, not small.
+        name: name of the column.
+        label: name with the unit.
+        unit: unit of the values; empty: none.
+        values: values in the cells, shape (n,); NaN where there is none.
+        above: whether it should be large, not small.
     """
 
     name: str
@@ -54,27 +54,28 @@ class Goal:
 
     @property
     def scale(self) -> Spec:
-        """Of an axis."""
+        """Scale of an axis of the goal."""
         return axis_scale(log=self.log)
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """Cells that have a goal, the best first; equal ones as they were asked for."""
+        """Cells that have a goal, best first; equal ones in the order of the cells."""
         known = np.flatnonzero(np.isfinite(self.values))
         return known[np.argsort(-self.values[known] if self.above else self.values[known], kind="stable")]
 
     def told(self, value: float) -> str:
-        """A value with the unit."""
+        """Format a value with the unit."""
         return f"{said(value)} {self.unit}".rstrip()
 
 
 def said(value: float) -> str:
-    """A number for people."""
+    """Format a number for readers."""
     return f"{value:.4g}"
 
 
 def effect_said(effect: Effect) -> tuple[str, str]:
-    """Share and rank correlation for people, without the sign of what is rounded to 0; empty: there is none."""
+    """Format the share and the rank correlation of an effect; empty: there is none."""
+    # Adding 0.0 turns -0.0 into 0.0: a value that rounds to 0 is shown without a sign.
     share = "" if effect.share is None else f"{round(effect.share, 3) + 0.0:.3f}"
     return share, "" if effect.rank is None else f"{round(effect.rank, 2) + 0.0:+.2f}"
 
@@ -83,9 +84,10 @@ def effect_said(effect: Effect) -> tuple[str, str]:
 
 
 def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: Index) -> Rows:
-    """The results of the cells of each group that has any."""
+    """Return statistics of the goal in each group of cells; a group without cells has no row."""
     known = (group >= 0) & np.isfinite(goal)
     cells, done = (np.bincount(group[some], minlength=count) for some in (group >= 0, known))
+    # One sort by group and goal gives all quantiles: group k has the places first[k] to first[k] + done[k] - 1.
     ordered = goal[known][np.lexsort((goal[known], group[known]))]
     ordered = ordered if ordered.size else np.array([np.nan])
     first = np.cumsum(done) - done
@@ -100,19 +102,19 @@ def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: In
 
 
 def pair(first: Bins, second: Bins, goal: Samples) -> Rows:
-    """The data set of two axes."""
+    """Return the data set of two axes."""
     group = np.where((first.index < 0) | (second.index < 0), -1, first.index * second.count + second.index)
     a, b = np.divmod(np.arange(first.count * second.count), second.count)
     return _grouped(group, a.size, goal, "msl", a=a, b=b)
 
 
 def one(place: Bins, goal: Samples) -> Rows:
-    """The data set of one axis."""
+    """Return the data set of one axis."""
     return _grouped(place.index, place.count, goal, "mslpq", a=np.arange(place.count))
 
 
 def places(axis: Axis, found: Bins) -> Rows:
-    """Where the bins of an axis are, and what they are called."""
+    """Return positions and names of the bins of an axis."""
     index = np.arange(found.count)
     if axis.texts:
         return rows(i=index, t=list(axis.texts[: found.count]))
@@ -127,7 +129,10 @@ def places(axis: Axis, found: Bins) -> Rows:
 
 
 def _looked_up(place: int, axis: Axis, prefix: str, others: Sequence[int] = ()) -> Spec:
-    """Where the bins of an axis are; it is the first axis of the data set unless one of the others comes before."""
+    """Return the transform that looks up the positions of an axis's bins.
+
+    A data set of two axes has them in their order: the bin is ``a``, or ``b`` if one of the others comes before.
+    """
     fields = ["t"] if axis.texts else ["t", "x", "x0", "x1"]
     source = {"data": {"name": f"bins-{place}"}, "key": "i", "fields": fields}
     bin_ = "a" if all(place < other for other in others) else "b"
@@ -139,13 +144,13 @@ def _named(axis: Axis, prefix: str) -> Spec:
 
 
 def _along(axis: Axis, found: Bins, field: str) -> Spec:
-    """Encoding by a field of numbers, on an axis from the first to the last bin."""
+    """Return the encoding of a numeric field, on an axis from the first to the last bin."""
     ends = [float(found.low[0]), float(found.high[-1])]
     return quantity(field, axis.label, scale=axis_scale(log=axis.log, ends=ends), axis=_AXIS)
 
 
 def _span(channel: str, axis: Axis, found: Bins) -> Spec:
-    """Encoding of a bin from its low to its high end."""
+    """Return the encoding of a bin from its low to its high end."""
     if axis.texts:
         return {channel: _named(axis, channel)}
     return {channel: _along(axis, found, f"{channel}x0"), f"{channel}2": {"field": f"{channel}x1"}}
@@ -157,7 +162,7 @@ def _tip(goal: Goal, **names: Axis) -> Rows:
 
 
 def _choice(what: str) -> Spec:
-    """The reader's choice of a statistic of several cells."""
+    """Return the control by which readers choose a statistic of several cells."""
     choice = {"input": "select", "options": list(_STATISTICS), "labels": list(_STATISTICS.values()), "name": f"{what} "}
     return {"name": "shown", "value": "m", "bind": choice}
 
@@ -166,7 +171,7 @@ _CHOSEN = {"calculate": "datum[shown]", "as": "v"}
 
 
 def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal) -> Spec:
-    """The goal over two parameters; grey where cells have none."""
+    """Return the heat map of the goal over two parameters; fields without a goal are grey."""
     (x, x_bins), (y, y_bins) = axes[across], axes[up]
     where = {**_span("x", x, x_bins), **_span("y", y, y_bins), "tooltip": _tip(goal, xt=x, yt=y)}
     scale = {**goal.scale, "scheme": "viridis", "reverse": goal.above}
@@ -184,7 +189,7 @@ def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal
 
 
 def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goal: Goal) -> Spec:
-    """The goal over one parameter: a line for each value of another one, or the median with a band."""
+    """Return the goal over one parameter: a line for each value of another one, or the median with a band."""
     x, x_bins = axes[across]
     place = _named(x, "x") if x.texts else _along(x, x_bins, "xx")
     known = {"filter": "datum.d > 0"}
@@ -231,7 +236,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
 
 
 def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
-    """Bars: what each parameter explains of the goal's variance."""
+    """Return bars of the share of the goal's variance that each parameter explains."""
     texts = []
     for name, effect in zip(names, effects, strict=True):
         share, rank = effect_said(effect)
@@ -252,7 +257,7 @@ def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
 
 
 def cumulative(found: Yield, goal: Goal, tolerance: float | None) -> Spec:
-    """Share of all cells whose goal keeps to a limit, with the points that 95 and 99 % keep to."""
+    """Return the curve of the share of cells within a limit, with the limits of 95 and 99 % of the cells."""
     limits, shares = found.curve(_POINTS)
     points = [(found.point(share), f"{share:.0%}", level) for share, level in zip(_SHARES, (0.32, 0.2), strict=True)]
     marks = [(limit, level, f"{name}: {goal.told(limit)}") for limit, name, level in points if limit is not None]

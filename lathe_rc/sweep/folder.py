@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a sweep: the cell that is varied, the spaces that were asked for, and the rows as a Parquet data set.
+"""Folder of a sweep: the varied cell, the requested spaces, and the rows as a Parquet data set.
 
 DIR/scenario.yaml    the cell, as it was given
-DIR/sweep.json       its identity, what is measured, the spaces, or what is tuned
-DIR/rows/*.parquet   a row a cell, see `lathe_rc.sweep.row`
+DIR/sweep.json       identity of the cell, measures, and the spaces or the request of a tuning
+DIR/rows/*.parquet   one row for each cell, see `lathe_rc.sweep.row`
 
-Each of these files has a checksum, which is compared when it is read; those of older versions have none.
+Each of these files has a checksum, which is compared when it is read; files of older versions have none.
 """
 
 import io
@@ -39,7 +39,7 @@ _MOST = 2**30  # longest file of rows [B]
 
 @dataclass(frozen=True)
 class Request:
-    """The request of a tuning, see `lathe_rc.sweep.tune`; ``targets`` are columns."""
+    """Request of a tuning, see `lathe_rc.sweep.tune`; ``targets`` are the columns of its parameters."""
 
     targets: list[str]
     free: dict[str, str | list[Value]]
@@ -55,7 +55,7 @@ class Request:
 
 @dataclass(frozen=True)
 class _Contents:
-    """The content of a sweep.json; see `Folder`."""
+    """Content of a sweep.json, see `Folder`."""
 
     format: int
     name: str
@@ -66,20 +66,20 @@ class _Contents:
 
 
 class Folder:
-    """A sweep on the disk.
+    """A sweep on disk.
 
     Args:
-        path: its folder.
+        path: folder of the sweep.
 
     Attributes:
         path: see above.
-        scenario: the cell that is varied.
-        measures: what is measured of each, beside the rest.
-        spaces: that were asked for, in order.
-        tuning: what is tuned; None: it is no tuning.
+        scenario: the varied cell.
+        measures: further columns of the rows.
+        spaces: requested spaces, in order.
+        tuning: request of a tuning; None: the sweep is no tuning.
 
     Raises:
-        InputError: it holds no sweep.
+        InputError: the folder holds no sweep.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,11 +105,11 @@ class Folder:
         measures: Sequence[Measure],
         tuning: Request | None = None,
     ) -> "Folder":
-        """The sweep of a folder, which is made if it is not there, with one more space; or its tuning.
+        """Open the sweep or the tuning of a folder, with one more space; a missing folder is made.
 
         Raises:
-            InputError: it holds something else.
-            LatheError: it cannot be written.
+            InputError: the folder holds something else.
+            LatheError: the folder cannot be written.
         """
         if not (path / _WRITING).exists():  # else another process has begun it just now
             _refuse_others(path)
@@ -137,6 +137,7 @@ class Folder:
                 raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
         if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
+        # scenario.yaml is written first: where there is a sweep.json, the folder is complete.
         told = asdict(_Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning))
         with writing(path):
             (path / "rows").mkdir(parents=True, exist_ok=True)
@@ -148,13 +149,13 @@ class Folder:
         return Folder(path)
 
     def locked(self, *, wait: bool = False) -> AbstractContextManager[None]:
-        """Keep others from computing into the folder.
+        """Keep other processes from computing into the folder.
 
         Args:
-            wait: for somebody who does already.
+            wait: whether to wait for a process that does so already.
 
         Raises:
-            InputError: somebody does already.
+            InputError: another process computes into the folder, and ``wait`` is false.
         """
         return locked(self.path / "lock", wait=wait)
 
@@ -171,18 +172,18 @@ class Folder:
         return row.schema(self.scenario, self.targets, self.measures)
 
     def keys(self) -> set[str]:
-        """Of the cells that are computed."""
+        """Return the keys of the computed cells."""
         return set(self._read(["key"]).column("key").to_pylist())
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """The rows, in the order of the cells.
+        """Return the rows, in the order of the cells.
 
         Args:
-            columns: that are read; None: all.
+            columns: columns to read; None: all.
         """
         found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
         for target in self.targets:
-            # A cell that was computed before a target was varied has the scenario's own value.
+            # A cell that was computed before a target was first varied has the scenario's own value of it.
             if target in found.column_names and found.column(target).null_count:
                 field = found.schema.field(target)
                 filled = pyarrow.compute.coalesce(
@@ -200,7 +201,7 @@ class Folder:
         return pa.concat_tables([whole, *(self._rows(path, columns) for path in paths)])
 
     def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
-        """The rows in a file."""
+        """Return the rows of a file."""
         content = pa.BufferReader(_read(path))
         try:
             names = pyarrow.parquet.read_schema(content).names
@@ -212,7 +213,7 @@ class Folder:
             raise InputError(f"{path}: no rows of a sweep ({shown(error)}); allowed: without it") from None
 
     def row(self, number: int) -> dict[str, Any]:
-        """The row of a cell, by column.
+        """Return the row of a cell, by column.
 
         Raises:
             InputError: there is no such cell, or it is not computed.
@@ -225,7 +226,7 @@ class Folder:
         return cast("dict[str, Any]", found[0])
 
     def values(self, number: int) -> dict[str, Value]:
-        """The varied values of a cell.
+        """Return the varied values of a cell.
 
         Raises:
             InputError: there is no such cell, or it is not computed.
@@ -238,17 +239,21 @@ class Folder:
         """Add rows, as one file.
 
         Raises:
-            LatheError: it cannot be written; what was written before is there still.
+            LatheError: the file cannot be written; the rows before are kept.
         """
         place = self.path / "rows"
-        with locked(self.path / _WRITING), writing(self.path):  # a tuning is computed by several
+        # Several processes may compute a tuning: without the lock two could take the same number for their files.
+        with locked(self.path / _WRITING), writing(self.path):
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
                 stream.write(_parquet(pa.concat_tables(rows)))
 
 
 def _parquet(rows: pa.Table) -> bytes:
-    """A Parquet file with a checksum among its metadata: those of its pages, for other programs, leave out the rest."""
+    """Return a Parquet file with a checksum of the whole in its metadata.
+
+    Its pages have checksums of their own for other programs; these do not cover the rest of the file.
+    """
     content = io.BytesIO()
     with pyarrow.parquet.ParquetWriter(content, rows.schema, compression="zstd", write_page_checksum=True) as writer:
         writer.write_table(rows)
@@ -267,10 +272,10 @@ def _contents(path: Path) -> _Contents:
 
 
 def _read(path: Path) -> bytes:
-    """The content of a file of a sweep.
+    """Return the content of a file of a sweep.
 
     Raises:
-        InputError: it cannot be read, or is damaged.
+        InputError: the file cannot be read, or is damaged.
     """
     try:
         with _reading(path):
@@ -294,10 +299,10 @@ def _refuse_others(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    """Hold a lock.
+    """Hold the lock of a file.
 
     Raises:
-        InputError: there can be none; without ``wait``: another process holds it.
+        InputError: the file cannot be made; without ``wait``: another process holds the lock.
     """
     lock = filelock.FileLock(path)
     with _reading(path):
@@ -313,7 +318,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say in one line why something cannot be read."""
+    """Report an error of reading in one line."""
     try:
         yield
     except OSError as error:
@@ -322,10 +327,10 @@ def _reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Say in one line why something cannot be written to a folder.
+    """Report an error of writing to a folder in one line.
 
     Raises:
-        LatheError: it cannot.
+        LatheError: an operation in the block has failed.
     """
     try:
         yield
@@ -337,7 +342,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _difference(there: Request | None, asked: Request | None) -> str:
-    """The difference between the content of a folder and the request, in words."""
+    """Describe the first difference between the content of a folder and a request."""
     if there is None or asked is None:
         return "a sweep" if there is None else "a tuning"
     one, other = asdict(there), asdict(asked)

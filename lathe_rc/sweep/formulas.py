@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a cell by formulas, to compare a search with.
+"""Parameters of a cell by formulas, with which a search is compared.
 
-Of a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
+For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
 
 - ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
-- ``q_time``: the shortest with sup|Q - γZ| <= 1 - margin, since what is left grows with it: (1 - Q)/(γZ + 1 - Q);
+- ``q_time``: the shortest with sup|Q - γZ| <= 1 - margin, since the remaining error grows with it:
+  (1 - Q)/(γZ + 1 - Q);
 - ``q_pass``, ``q_stop``, ``q_ripple`` of a flat Q (fir): the widest one with that margin;
-- ``lead_time``: the lag of the drive at low frequencies, with which no slow change of the form is late; where no Q
-  keeps the margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the one with the least
+- ``lead_time``: the lag of the drive at low frequencies, which delays no slow change of the form; where no Q keeps the
+  margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the lead with the least
   sup|Q - γZ|.
 
-Of a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB. Its
-plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), v0 the velocity
-that makes F0; the feedback delay is in it, limits, the elasticity and keyways are not.
+For a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB. Its
+plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), where v0 is the
+velocity that makes F0. It includes the feedback delay, but neither limits nor elasticity nor keyways.
 """
 
 import math
@@ -40,22 +41,22 @@ from lathe_rc.transfer import TransferFunction
 _PID = ("proportional", "integral", "derivative", "derivative_filter")
 _LEARNING = {"lead_time", "q_time", "q_pass", "q_stop", "q_ripple", "learning_gain"}
 _PHASE_MARGIN, _GAIN_MARGIN = 60.0, 2.0  # [°], factor
-_BAND = (0.1, 1e3)  # [rad/s] of its crossover
-MARGIN = 0.05  #: that is kept where none is asked for
+_BAND = (0.1, 1e3)  # [rad/s] of the crossover
+MARGIN = 0.05  #: default stability margin
 _SHORTEST, _LONGEST = 1e-6, 1e-3  # [s] of q_time
 _GAIN = "γ = 1 (paper 001, eqs 1-5)"
-_NONE = 1.0  # [s]: in place of a q_time that there is not
+_NONE = 1.0  # [s] in place of a q_time that does not exist: longer than all others, but finite for the search
 _HALVINGS = 16
-_LEADS = 20  # that are looked at before the best is refined
-_FAR = 2.0  # the longest of them, in lags of the drive
+_LEADS = 20  # leads on the grid whose best one is refined
+_FAR = 2.0  # longest lead of the grid, in lags of the drive
 
 
 class Found(NamedTuple):
-    """A value by a formula.
+    """Value of a parameter by a formula.
 
     Attributes:
-        value: of the parameter.
-        formula: in words.
+        value: value of the parameter.
+        formula: the formula in words.
     """
 
     value: float
@@ -63,12 +64,12 @@ class Found(NamedTuple):
 
 
 def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, Found]:
-    """The values by formulas, for those of some parameters that have one.
+    """Return the values by formulas of the parameters that have one.
 
     Args:
-        scenario: of the cell; what is not among the targets stays as it says.
+        scenario: the cell; parameters that are no targets keep its values.
         targets: ``NODE.PARAM``.
-        margin: that learning is to keep, 1 - sup|Q - γZ|.
+        margin: stability margin 1 - sup|Q - γZ| that learning has to keep.
     """
     cell = Cell(scenario.nodes)
     found: dict[str, Found] = {}
@@ -91,7 +92,7 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
         return _flat(loop, free, gain, margin)
 
     def factor(lead: float, q_time: float) -> float:
-        """sup|Q - γZ|; infinite where the memory cannot hold Q."""
+        """Return sup|Q - γZ|; infinite where the memory cannot hold Q."""
         return loop.factor({"lead_time": lead, "q_time": q_time, "learning_gain": gain})
 
     found: dict[str, Found] = {}
@@ -118,7 +119,7 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
 
 
 def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict[str, Found]:
-    """Of a flat Q; the lead is the lag of the drive where that allows one, else as it is given."""
+    """Return the values for a flat Q; the lead is the lag of the drive where that allows such a Q, else as given."""
     given = loop.stage.parameters
     assert isinstance(given, LearningControllerParameters), "it has a Q"
     stop, ripple = (None if name in free else getattr(given, name) for name in ("q_stop", "q_ripple"))
@@ -162,7 +163,8 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
 
 
 def _least(cost: Callable[[float], float], longest: float) -> float:
-    """The lead with the least cost."""
+    """Return the lead with the least cost."""
+    # The cost may have several minima: a coarse grid finds the deepest one, and the bounded search refines it.
     leads = np.linspace(0.0, longest, _LEADS + 1)[1:]
     best = int(np.argmin([cost(float(lead)) for lead in leads]))
     ends = float(leads[max(best - 1, 0)]), float(leads[min(best + 1, _LEADS - 1)])
@@ -171,7 +173,7 @@ def _least(cost: Callable[[float], float], longest: float) -> float:
 
 
 def _shortest(factor: Callable[[float], float], margin: float) -> float:
-    """The shortest time of Q with which the factor is at most 1 - margin; `_NONE` if there is none."""
+    """Return the shortest time of Q with which the factor is at most 1 - margin; `_NONE` if there is none."""
     longest = _LONGEST
     while factor(longest) > 1.0 - margin:  # also where the memory cannot hold Q
         longest /= 2.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figure of a tuning: its history or, of two goals, what has to be traded off."""
+"""Figure of a tuning: its history or, of several goals, the trade-off between the first and the last."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ def _title(tuning: Tuning, column: str) -> str:
 
 
 def chart(tuning: Tuning) -> alt.LayerChart:
-    """By trial: the goal, and the best so far; of several goals, the second over the first."""
+    """Return the goal and the best so far over the trials; of several goals, the last one over the first."""
     columns = [goal.column for goal in tuning.objectives.goals]
     front = {trial.number for trial in tuning.front}
     improvements = {trial.number for trial in tuning.improvements}
@@ -62,20 +62,20 @@ def chart(tuning: Tuning) -> alt.LayerChart:
 
 
 def _scale(rows: list[dict[str, Any]], name: str) -> alt.Scale:
-    """Logarithmic, if all is above 0 and reaches over more than a decade."""
+    """Return the scale of an axis: logarithmic, if all values are above 0 and span more than a decade."""
     values = [row[name] for row in rows if row[name] is not None]
     log = bool(values) and min(values) > 0.0 and max(values) > 10.0 * min(values)
     return alt.Scale(type="log") if log else alt.Scale(zero=False)
 
 
 def write(tuning: Tuning) -> Path:
-    """Write the figure to the tuning's folder, as history.png and, to look into it, history.html without network.
+    """Write the figure to the tuning's folder: history.png, and an interactive history.html that needs no network.
 
     Returns:
-        The PNG.
+        The path of the PNG.
 
     Raises:
-        LatheError: it cannot be written.
+        LatheError: the files cannot be written.
     """
     made, folder = chart(tuning), tuning.folder.path
     with writing(folder):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objectives of a tuning: goals, constraints, and the share of the cells that has to meet them.
 
-A goal is a column of a row (`lathe_rc.sweep.row`): as small as it can be, with a minus before it as large as it can be.
-A constraint is a limit of a column. Of several cells, plants and spindles, the worst or a percentile counts; a cell
-that was refused, that diverged or failed is as bad as none.
+A goal is a column of a row (`lathe_rc.sweep.row`) to be minimised, or maximised with a minus before it. A constraint is
+a limit of a column. Of several cells (plants and spindles) the worst one or a percentile counts. A cell that was
+refused, diverged or failed has an infinite cost.
 """
 
 import math
@@ -27,37 +27,37 @@ _CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
 
 
 class Goal(NamedTuple):
-    """A column, and whether it shall be as large as it can be in place of as small."""
+    """Column of a row that is minimised, or maximised if ``largest``."""
 
     column: str
     largest: bool
 
     @property
     def sign(self) -> float:
-        """Of the column in the cost, of which less is better."""
+        """Sign of the column in the cost, which is minimised."""
         return -1.0 if self.largest else 1.0
 
 
 class Constraint(NamedTuple):
-    """A limit of a column, from below or from above."""
+    """Limit of a column: a lower one if ``below``, else an upper one."""
 
     column: str
     below: bool
     bound: float
 
     def violation(self, value: float) -> float:
-        """How far a value is beyond, in parts of the limit; up to 0 if it is within."""
+        """Return how far a value is beyond the limit, relative to it; up to 0 if the value is within."""
         beyond = self.bound - value if self.below else value - self.bound
         return beyond / (abs(self.bound) or 1.0)
 
 
 class Score(NamedTuple):
-    """The score of the cells of a trial.
+    """Score of the cells of a trial.
 
     Attributes:
-        costs: of the goals, less is better; infinite where a cell that counts has no value.
-        violations: of "it runs to its end" and of the constraints; up to 0 if it is met.
-        margin: see `lathe_rc.sweep.row`, of the cell that counts; NaN: no cell learns.
+        costs: costs of the goals, less is better; infinite where a cell that counts has no value.
+        violations: violations of "the cell runs to its end" and of the constraints; up to 0 where they are met.
+        margin: margin (see `lathe_rc.sweep.row`) of the cell that counts; NaN: no cell learns.
     """
 
     costs: tuple[float, ...]
@@ -66,18 +66,18 @@ class Score(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether everything is met."""
+        """Whether all constraints are met."""
         return all(violation <= 0.0 for violation in self.violations)
 
 
 @dataclass(frozen=True)
 class Objectives:
-    """The objectives of a tuning.
+    """Objectives of a tuning.
 
     Attributes:
-        goals: one, or two and more to be traded off.
-        constraints: that have to be met.
-        percentile: that counts of the cells; 100: the worst.
+        goals: one goal, or several to be traded off.
+        constraints: limits that the trials have to meet.
+        percentile: percentile of the cells that counts; 100: the worst.
         measures: columns of goals and constraints beside those of all rows.
     """
 
@@ -88,15 +88,15 @@ class Objectives:
 
     @property
     def columns(self) -> list[str]:
-        """Columns that a score is made of."""
+        """Columns from which a score is computed."""
         named = [goal.column for goal in self.goals] + [limit.column for limit in self.constraints]
         return list(dict.fromkeys(["status", "margin", *named]))
 
     def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:
-        """The score of the cells of a trial.
+        """Return the score of the cells of a trial.
 
         Args:
-            rows: with `columns`, one or more.
+            rows: rows of the cells with `columns`, one or more.
         """
         cells = list(rows)
         costs = [self._counts(_cost(cell, goal) for cell in cells) for goal in self.goals]
@@ -107,7 +107,8 @@ class Objectives:
         return Score(tuple(costs), tuple(violations), margin)
 
     def _counts(self, values: Iterable[float]) -> float:
-        """Of the cells' values, of which less is better: the value of one of them."""
+        """Return the percentile of the cells' values, of which less is better."""
+        # The inverted distribution returns one of the values: an interpolation between infinite ones would be NaN.
         return float(np.percentile(list(values), self.percentile, method="inverted_cdf"))
 
 
@@ -121,7 +122,7 @@ def _cost(cell: Mapping[str, Any], goal: Goal) -> float:
 
 
 def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
-    """How far a cell is from running to its end with a value of each goal: by its margin, if it is refused for that."""
+    """Return how far a cell is from its end with a value of each goal: a refused cell by its negative margin."""
     if cell["status"] == row.DONE:
         return 0.0 if all(_known(cell[goal.column]) for goal in goals) else 1.0
     margin = cell["margin"]
@@ -129,7 +130,7 @@ def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
 
 
 def _violation(cell: Mapping[str, Any], limit: Constraint) -> float:
-    """A refused cell may have a margin all the same; a value that it lacks is for `_stops` to judge."""
+    """Return the violation of a cell; a refused one may have a margin, and `_stops` judges the values that it lacks."""
     value = cell[limit.column]
     if _known(value):
         return limit.violation(value)
@@ -144,10 +145,10 @@ def objectives(
     measures: Sequence[str] = (),
     percentile: float = 100.0,
 ) -> Objectives:
-    """The objectives in texts.
+    """Parse the objectives.
 
     Args:
-        scenario: that is tuned.
+        scenario: scenario to be tuned.
         goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC``.
         constraints: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
         measures: further columns.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sweep as one HTML page that needs nothing else, and its figures as PNGs beside it; see `write`.
+"""Self-contained HTML page of a sweep, and its figures as PNGs beside it.
 
-`page_data` says what is looked at, `effects` computes, `figures` and `parallel` draw.
+`page_data` prepares the data, `effects` computes, `figures` and `parallel` draw.
 """
 
 import math
@@ -28,13 +28,13 @@ from lathe_rc.view.charts import Charts, page_template
 
 PAGE, FIGURES = "page.html", "figures"
 
-_MOST_AXES = 6  # that can be chosen for maps and lines
+_MOST_AXES = 6  # parameters offered for maps and lines
 _MOST_LINES = 10  # axes of parallel coordinates
 _MOST_FIELDS = 16_000  # rows of the data sets of all pairs
 _MOST_BINS = 24  # of an axis whose values are not shown one by one
 _MOST_ALONE = 200  # values of the only parameter that are shown one by one
-_FIELD = 10  # cells of a field, on average, where values are put into bins
-_BEST = 10  # cells that are listed
+_FIELD = 10  # mean number of cells of a field, where values are put into bins
+_BEST = 10  # listed cells
 _MOST_REASONS = 12
 _SCALE = 2.0  # of the PNGs
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -43,7 +43,7 @@ _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
 
 @dataclass(frozen=True)
 class Written:
-    """The files that `write` has written.
+    """Files that `write` has written.
 
     Attributes:
         page: the HTML file.
@@ -58,17 +58,18 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     """Write the page of a sweep into its folder, and its figures as PNGs; older ones are replaced.
 
     Args:
-        folder: of the sweep; what is computed so far is shown.
+        folder: folder of the sweep; the page shows the cells that are computed so far.
         goal: column by which the cells are judged.
 
     Raises:
         InputError: no such goal.
-        LatheError: the disk does not take it.
+        LatheError: the files cannot be written.
     """
     seen = PageData(folder, goal)
     drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
+    # All is drawn before anything is written: an error in a figure leaves the old page with its old pictures.
     pngs = {place / f"{name}.png": drawn.png(name, _SCALE) for name in drawn.specs}
     try:
         place.mkdir(exist_ok=True)
@@ -107,7 +108,7 @@ def _text(seen: PageData, drawn: Charts) -> str:
 
 
 def _nothing(seen: PageData) -> str:
-    """Why nothing can be drawn; empty: something can."""
+    """Return why nothing can be drawn; empty: something can."""
     if not len(seen.cells):
         return "No cell is computed yet."
     if seen.goal.order.size:
@@ -119,7 +120,7 @@ def _nothing(seen: PageData) -> str:
 
 
 def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
-    """The figures at the top: name, value and mood."""
+    """Yield the figures at the top of the page: name, value and mood."""
     yield "cells", str(len(seen.cells)), ""
     for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED):
         if count := seen.statuses[status]:
@@ -135,7 +136,8 @@ def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
 
 
 def _outcomes(seen: PageData) -> list[list[str]]:
-    """Status, how many, and why, with the numbers left out by which reasons differ; the first cell's as example."""
+    """Return the outcomes of the cells: status, number, share, and the reason of the first such cell as an example."""
+    # Reasons that differ only in their numbers are one outcome.
     groups: dict[tuple[str, str], list[int]] = {}
     statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
     for place, (status, reason) in enumerate(zip(statuses, reasons, strict=True)):
@@ -151,13 +153,13 @@ def _outcomes(seen: PageData) -> list[list[str]]:
 
 
 def _limits(seen: PageData) -> str:
-    """Which nodes came to a limit in how many cells."""
+    """List the nodes that came to a limit, with the number of cells."""
     counts = Counter(name for text in seen.table.column("limits").to_pylist() if text for name in text.split(", "))
     return ", ".join(f"{name} in {count} cells" for name, count in counts.most_common())
 
 
 def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
-    """The sections of the template for cells that have a goal, and the figures."""
+    """Return the template's sections for cells that have a goal, and add their figures."""
     weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
     axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
     effects = {goal.name: _effects_on(goal, axes) for goal in seen.goals}
@@ -198,7 +200,7 @@ def _effects_on(goal: Goal, axes: Sequence[Axis]) -> list[Effect]:
 
 
 def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
-    """By which parameters are put in order, the one that matters most first; those that follow from others last."""
+    """Sort key of parameters: largest effect first, tied parameters last."""
     share = -math.inf if found.share is None else found.share
     return axis.tied, -share, -abs(found.rank or 0.0)
 
@@ -209,10 +211,11 @@ def _told(found: Effect) -> str:
 
 
 def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
-    """Maps and lines of the parameters that matter most; says what of the cells is in them."""
+    """Add maps and lines of the parameters with the largest effects; return which cells and values are in them."""
     some = list(axes[:_MOST_AXES])
     free = [axis for axis in axes if not axis.tied]
     pairs = max(math.comb(len(some), 2), 1)
+    # Values are shown one by one only as far as the data sets of all pairs stay within the size of a page.
     exact = min(int(math.sqrt(_MOST_FIELDS / pairs)), len(seen.cells) // 2)
     exact = _MOST_ALONE if len(free) == 1 and pairs == 1 else exact
     most = int(np.clip(math.sqrt(len(seen.cells) / _FIELD), 4, _MOST_BINS))
@@ -235,7 +238,7 @@ def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
 
 
 def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
-    """Parallel coordinates; says which cells are in them."""
+    """Add the parallel coordinates; return which cells are in them."""
     some = list(axes[:_MOST_LINES])
     margin = next((goal for goal in seen.goals if goal.name == "margin" and goal is not seen.goal), None)
     if margin is not None and np.unique(margin.values[seen.goal.order]).size > 1:
@@ -250,7 +253,7 @@ def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
 
 
 def _best(seen: PageData) -> dict[str, Any]:
-    """The table of the best cells."""
+    """Return the table of the best cells."""
     places = seen.goal.order[:_BEST].tolist()
     others = [goal for goal in seen.goals if goal is not seen.goal and goal.name in ("tool.rms_error", "margin")]
     goals = [seen.goal, *others]
@@ -265,7 +268,7 @@ def _best(seen: PageData) -> dict[str, Any]:
 
 
 def _yields(seen: PageData, done: Yield) -> Iterator[str]:
-    """The sentences about the yield."""
+    """Yield the sentences about the share of cells within limits."""
     points = {share: done.point(share) for share in (0.95, 0.99)}
     for share, limit in points.items():
         if limit is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
+"""Data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
 
 from collections import Counter
 from functools import cached_property
@@ -20,23 +20,23 @@ from lathe_rc.sweep.folder import Folder
 GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
-_MOST_TEXTS = 24  # that have a colour each
+_MOST_TEXTS = 24  # texts of an axis with a colour of their own; the rest share one
 
 
 class PageData:
-    """The rows of a sweep, as they are looked at.
+    """Rows of a sweep, prepared for its page.
 
     Args:
-        folder: of the sweep.
+        folder: folder of the sweep.
         goal: column by which the cells are judged.
 
     Attributes:
         folder: see above.
-        goals: columns by which they could be, those that have a value in some cell.
-        goal: the one that was chosen.
+        goals: possible goals: columns that have a value in some cell.
+        goal: the chosen goal.
         axes: parameters that differ between the cells.
         cells: numbers of the cells.
-        table: the rows, without those of each revolution.
+        table: the rows, without the columns of all revolutions.
 
     Raises:
         InputError: no such goal.
@@ -68,7 +68,7 @@ class PageData:
         column = self.table.column(target)
         found = column.to_pylist()
         if pa.types.is_list(column.type) and all(value is None or len(value) == 1 for value in found):
-            found = [None if value is None else value[0] for value in found]
+            found = [None if value is None else value[0] for value in found]  # lists of one number are numbers
         tied = any(target in space.ties for space in self.folder.spaces)
         unit = self.folder.scenario.parameter(target).unit
         label = target if unit in ("", "1") else f"{target} [{unit}]"
@@ -86,7 +86,7 @@ class PageData:
         return Axis(target, target, values, texts=names, tied=tied)
 
     def _told(self, target: str) -> list[str]:
-        """How a target was asked for, in each space."""
+        """Return how each space varies a target, in the words of the request."""
         found: list[str] = []
         for space in self.folder.spaces:
             if (axis := space.grid.get(target)) is not None:
@@ -100,7 +100,7 @@ class PageData:
         return list(dict.fromkeys(found))
 
     def asked(self) -> list[list[str]]:
-        """A row a target: its name with the unit, how it was asked for, from, to, how many values, the scenario's."""
+        """Return a row for each target: label, request, lowest, highest, number of values, and the scenario's value."""
         found = []
         axes = {axis.name: axis for axis in self.axes}
         for target in self.folder.targets:
@@ -115,22 +115,22 @@ class PageData:
 
     @cached_property
     def statuses(self) -> Counter[str]:
-        """How many cells have each status."""
+        """Number of cells by status."""
         return Counter(self.table.column("status").to_pylist())
 
     @cached_property
     def seeds(self) -> int:
-        """How many different ones there are."""
+        """Number of different seeds."""
         return len(set(self.table.column("seed").to_pylist()) - {None})
 
     @property
     def is_sampled(self) -> bool:
-        """Whether points of a sample are all that differs, so that shares are those of what was drawn."""
+        """Whether all cells are points of a sample, so that their shares estimate those of the population."""
         return all(space.sample and not space.grid and not space.given for space in self.folder.spaces)
 
     @property
     def tolerance(self) -> float | None:
-        """Of the form, in the unit of the goal; None: there is none, it is varied itself, or the goal is another."""
+        """Tolerance of the form, in the unit of the goal; None: none is set, it is varied, or the goal is another."""
         scenario = self.folder.scenario
         if self.goal.name != GOAL or any(target.endswith(".tolerance") for target in self.folder.targets):
             return None
@@ -139,7 +139,7 @@ class PageData:
 
 
 def text_of(value: object) -> str:
-    """A value as it is shown."""
+    """Format a value for the page."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parallel coordinates as a specification of Vega: a line for each cell, an axis for each parameter, brushes on all.
+"""Parallel coordinates as a Vega specification: a line for each cell, an axis with a brush for each parameter.
 
 The axes lie one above the other, so that their names can be read on a narrow screen.
 """
@@ -20,20 +20,20 @@ from lathe_rc.view.charts import Column, Rows, Spec, number, rows
 _GAP = 74  # [px] from axis to axis
 _SIDE = 26  # [px] beside the axes, for the labels at their ends
 _TOP, _BOTTOM = 62, 26  # [px] above the first axis and below the last
-_REACH = 13  # [px] above and below an axis where it can be brushed
+_REACH = 13  # [px] above and below an axis where a brush starts
 _MOST, _BEST = 400, 50  # lines, and the best among them
 _TICKS = 5
-_DECADES = 2.5  # up to which a logarithmic axis has ticks between them
+_DECADES = 2.5  # length up to which a logarithmic axis has ticks within its decades
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """The figure, and how many cells are in it.
+    """The figure, and the number of cells in it.
 
     Attributes:
-        spec: of Vega.
-        lines: cells that are drawn.
-        cells: that could be.
+        spec: Vega specification.
+        lines: number of drawn cells.
+        cells: number of cells with a value on every axis.
     """
 
     spec: Spec
@@ -42,21 +42,22 @@ class Drawn:
 
 
 def chosen(axes: Sequence[Axis], goal: Goal) -> tuple[NDArray[np.int64], int]:
-    """Cells that are drawn, the best last, so that they lie on top; and how many could be.
+    """Return the cells to draw, best last, so that they lie on top, and the number of cells that could be drawn.
 
-    Where there are too many, these are the best ones, and the others by lot.
+    Of too many cells the best are drawn, and others by lot.
     """
     whole = np.all([np.isfinite(axis.values) for axis in axes], axis=0)
     order = goal.order
     order = order[whole[order]]
     if order.size <= _MOST:
         return order[::-1], order.size
+    # The seed is fixed: the same rows give the same page.
     lot = np.random.default_rng(0).choice(order.size - _BEST, _MOST - _BEST, replace=False) + _BEST
     return order[np.concatenate([np.arange(_BEST), np.sort(lot)])][::-1], order.size
 
 
 def _scaled(axis: Axis) -> tuple[Samples, float, float]:
-    """Values as they lie on the axis, and its ends."""
+    """Return the values as they lie on the axis, and the ends of the axis."""
     values = np.log10(axis.values) if axis.log else axis.values
     known = values[np.isfinite(values)]
     low, high = float(known.min()), float(known.max())
@@ -66,7 +67,7 @@ def _scaled(axis: Axis) -> tuple[Samples, float, float]:
 
 
 def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
-    """Places on the axis from 0 to 1, and their labels."""
+    """Return the ticks of an axis: places from 0 to 1, and labels."""
     if axis.texts:
         return [((place - low) / (high - low), text) for place, text in enumerate(axis.texts)]
     few = axis.distinct
@@ -81,9 +82,9 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
 
 
 def _brush(place: int) -> Spec:
-    """The part of an axis that is brushed, from 0 to 1; null: all of it.
+    """Return the signal of the brushed part of an axis, from 0 to 1; null: all of it.
 
-    The events are those of the view at the axis, not of a mark: a finger comes down without having moved over one.
+    The events are those of the view near the axis, not of a mark: a finger touches down without moving over a mark.
     """
     at, held = "clamp(x() / width, 0, 1)", f"brush_{place}"
     near = [f"abs(y() - {place * _GAP}) <= {_REACH}"]
@@ -103,7 +104,7 @@ def _brush(place: int) -> Spec:
 
 
 def _mark(kind: str, *, style: str = "", data: str = "", interactive: bool = False, **channels: object) -> Spec:
-    """A mark; of its channels, texts that begin with = are expressions, and mappings are as Vega has them."""
+    """Return a mark. In its channels a text after = is an expression, a mapping is Vega's, the rest is constant."""
     encoded = {
         name: value
         if isinstance(value, dict)
@@ -117,7 +118,7 @@ def _mark(kind: str, *, style: str = "", data: str = "", interactive: bool = Fal
 
 
 def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
-    """The marks of an axis."""
+    """Return the marks of an axis."""
     height, held, data = place * _GAP, f"brush_{place}", f"ticks_{place}"
     across = "=datum.u * width"
     label: dict[str, Any] = {"x": across, "y": height + 17, "align": "center", "text": {"field": "t"}}
@@ -138,12 +139,12 @@ def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
 
 
 def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> Drawn:
-    """Parallel coordinates of parameters and goals.
+    """Return the parallel coordinates of parameters and goals.
 
     Args:
-        axes: from the first to the last.
-        goal: colours the lines.
-        numbers: of the cells, shape (n,).
+        axes: axes from top to bottom.
+        goal: goal that colours the lines.
+        numbers: numbers of the cells, shape (n,).
     """
     cells, known = chosen(axes, goal)
     count = len(cells)

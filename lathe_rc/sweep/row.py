@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The row of a cell in the table of a sweep.
+"""Row of a cell in the table of a sweep.
 
-| column | what |
+| column | content |
 |---|---|
 | cell | number within the sweep |
-| key | identity of the cell: a hash of the whole scenario and of what is measured |
-| status, reason | done; refused by the check before the start; diverged; failed on the way: and why |
-| NODE.PARAM | what differs between the cells |
+| key | identity of the cell: a hash of the whole scenario and of the measures |
+| status, reason | done; refused by the check before the start; diverged; failed during the run: and why |
+| NODE.PARAM | parameters that differ between the cells |
 | tool.max_error, tool.rms_error | largest and RMS form error of the last revolution [m] |
 | tool.first_max_error, tool.first_rms_error | those of the first [m] |
 | tool.max_errors, tool.rms_errors | those of each revolution [m] |
 | tool.in_tolerance_from | first revolution from which on the largest error is within `tool.tolerance`; none if never |
 | margin | 1 less the largest factor of a cycle over all frequencies (sup|Q - γZ|): below 0 learning diverges |
-| limits | nodes that came to a limit of a command or a way |
-| TOPIC.FIELD:STATISTIC | what was asked to be measured, over the last revolution |
-| revolutions, samples, seconds | computed, and how long that took |
-| seed, version, digest | of the random parts; of lathe_rc; see `digest` |
+| limits | nodes that came to a limit of a command or a stroke |
+| TOPIC.FIELD:STATISTIC | a measure of the last revolution |
+| revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
+| seed, version, digest | seed of the random parts; version of lathe_rc; see `digest` |
 """
 
 import contextlib
@@ -50,7 +50,7 @@ from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
 
 DONE, REFUSED, DIVERGED, FAILED = "done", "refused", "diverged", "failed"
-LIMITS = (LIMITED, OUT_OF_REACH)  # how events of a limit begin
+LIMITS = (LIMITED, OUT_OF_REACH)  # beginnings of the events of a limit
 
 Samples = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ STATISTICS: Mapping[str, Callable[[Samples], float]] = {
     "rms": lambda samples: math.sqrt(float(np.mean(samples * samples))),
     "mean": lambda samples: float(samples.mean()),
     "peak_to_valley": lambda samples: float(np.ptp(samples)),
-}  #: what can be said of a signal in the last revolution
+}  #: of a signal in the last revolution
 
 _ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}  #: columns of each row
@@ -77,7 +77,7 @@ _TAIL = {
 
 
 class Measure(NamedTuple):
-    """A statistic of a field of a topic over the last revolution."""
+    """Statistic of a field of a topic over the last revolution."""
 
     topic: str
     field: str
@@ -85,12 +85,12 @@ class Measure(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its column."""
+        """Name of the column."""
         return f"{self.topic}.{self.field}:{self.statistic}"
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """The measure that ``TOPIC.FIELD:STATISTIC`` asks for.
+    """Parse a measure ``TOPIC.FIELD:STATISTIC``.
 
     Raises:
         InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
@@ -111,7 +111,7 @@ def measure(text: str, scenario: Scenario) -> Measure:
 
 
 def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
-    """Columns of the rows of a sweep."""
+    """Return the columns of the rows of a sweep."""
     columns = dict(HEAD)
     for target in targets:
         row = scenario.parameter(target)
@@ -121,7 +121,7 @@ def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measur
 
 
 class _Keeper(Errors):
-    """Keeps the form error, which nodes came to a limit, and what is to be measured."""
+    """Keeps the form error, the nodes that came to a limit, and the measured signals of a run."""
 
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         super().__init__(cell, samples)
@@ -135,7 +135,7 @@ class _Keeper(Errors):
         self._hash = xxhash.xxh3_128()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take a chunk of samples from the engine (`lathe_rc.cell.engine.Sink`)."""
         super().chunk(first, samples, dense, sparse)
         for topic, said in sparse.items():
             if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
@@ -149,7 +149,7 @@ class _Keeper(Errors):
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
-        """The columns of a cell that ran to its end."""
+        """Return the columns of a cell that ran to its end."""
         starts = (errors if self._tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
         found: dict[str, Any] = {
@@ -168,10 +168,10 @@ class _Keeper(Errors):
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
-    """The digest in the row of a cell that was run again.
+    """Return the digest of a recording, which equals that of the cell's row if the bits are equal.
 
-    XXH3 (128 bits) of all samples of the form error, little-endian; of a cell without a tool, of what is measured. None
-    where there is neither. It tells whether bits are equal, in a twentieth of the time that SHA-256 takes.
+    XXH3 (128 bits) of all samples of the form error, little-endian; of a cell without a tool, of the measured signals;
+    None where there is neither. It takes a twentieth of the time of SHA-256.
     """
     if messages.TOOL in (recording.types[topic] for topic in recording.dense):
         return _digest([recording.of_type(messages.TOOL)["error"]])
@@ -190,7 +190,7 @@ def _told(found: xxhash.xxh3_128) -> str:
 
 
 def _bytes(samples: Samples) -> memoryview:
-    return samples.astype("<f8", copy=False).data
+    return samples.astype("<f8", copy=False).data  # a copy is made only on a big-endian machine
 
 
 def compute(
@@ -200,14 +200,14 @@ def compute(
     measures: Sequence[Measure],
     bench: CellRunner | None = None,
 ) -> dict[str, Any]:
-    """The row of a cell but for its number and key; whatever is wrong with the cell stands in it.
+    """Run a cell and return its row without number and key; an error of the cell becomes its status and reason.
 
     Args:
-        base: the scenario that is varied.
-        values: how.
-        targets: those of them that are columns.
-        measures: what is measured.
-        bench: for cells of one kind; None: one of its own.
+        base: the varied scenario.
+        values: the cell's values, by target.
+        targets: targets that are columns.
+        measures: further columns.
+        bench: runner that cells of one kind share; None: a new one.
     """
     start = time.perf_counter()
     row: dict[str, Any] = {"status": DONE, "version": revision()}
@@ -221,7 +221,7 @@ def compute(
         cell = bench.cell(scenario)
         cell.check(cures=False)
         keeper = _Keeper(cell, cell.samples, measures)
-        started = True
+        started = True  # from here on an InputError is a failure of the run, no refusal
         row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples}
     except LatheError as error:
         refused = isinstance(error, InputError) and not started

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search space of a tuning: ranges and lists of parameters, as Optuna knows them."""
+"""Search space of a tuning: ranges and lists of parameters, as distributions of Optuna."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -14,11 +14,11 @@ from lathe_rc.sweep.space import axis, canonical, number
 
 
 class Dimension(NamedTuple):
-    """A parameter that is searched.
+    """A free parameter of a search.
 
     Attributes:
-        distribution: of Optuna.
-        choices: the values of a list, by the texts that Optuna knows them as; None: a range.
+        distribution: distribution of Optuna.
+        choices: values of a list, by the texts that stand for them in Optuna; None: a range.
     """
 
     distribution: CategoricalDistribution | FloatDistribution | IntDistribution
@@ -26,21 +26,21 @@ class Dimension(NamedTuple):
 
     @property
     def ends(self) -> list[Value]:
-        """The ends of the range, or all values of the list."""
+        """Ends of the range, or all values of the list."""
         if isinstance(self.distribution, CategoricalDistribution):
             return list((self.choices or {}).values())
         return [self.distribution.low, self.distribution.high]
 
     def value(self, encoded: Any) -> Value:
-        """The value that Optuna has drawn."""
+        """Decode a value that Optuna has drawn."""
         return cast("Value", encoded) if self.choices is None else self.choices[encoded]
 
     def encoded(self, value: Value) -> Any:
-        """The form of a value in Optuna."""
+        """Encode a value for Optuna."""
         return value if self.choices is None else _text(value)
 
     def suggest(self, trial: Trial, target: str) -> None:
-        """Let a trial have a value, if it has none yet."""
+        """Draw a value for a trial that has none yet."""
         found = self.distribution
         if isinstance(found, CategoricalDistribution):
             trial.suggest_categorical(target, found.choices)
@@ -62,14 +62,14 @@ def _text(value: Value) -> str:
 
 
 def search_space(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict[str, Dimension]:
-    """The free parameters of a scenario, by target.
+    """Parse the free parameters of a scenario, by target.
 
     Args:
-        scenario: whose own values are the start.
+        scenario: scenario whose own values are the start.
         free: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
 
     Raises:
-        InputError: no range or list of this parameter, or one without the start.
+        InputError: a range or list is none of this parameter, or does not contain the start.
     """
     if not free:
         raise InputError("nothing is free; allowed: --free NODE.PARAM=LOW:HIGH, =LOW:HIGH:log or =A,B,C, once or more")
@@ -95,6 +95,7 @@ def _dimension(scenario: Scenario, target: str, told: str | Sequence[Value]) -> 
         values = axis(scenario, target, told)
         if row.type is float and not row.is_list:
             values = [float(cast("float", value)) for value in values]
+        # Optuna's choices are scalars alone: texts stand for them, so that a choice may be a list.
         choices = {_text(value): value for value in values}
         if len(choices) < 2:
             raise InputError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which variations of a cell: grids, lists, samples, draws, ties, seeds.
+"""Variations of a cell: grids, lists, samples, ties and seeds.
 
     space = Space(
         grid={"learning_controller.lead_time": "1.3e-3:1.5e-3:9"},
@@ -9,9 +9,9 @@
     for values in space.cells(scenario):
         ...
 
-The cells are the product of the grids, the points of the sample, the given cells and the seeds, in an order that
-depends on nothing else; the values of the last grid change first. All of them are text, as on the command line, or
-values: see `Space`.
+The cells are the product of the given cells, the grids, the points of the sample and the seeds, in this order: the
+seeds change first, then the points, then the values of the last grid. Each is given as text, as on the command line,
+or as values: see `Space`.
 """
 
 import csv
@@ -37,16 +37,17 @@ from lathe_rc.sweep.derived_parameters import Formulas, ordered
 
 SAMPLERS = ("sobol", "halton", "latin", "random")
 _MOST_POINTS = 2**24
-_PIECE = 2**12  # points of a sample that are drawn in one go
-_LONG = 40  # values of one axis that a message quotes
+_SAMPLES = f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
+_PIECE = 2**12  # points of a sample that are drawn at a time
+_LONG = 40  # characters of an axis that a message quotes
 
 
 class Drawn(NamedTuple):
-    """How a value is drawn from a number between 0 and 1.
+    """Law of a drawn value.
 
     Attributes:
         law: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
-        first, second: ends, or mean and standard deviation.
+        first, second: ends of the range, or mean and standard deviation.
     """
 
     law: str
@@ -54,7 +55,7 @@ class Drawn(NamedTuple):
     second: float
 
     def at(self, quantile: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values at quantiles, shape (n,)."""
+        """Return the values at quantiles between 0 and 1, shape (n,)."""
         if self.law == "normal":
             return np.asarray(scipy.stats.norm.ppf(quantile, self.first, self.second))
         if self.law == "log":
@@ -99,25 +100,25 @@ class Space:
     sample_seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """The arguments of the same space, for ``Space(**told)``."""
+        """Return the arguments of an equal space, for ``Space(**arguments)``."""
         return cast("dict[str, Any]", json.loads(json.dumps(asdict(self), default=list)))
 
     def targets(self) -> list[str]:
-        """The parameters that differ between the cells, in the order of the columns."""
+        """Return the parameters that differ between the cells, in the order of the columns."""
         seed = ["seed"] if self.seeds > 1 else []
         named = [name for cell in self.given for name in cell]
         return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))
 
     def count(self, scenario: Scenario) -> int:
-        """How many cells there are."""
+        """Return the number of cells."""
         axes = [len(axis(scenario, target, told)) for target, told in self.grid.items()]
         return math.prod(axes) * max(self._points(), 1) * max(len(self.given), 1) * self.seeds
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse what is no space of a scenario, before anything is computed.
+        """Refuse a space that does not suit a scenario, before anything is computed.
 
         Raises:
-            InputError: names the target, the value and what is allowed.
+            InputError: the space does not suit; the message names the target, the value and the allowed ones.
         """
         twice = [target for target in self.grid if target in self.sampled or target in self.ties]
         twice += [target for target in self.sampled if target in self.ties]
@@ -133,17 +134,17 @@ class Space:
         if any(dict(first) == dict(second) for first, second in itertools.pairwise(sorted(self.given, key=canonical))):
             raise InputError("two of the given cells are the same; allowed: each once")
         if self.sampled and not self.sample:
-            raise InputError(f"{next(iter(self.sampled))}: drawn, and no sample says how often; allowed: {_samples()}")
+            raise InputError(f"{next(iter(self.sampled))}: drawn, and no sample says how often; allowed: {_SAMPLES}")
         if self.sample and not self.sampled:
             raise InputError(f"sample {self.sample!r}, and nothing is drawn; allowed: LOW:HIGH or a law for a target")
         self._points()
         for target, told in self.sampled.items():
             _drawn(scenario, target, told)
         ordered(self.ties)
-        next(self.cells(scenario))
+        next(self.cells(scenario))  # the formulas are evaluated once: most errors show in the first cell
 
     def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
-        """The values of each cell, by target."""
+        """Yield the values of each cell, by target."""
         axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
@@ -158,17 +159,17 @@ class Space:
                         yield formulas.add_to(values)
 
     def _points(self) -> int:
-        """Of the sample; 0 if there is none."""
+        """Return the number of points of the sample; 0 without a sample."""
         if not self.sample:
             return 0
         name, _, number = self.sample.partition(":")
         count = int(number) if number.isascii() and number.isdigit() else 0
         if name not in SAMPLERS or not 0 < count <= _MOST_POINTS:
-            raise InputError(f"sample {self.sample!r}; allowed: {_samples()}")
+            raise InputError(f"sample {self.sample!r}; allowed: {_SAMPLES}")
         return count
 
     def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
-        """Values by target, of each point of the sample."""
+        """Yield the values of each point of the sample, by target."""
         if not self.sampled:
             yield {}
             return
@@ -179,13 +180,9 @@ class Space:
                 yield dict(zip(laws, row, strict=True))
 
 
-def _samples() -> str:
-    return f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
-
-
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
-    """Points in the unit cube, piece by piece, shape (n, dimensions); more points begin with the same ones."""
-    if name == "latin":  # needs all at once, and others of them for another count
+    """Yield points in the unit cube, shape (n, dimensions); a larger sample begins with the points of a smaller one."""
+    if name == "latin":  # all points at once; those of another count are others
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
     generator = np.random.default_rng(seed)
@@ -196,13 +193,13 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
     }
     for first in range(0, count, _PIECE):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # Sobol's points are spread best by powers of two
+            warnings.simplefilter("ignore", UserWarning)  # Sobol's warns of counts that are no power of two
             piece = draws[name](min(_PIECE, count - first))
         yield piece
 
 
 def number(scenario: Scenario, target: str, text: str) -> float:
-    """A number, or a part of the scenario's value."""
+    """Parse a number, or a part in % of the scenario's value."""
     plain = text.strip()
     found = ros_yaml.scalar(plain.removesuffix("%"))
     if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
@@ -218,10 +215,10 @@ def number(scenario: Scenario, target: str, text: str) -> float:
 
 
 def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
-    """The values of a grid, each once.
+    """Return the values of a grid, each once.
 
     Raises:
-        InputError: a text that tells none.
+        InputError: a text cannot be parsed, or a value is none of the parameter.
     """
     row = scenario.parameter(target)
     if isinstance(told, str):
@@ -259,7 +256,7 @@ def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
 
 
 def _split(text: str) -> list[str]:
-    """At commas that stand in no brackets and no quotes."""
+    """Split at commas outside of brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         quote = ("" if letter == quote else quote) if quote else (letter if letter in "'\"" else "")
@@ -281,7 +278,7 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
 
 
 def _check_type(target: str, row: Row, value: Value) -> None:
-    """Refuse what can be no value of a parameter; whether it is in range is for the cell to say, in its row."""
+    """Refuse a value of a wrong type; one out of range is refused by its cell, in its row."""
     kinds = (int, float) if row.type is float else row.type
     items = value if isinstance(value, list) else [value]
     wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
@@ -291,7 +288,7 @@ def _check_type(target: str, row: Row, value: Value) -> None:
 
 
 def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
-    """The law that a text tells."""
+    """Parse the law of a drawn value."""
     row = scenario.parameter(target)
     if row.is_list or row.type is not float:
         raise InputError(f"{target}: drawn, and is {row.allowed()}; allowed: parameters that are one real number")
@@ -316,10 +313,10 @@ def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
 
 
 def given(path: Path) -> list[dict[str, Value]]:
-    """The cells of a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
+    """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
 
     Raises:
-        InputError: it cannot be read, or is neither.
+        InputError: the file cannot be read, or is neither.
     """
     try:
         text = files.contents(path).decode()
@@ -341,5 +338,5 @@ def given(path: Path) -> list[dict[str, Value]]:
 
 
 def canonical(values: Mapping[str, Value]) -> str:
-    """The same text for the same values, whatever their order."""
+    """Return a text that is the same for the same values in any order."""
     return json.dumps(dict(values), sort_keys=True)

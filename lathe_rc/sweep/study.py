@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tuning on the disk: Optuna's study, and what came of the cells of its trials.
+"""A tuning on disk: Optuna's study, and the results of the cells of its trials.
 
-Trials are asked for a batch at a time. Each is drawn with a random generator of its own, from the seed and its number,
-and what came of a batch is told in the order of the numbers: the same search, whoever computes it and when.
+Trials are drawn a batch at a time, each with a random generator of its own, seeded by the seed and the trial's number.
+The results of a batch are reported to Optuna in the order of the numbers. So the search depends neither on the
+processes that compute it nor on their timing.
 """
 
 import hashlib
@@ -40,15 +41,15 @@ from lathe_rc.sweep.workers import Job, rows
 
 _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # of NSGA-II
-_UNKNOWN = 1e9  # in place of an infinite cost, which the samplers do not take: beyond all that there are
+_UNKNOWN = 1e9  # larger than every cost, in place of an infinite one, which the samplers do not accept
 _CHECKSUM = "checksum"  # of a line of the journal, in itself
-_BY, _SCORE = "by", "score"  # attributes of a trial: its worker, its result
+_BY, _SCORE = "by", "score"  # attributes of a trial: the process that computes it, its result
 
 
 class _Journal(BaseJournalBackend):
     """Optuna's journal with a checksum in each line; lines of older versions have none.
 
-    Optuna's own file takes a damaged last line for one that is being written, and passes over it. Only a process that
+    Optuna's own class takes a damaged last line for one that is being written, and skips it. Here only a process that
     holds the lock of the folder writes.
     """
 
@@ -60,7 +61,7 @@ class _Journal(BaseJournalBackend):
             print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
 
     def _cut(self) -> bool:
-        """Remove a line that a process was stopped in, or a full disk; by it the next line would be lost as well."""
+        """Remove an incomplete last line: the next line would be appended to it, and both would be lost."""
         with open(self._path, "rb+", opener=open_file) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 1, 0))
@@ -71,7 +72,7 @@ class _Journal(BaseJournalBackend):
         return True
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Write lines, to the disk."""
+        """Append lines and flush them to the disk."""
         self._cut()
         lines = (json.dumps(log | {_CHECKSUM: _checksum(log)}, separators=(",", ":")) + "\n" for log in logs)
         with open(self._path, "ab", opener=open_file) as file:
@@ -80,13 +81,13 @@ class _Journal(BaseJournalBackend):
             os.fsync(file.fileno())
 
     def read_logs(self, log_number_from: int) -> Generator[dict[str, Any]]:
-        """Read lines.
+        """Yield the lines from a number on.
 
         Raises:
             InputError: a line is damaged.
         """
         with open(self._path, "rb", opener=open_file) as file:
-            file.seek(self._starts[log_number_from])
+            file.seek(self._starts[log_number_from])  # Optuna reads often, each time from its last line on
             for self.line, line in enumerate(file, log_number_from + 1):
                 if not line.endswith(b"\n"):  # it is being written
                     return
@@ -103,7 +104,7 @@ class _Journal(BaseJournalBackend):
                 yield log
 
     def refusal(self, reason: object) -> InputError:
-        """The error for the line that was read last."""
+        """Return the error for the line that was read last."""
         return InputError(
             f"{self._path}, line {self.line}: no journal of Optuna, or damaged ({shown(reason)}); "
             "allowed: as it was written, or a new folder"
@@ -116,10 +117,10 @@ def _checksum(log: Mapping[str, Any]) -> str:
 
 
 def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
-    """The journal, and the study in it.
+    """Open a journal and the study in it.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the journal cannot be read.
     """
     try:
         journal = _Journal(path)
@@ -138,10 +139,10 @@ def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
 
 
 class Study:
-    """A tuning on the disk: Optuna's study, and the rows of its trials.
+    """A tuning on disk: Optuna's study, and the rows of its trials.
 
     Attributes:
-        count: cells of a trial.
+        count: number of cells of a trial.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -175,7 +176,7 @@ class Study:
 
     @contextmanager
     def present(self) -> Iterator[str]:
-        """Hold a lock of one's own, by which others see that this process computes; yields its name."""
+        """Hold a lock by which other processes see that this one computes; yield its name."""
         place, me = self._folder.path / "running", uuid.uuid4().hex
         with writing(self._folder.path):
             place.mkdir(exist_ok=True)
@@ -186,7 +187,7 @@ class Study:
                 (place / me).unlink(missing_ok=True)
 
     def _is_left(self, trial: FrozenTrial, me: str) -> bool:
-        """Whether the process that computed a trial has ended."""
+        """Whether the process that was to compute a trial has ended: its lock is free."""
         by = str(trial.user_attrs.get(_BY))
         path = self._folder.path / "running" / by
         with suppress(filelock.Timeout):
@@ -197,16 +198,17 @@ class Study:
         return False
 
     def count_trials(self, state: TrialState, most: int = sys.maxsize) -> int:
-        """How many of the first ``most`` trials are in a state: computed, or being so, perhaps by other processes."""
+        """Return how many of the first ``most`` trials are in a state, those of other processes included."""
         return sum(trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(state,)))
 
     def ask(self, me: str, most: int) -> list[FrozenTrial]:
-        """The next batch: trials that somebody has left, filled up with new ones to ``most`` in all."""
+        """Return the next batch: trials of processes that have ended, and new ones up to ``most`` in all."""
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             there = self._study.get_trials(deepcopy=False)
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
             left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._is_left(trial, me)]
             number, batch = len(asked), self._asked.batch
+            # Batches end at multiples of their size, also after a stop: a trial knows the results of the same others.
             missing = batch - number % batch if number % batch or not left else 0
             for _ in range(max(0, min(missing, most - number))):
                 self._study.sampler = self._sampler(number)
@@ -226,7 +228,7 @@ class Study:
         return optuna.Trial(self._study, self._storage.get_trial_id_from_study_id_trial_number(study, number))
 
     def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
-        """Of a trial."""
+        """Return a sampler for one trial, with a seed of its own."""
         seed = int(np.random.SeedSequence([self._asked.seed, number]).generate_state(1)[0])
         if self._asked.sampler == "cmaes":
             return optuna.samplers.CmaEsSampler(x0=self._start, seed=seed)
@@ -235,7 +237,7 @@ class Study:
         return optuna.samplers.TPESampler(multivariate=True, seed=seed)
 
     def compute(self, crew: distributed.Client, asked: Sequence[FrozenTrial], watch: Watch) -> None:
-        """Compute the cells of a batch, and tell what came of it."""
+        """Compute the cells of a batch, and report the scores to Optuna."""
         jobs = {trial.number: self._jobs(trial) for trial in asked}
         missing = {job.key: job for each in jobs.values() for job in each if job.key not in self._known}
         keep(self._folder, rows(crew, order_of(self._folder), missing.values(), len(missing)), watch, self._take)
@@ -243,7 +245,8 @@ class Study:
             for number, each in jobs.items():
                 self._tell(number, self._objectives.score(self._known[job.key] for job in each))
             tuning = self.tuning()
-            if best := tuning.best:  # while no other process writes one of fewer trials
+            # Within the lock: a process that knows fewer trials could write its best one over this one.
+            if best := tuning.best:
                 tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})
 
@@ -267,13 +270,14 @@ class Study:
         for place, violation in enumerate(score.violations):
             trial.set_constraint(str(place), violation)
         known = [min(cost, _UNKNOWN) for cost in score.costs]
-        if self._asked.sampler == "cmaes" and not score.feasible:  # it knows no constraints: the nearer the better
+        # CMA-ES knows no constraints: an infeasible trial costs more than all others, and the less the nearer it is.
+        if self._asked.sampler == "cmaes" and not score.feasible:
             known = [_UNKNOWN * (1.0 + sum(max(violation, 0.0) for violation in score.violations))]
         self._study.sampler = self._sampler(number)
         self._study.tell(number, known)
 
     def tuning(self) -> Tuning:
-        """The tuning so far."""
+        """Return the tuning so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             if _SCORE not in trial.user_attrs or not trial.params.keys() >= self._space.keys():
@@ -288,7 +292,7 @@ class Study:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without Optuna's warnings of what it may change one day."""
+    """Suppress Optuna's warnings of experimental features."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

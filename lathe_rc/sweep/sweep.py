@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sweep from its space to its table; see `run`."""
+"""Sweep from its space to its table of results."""
 
 import hashlib
 import os
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 Models = Literal["follow", "nominal"]
 Watch = Callable[[Mapping[str, Any]], None]
 
-_WRITE = 10.0  # [s] between writes of what has come
+_WRITE = 10.0  # [s] between files of rows
 
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """The result of a sweep.
+    """Result of a sweep.
 
     Attributes:
-        folder: where it is.
+        folder: folder of the rows.
     """
 
     folder: Folder
@@ -49,32 +49,32 @@ class Sweep:
         return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
     def table(self) -> pa.Table:
-        """The rows, in the order of the cells; see `lathe_rc.sweep.row`."""
+        """Return the rows, in the order of the cells; see `lathe_rc.sweep.row`."""
         return self.folder.table()
 
     def frame(self) -> "pd.DataFrame":
-        """The same for pandas."""
+        """Return the rows as a pandas data frame."""
         return self.table().to_pandas()
 
     def statuses(self) -> dict[str, int]:
-        """How many cells came to what."""
+        """Return the numbers of cells by status, most frequent first."""
         return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
 
     def row(self, number: int) -> dict[str, Any]:
-        """The row of a cell, by column; raises as `scenario` does."""
+        """Return the row of a cell, by column; raises as `scenario` does."""
         return self.folder.row(number)
 
     def scenario(self, number: int) -> Scenario:
-        """The scenario of a cell, to run it again.
+        """Return the scenario of a cell, to run it again.
 
         Raises:
-            InputError: there is no such cell, or it is not computed; it was refused.
+            InputError: there is no such cell, it is not computed, or it was refused.
         """
         return self.folder.scenario.varied(self.folder.values(number))
 
 
 def ignore(event: Mapping[str, Any]) -> None:
-    """Watch nothing."""
+    """Ignore the events of a sweep."""
 
 
 def run_sweep(
@@ -92,22 +92,21 @@ def run_sweep(
     """Compute the cells of a space that are not in the folder yet.
 
     Args:
-        scenario: the cell that is varied; it needs a number of revolutions.
-        space: which variations.
-        folder: of the results; a sweep goes on where it was stopped, and takes more spaces.
+        scenario: the varied cell; it needs a number of revolutions.
+        space: its variations.
+        folder: folder of the results; a stopped sweep is continued, and further spaces are added.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
-        models: of drives that controllers have, and that the scenario does not give: ``follow`` the drives that are
-            varied, or stay ``nominal``, as when one controller is to serve many drives.
+        models: drive models of controllers, where the scenario does not give them: ``follow`` the varied drives, or
+            stay ``nominal``, as when one controller has to serve many drives.
         scheduler: address of a scheduler of Dask; None: workers of this machine.
-        workers: processes of this machine; None: one for each core.
-        client: of Dask, in place of both.
-        watch: called with the events ``began`` (cells; computed: those of them that are there already),
-            ``compiling`` (nodes), ``ready`` (dashboard: address of Dask's) and ``rows`` (statuses: how many cells came
-            to what).
+        workers: number of worker processes of this machine; None: one for each core.
+        client: client of Dask, in place of both.
+        watch: called with the events ``began`` (cells; computed: number of those that exist already), ``compiling``
+            (nodes), ``ready`` (dashboard: address of Dask's) and ``rows`` (statuses: numbers of cells by status).
 
     Raises:
-        InputError: no space of this scenario, the folder holds something else, or nobody is at the address.
-        LatheError: workers died, or the disk is full; what was computed is kept.
+        InputError: no space of this scenario, the folder holds something else, or no scheduler is at the address.
+        LatheError: workers died, or the disk is full; the computed rows are kept.
 
     Example:
         >>> import lathe_rc
@@ -136,7 +135,8 @@ def run_sweep(
 def crew_for(
     scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
 ) -> Iterator[distributed.Client]:
-    """The workers for cells of a scenario, once its kernels are compiled; arguments and events as in `run`."""
+    """Yield the workers for cells of a scenario; arguments and events as in `run_sweep`."""
+    # Kernels are compiled here once, into the cache of all processes, instead of in every worker at the same time.
     for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
         watch({"event": "compiling", "nodes": stages})
     with nullcontext(client) if client else client_of(scheduler, workers) as crew:
@@ -145,7 +145,7 @@ def crew_for(
 
 
 def order_of(folder: Folder) -> Order:
-    """The order that all jobs of a folder share."""
+    """Return the order that all jobs of a folder share."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
@@ -156,13 +156,13 @@ def order_of(folder: Folder) -> Order:
 def keep(
     folder: Folder, found: Generator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
 ) -> None:
-    """Write rows as they come, a file now and then; those that have come when something ends it, too.
+    """Write rows as they arrive, one file every few seconds, and the last ones also after an interruption.
 
     Args:
-        folder: of the rows.
-        found: see `lathe_rc.sweep.workers.rows`; it is closed, which takes back what is not computed yet.
-        watch: see `run`.
-        take: gets the rows as well, before they are written.
+        folder: folder of the rows.
+        found: tables of rows, see `lathe_rc.sweep.workers.rows`; closing it cancels the cells not yet computed.
+        watch: see `run_sweep`.
+        take: called with the rows before they are written.
     """
     waiting: list[pa.Table] = []
     written = time.monotonic()
@@ -183,8 +183,9 @@ def keep(
 
 
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
-    """All cells of a space, numbered through all spaces of the folder in the order in which they were asked for."""
+    """Yield the cells of a space, numbered through all spaces of the folder in the order of their requests."""
     key = Key(folder)
+    # Of the only space no cell occurs twice: its cells need no table of keys, which may be millions.
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
             yield Job(number, key.of(values), values)
@@ -199,7 +200,7 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
 
 
 class Key:
-    """Identity of a cell: that of the scenario, what is measured, and the values that are not the scenario's own."""
+    """Identities of cells: hashes of the scenario, the measures, and the values that differ from the scenario's own."""
 
     def __init__(self, folder: Folder) -> None:
         scenario = folder.scenario
@@ -209,8 +210,9 @@ class Key:
         self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())
 
     def of(self, values: Mapping[str, Value]) -> str:
-        """In hexadecimal digits."""
+        """Return the identity of a cell in hexadecimal digits."""
         own = {target: value for target, value in values.items() if value != self._base[target]}
+        # A file is identified by its content, not by its path.
         for target in self._files & own.keys():
             own[target] = content(Path(str(own[target])))
         found = self._start.copy()

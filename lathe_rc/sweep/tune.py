@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning: parameters of a cell searched by Optuna, its trials computed by the workers of a sweep; see `run`.
+"""Tuning: a search for parameters of a cell by Optuna, whose trials the workers of a sweep compute.
 
-DIR/trials.log       Optuna's journal: what was asked, and what came of it
-DIR/running/         a lock for each program that computes; by it a program that died is noticed
+DIR/trials.log       Optuna's journal: the trials and their scores
+DIR/running/         a lock for each process that computes; a free lock is that of a process that has ended
 DIR/best.yaml        the cell with the best trial's parameters
-DIR/front/           of several goals, the cells of all trials that no other is better than
-DIR, the rest        see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
+DIR/front/           for several goals, the cells of the Pareto front
+DIR, other files     see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
 """
 
 import os
@@ -30,7 +30,7 @@ from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuning import Tuning
 
-_PAUSE = 0.2  # [s] before looking again whether other processes have computed their trials
+_PAUSE = 0.2  # [s] between looks at the trials of other processes
 
 
 def tune(
@@ -53,32 +53,32 @@ def tune(
     client: distributed.Client | None = None,
     watch: Watch = ignore,
 ) -> Tuning:
-    """Search parameters of a cell; what the folder has already is not computed again.
+    """Search for parameters of a cell; trials that the folder has already are not computed again.
 
     Args:
         scenario: the cell; its own parameters are the start, trial 0. It needs a number of revolutions.
-        free: what is searched, by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
+        free: search space by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
         goals: columns of a row, see `lathe_rc.sweep.objectives`; several are traded off.
-        folder: of the results. Several programs, on this machine or others, may compute into it at the same time.
-        subjects: what has to be met.
-        over: plants and spindles; what counts is the worst of them, or a percentile. None: the scenario's own.
+        folder: folder of the results. Several processes, also on other machines, may compute into it at a time.
+        subjects: constraints.
+        over: plants and spindles, of which the worst or a percentile counts; None: the scenario's own.
         percentile: see `over`; 100: the worst.
-        trials: so many in all, those that are there already among them.
+        trials: total number of trials, including existing ones.
         sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2`` for several goals and many trials.
-        seed: of the search.
-        batch: trials that are asked for before the first of them is told.
-        ask_formulas: let trial 1 be what `lathe_rc.sweep.formulas` gives, if it is within the ranges.
+        seed: seed of the search.
+        batch: number of trials that are drawn before the first of them has a score.
+        ask_formulas: whether trial 1 has the values of `lathe_rc.sweep.formulas`, if they are within the ranges.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
         scheduler: see `lathe_rc.run_sweep`, as the next two.
-        workers: processes of this machine.
-        client: of Dask, in place of both.
-        watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the trials that are there, and with
-            ``told`` (tuning: all trials so far), after each batch, and ``waiting``, again and again, while the last
-            trials are those of other programs.
+        workers: number of worker processes of this machine.
+        client: client of Dask, in place of both.
+        watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the number of existing trials, and with
+            ``told`` (tuning: all trials so far) after each batch, and ``waiting``, repeatedly, while other processes
+            compute the last trials.
 
     Raises:
-        InputError: what is asked for cannot be, or the folder holds something else.
-        LatheError: workers died, or the disk is full; what was computed is kept.
+        InputError: the request is impossible, or the folder holds something else.
+        LatheError: workers died, or the disk is full; the computed rows are kept.
 
     Example:
         >>> import lathe_rc
@@ -151,10 +151,10 @@ def _check_sampler(name: str, wanted: Objectives, found: Mapping[str, Dimension]
 
 
 def load(path: Path) -> Tuning:
-    """The tuning of a folder.
+    """Load the tuning of a folder.
 
     Raises:
-        InputError: it holds none.
+        InputError: the folder holds none.
     """
     folder = Folder(path)
     if folder.tuning is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a tuning: its trials, the best of them, and the values by formulas."""
+"""Result of a tuning: its trials, the best of them, and the values by formulas."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,12 +21,12 @@ from lathe_rc.sweep.sweep import Sweep
 
 
 class Trial(NamedTuple):
-    """One trial.
+    """Trial of a tuning.
 
     Attributes:
-        number: of it; 0 is the start, the scenario's own parameters.
-        values: of the free parameters.
-        score: what came of its cells.
+        number: number of the trial; 0 is the start, the scenario's own parameters.
+        values: values of the free parameters.
+        score: score of its cells.
     """
 
     number: int
@@ -35,20 +35,20 @@ class Trial(NamedTuple):
 
 
 def unit(column: str) -> tuple[float, str]:
-    """The unit in which a column is shown: how many of it are 1, and its name."""
+    """Return the unit in which a column is shown: the factor from SI units, and the unit's name."""
     return (1e6, "µm") if column.endswith("_error") else (1.0, "")
 
 
 @dataclass(frozen=True, repr=False)
 class Tuning:
-    """The result of a tuning.
+    """Result of a tuning.
 
     Attributes:
-        folder: where it is.
-        objectives: what was wanted.
-        over: the plants and spindles of each trial.
-        trials: that are computed, in order.
-        formulas: what formulas give, by free parameter, where there is one.
+        folder: folder of the tuning.
+        objectives: goals and constraints.
+        over: plants and spindles of each trial.
+        trials: computed trials, in order.
+        formulas: values by formulas, for the free parameters that have one.
     """
 
     folder: Folder
@@ -72,22 +72,22 @@ class Tuning:
 
     @property
     def cells(self) -> int:
-        """How many cells a trial has."""
+        """Number of cells of a trial."""
         return self.over.count(self.folder.scenario)
 
     @property
     def feasible(self) -> list[Trial]:
-        """The trials that meet all constraints."""
+        """Trials that meet all constraints."""
         return [trial for trial in self.trials if trial.score.feasible]
 
     @property
     def start(self) -> Trial | None:
-        """The scenario's own parameters; None if they are not computed yet."""
+        """Trial with the scenario's own parameters; None if it is not computed yet."""
         return next((trial for trial in self.trials if trial.number == 0), None)
 
     @property
     def by_formula(self) -> Trial | None:
-        """The trial with what the formulas give; None: they give nothing, or it is outside of the ranges."""
+        """Trial with the values by formulas; None: there are none, or they are outside of the ranges."""
         given = {target: found.value for target, found in self.formulas.items()}
         scenario = self.folder.scenario
 
@@ -98,7 +98,7 @@ class Tuning:
 
     @property
     def improvements(self) -> list[Trial]:
-        """The trials that were better in the first goal than all before."""
+        """Trials that were better in the first goal than all before."""
         found: list[Trial] = []
         for trial in self.feasible:
             if not found or trial.score.costs[0] < found[-1].score.costs[0]:
@@ -107,7 +107,7 @@ class Tuning:
 
     @property
     def front(self) -> list[Trial]:
-        """The trials that no other is better than in all goals, by the first goal; of one goal, the best."""
+        """Pareto front of the feasible trials, in the order of the first goal; for one goal, the best trial."""
         found: list[Trial] = []
         # In this order only a trial that is there already can be as good in all goals.
         for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
@@ -117,22 +117,23 @@ class Tuning:
 
     @property
     def best(self) -> Trial | None:
-        """The best trial; of several goals, that of the front nearest to the best of each. None: none is feasible."""
+        """Best trial; for several goals the one of the front nearest to the best of each. None: none is feasible."""
         front = self.front
         if not front:
             return None
+        # Each goal is scaled by its span over the front: goals have different units.
         costs = np.array([trial.score.costs for trial in front])
         span = np.ptp(costs, axis=0)
         distance = np.linalg.norm((costs - costs.min(axis=0)) / np.where(span > 0.0, span, 1.0), axis=1)
         return front[int(np.argmin(distance))]
 
     def goals(self, trial: Trial) -> dict[str, float]:
-        """The goals of a trial, by column [SI units]; infinite where there is none."""
+        """Return the goals of a trial, by column [SI units]; infinite where a goal has no value."""
         pairs = zip(self.objectives.goals, trial.score.costs, strict=True)
         return {goal.column: goal.sign * cost for goal, cost in pairs}
 
     def goals_shown(self, trial: Trial) -> dict[str, str]:
-        """The goals of a trial as texts with units, by column."""
+        """Format the goals of a trial with their units, by column."""
         found = {}
         for column, value in self.goals(trial).items():
             factor, name = unit(column)
@@ -140,14 +141,14 @@ class Tuning:
         return found
 
     def scenario(self, trial: Trial) -> Scenario:
-        """The cell with a trial's parameters, on its own plant and spindle."""
+        """Return the cell with a trial's parameters, on its own plant and spindle."""
         return self.folder.scenario.varied(trial.values)
 
     def trial(self, number: int) -> Trial:
-        """A trial by its number.
+        """Return a trial by its number.
 
         Raises:
-            InputError: there is none, or it is not computed.
+            InputError: there is no such trial, or it is not computed.
         """
         known = {trial.number: trial for trial in self.trials}
         if number not in known:
@@ -159,7 +160,7 @@ class Tuning:
         """Write the cell with a trial's parameters as a parameter file that ``lathe run`` takes.
 
         Raises:
-            LatheError: it cannot be written.
+            LatheError: the file cannot be written.
         """
         text = f"# Trial {trial.number} of the tuning {self.folder.path} of {self.folder.scenario.name}.\n"
         with writing(path.parent), files.replacing(path) as stream:

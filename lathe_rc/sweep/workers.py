@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of a sweep on Dask's workers: as many tasks as keep them busy, each of a few seconds.
+"""Cells of a sweep on Dask's workers, in tasks of a few seconds.
 
-Dask schedules, retries and moves data. What is decided here is how many cells a task has: after the first ones, which
-compile what is not compiled yet, as many as take `TASK` seconds.
+Dask schedules, retries and moves data. This module decides how many cells a task has: after the first tasks, which
+compile missing kernels, as many as take `TASK` seconds.
 """
 
 import logging
@@ -33,16 +33,16 @@ from lathe_rc.sweep import row
 from lathe_rc.sweep.row import Measure
 
 TASK = 2.0  #: [s] of a task
-_GROWTH = 4  # of a task's cells against the one before
-_MOST = 4096  # cells of a task
-_LEAST = 8  # towards the end tasks get shorter, down to this part of the others
-_AHEAD = 2  # tasks for each thread of the workers
+_GROWTH = 4  # largest ratio of a task's cells to those of the one before
+_MOST = 4096  # most cells of a task
+_LEAST = 8  # towards the end tasks get shorter, down to this fraction of the others
+_AHEAD = 2  # tasks for each thread of the workers: one runs, and the next one is ready at the scheduler
 _CONNECT = 5  # [s] to reach a scheduler
 _SETTINGS = {  # of this machine's workers
-    # A worker that dies is blamed on every task that it has: so it has one, and none waits there.
+    # Dask blames the death of a worker on every task that it holds: so it holds only the one that runs.
     "distributed.scheduler.worker-saturation": 1.0,
-    # Dask looks every 10 ms where a worker is, every 20 whether its loop is late, and every 100 at its memory: that
-    # takes a tenth of the time of short cells.
+    # By default Dask profiles a worker every 10 ms, checks its event loop every 20 ms and its memory every 100 ms:
+    # that takes a tenth of the time of short cells.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "200ms",
     "distributed.worker.memory.monitor-interval": "1s",
@@ -51,12 +51,12 @@ _SETTINGS = {  # of this machine's workers
 
 
 class Job(NamedTuple):
-    """A cell to be computed.
+    """Cell to be computed.
 
     Attributes:
-        number: within the sweep.
-        key: its identity.
-        values: that differ from the scenario's.
+        number: number within the sweep.
+        key: identity of the cell.
+        values: values that the cell sets, by target.
     """
 
     number: int
@@ -65,16 +65,16 @@ class Job(NamedTuple):
 
 
 class Order(NamedTuple):
-    """The data that all jobs share; travels to the workers as it is.
+    """Data that all jobs share, and that travel to the workers with them.
 
     Attributes:
-        name: of the scenario.
+        name: name of the scenario.
         text: the scenario as a parameter file; a worker reads it once.
-        identity: of the scenario, as it has to be there as well.
-        targets: columns of what differs.
-        measures: what is measured.
-        schema: of the rows.
-        code: options that let a worker import packages for it, see `lathe_rc.allowed_code`.
+        identity: identity of the scenario, which a worker has to arrive at as well.
+        targets: columns of the varied parameters.
+        measures: further columns.
+        schema: schema of the rows.
+        code: options that allow a worker to import packages, see `lathe_rc.allowed_code`.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Order(NamedTuple):
 
 @dataclass(frozen=True)
 class Share:
-    """The jobs of a task. Dask looks for other tasks in all lists and tuples that it is given, but not in this."""
+    """Jobs of a task. Dask searches all lists and tuples among its arguments for other tasks, but not this class."""
 
     order: Order
     jobs: Sequence[Job]
@@ -96,10 +96,10 @@ class Share:
 
 @lru_cache(maxsize=4)
 def _scenario(name: str, text: str, identity: str) -> Scenario:
-    """The scenario at a worker.
+    """Return the scenario at a worker.
 
     Raises:
-        InputError: it is not the same there.
+        InputError: its identity differs there.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
@@ -113,7 +113,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 
 
 def compute(share: Share) -> pa.Table:
-    """The rows of some cells; a task of Dask."""
+    """Return the rows of some cells: a task of Dask."""
     order = share.order
     allowed_code.taken_from(order.code)
     base, bench = _scenario(order.name, order.text, order.identity), CellRunner()
@@ -126,14 +126,14 @@ def compute(share: Share) -> pa.Table:
 
 @contextmanager
 def client_of(scheduler: str | None, workers: int | None) -> Iterator[distributed.Client]:
-    """A client of a scheduler, or of workers of this machine's own, which end with the block.
+    """Yield a client of a scheduler, or of workers on this machine that end with the block.
 
     Args:
         scheduler: address, such as ``tcp://host:8786``; None: this machine.
-        workers: processes of this machine; None: one for each core.
+        workers: number of worker processes of this machine; None: one for each core.
 
     Raises:
-        InputError: nobody is at the address.
+        InputError: no scheduler is at the address.
     """
     if scheduler is not None:
         try:
@@ -151,7 +151,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Keep the current folder off the path of Python processes that are started meanwhile."""
+    """Keep the current folder off the import path of Python processes that are started within the block."""
     before = os.environ.get("PYTHONSAFEPATH", "")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
@@ -161,7 +161,7 @@ def _safe_path() -> Iterator[None]:
 
 
 def _cluster(workers: int | None) -> distributed.LocalCluster:
-    # Ctrl-C is for this process, which ends its workers.
+    # A terminal sends Ctrl-C to all processes. The workers inherit that it is ignored: this process ends them.
     before = None
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -180,16 +180,16 @@ def _cluster(workers: int | None) -> distributed.LocalCluster:
 
 
 def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
-    """Compute cells; their rows as they come.
+    """Compute cells, and yield their rows as they arrive.
 
     Args:
-        client: whose workers do it.
-        order: what the jobs have in common.
-        jobs: asked for as workers get free.
-        count: of them.
+        client: client whose workers compute.
+        order: data that the jobs share.
+        jobs: cells, taken from the iterator as workers become free.
+        count: number of jobs.
 
     Raises:
-        LatheError: workers died over the same cells again and again.
+        LatheError: workers died repeatedly over the same cells.
     """
     waiting = iter(jobs)
     left, size = count, 1
@@ -199,10 +199,11 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
         while True:
             threads = max(sum(client.nthreads().values()), 1)
             while len(sent) < _AHEAD * threads:
-                fair = -(-left // (_AHEAD * threads))  # so that all workers end at about the same time
+                fair = -(-left // (_AHEAD * threads))  # rounded up: all workers end at about the same time
                 if not (some := list(islice(waiting, max(min(size, fair), size // _LEAST, 1)))):
                     break
                 left -= len(some)
+                # Not pure: Dask would hash all jobs of a task in order to recognise it.
                 future = client.submit(compute, Share(order, some), pure=False)
                 sent[future] = some
                 arriving.add(future)
@@ -229,7 +230,7 @@ def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Tab
 
 
 def _next(size: int, found: pa.Table) -> int:
-    """How many cells the next task has."""
+    """Return the number of cells of the next task."""
     took: float = sum(found.column("seconds").to_pylist())
     fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
     grown: int = _GROWTH * max(size, found.num_rows)
