@@ -2,10 +2,11 @@
 """The pages are true: the reference page, links, the examples of the README, scenarios, the launch file."""
 
 import ast
+import contextlib
 import functools
-import importlib.util
 import pkgutil
 import re
+import runpy
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,6 @@ from lathe_rc.cell import ros_yaml, scenario
 from lathe_rc.cell.host_topics import HOST_TOPICS, HostTopic
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.run import run
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import PACKAGE, store
@@ -29,7 +29,6 @@ from lathe_rc.messages import PACKAGE, store
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
-SCENARIOS = sorted((ROOT / "config").glob("*.yaml"))
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
 LAUNCH = ROOT / "launch" / "cell.launch.py"
 
@@ -106,20 +105,17 @@ class TestHostTopics:
 
     @pytest.mark.parametrize("topic", HOST_TOPICS, ids=lambda topic: topic.name)
     def test_are_published_and_read_as_the_table_says(self, nodes: dict[str, Any], topic: HostTopic) -> None:
-        full = topic.name if topic.name.startswith("/") else f"/{topic.name}"
+        full = f"/{topic.name.removeprefix('/')}"
         for kind, node in nodes.items():
             outlets = [outlet for outlet in node.publishers if outlet.topic_name == full]
-            inlets = [inlet for inlet in node.subscriptions if inlet.topic_name == full]
+            read = {inlet.topic_name for inlet in node.subscriptions}
             assert bool(outlets) == (kind in topic.publishers), f"{kind} publishes {full}"
-            assert bool(inlets) == (kind in topic.subscribers), f"{kind} reads {full}"
+            assert (full in read) == (kind in topic.subscribers), f"{kind} reads {full}"
             for outlet in outlets:
-                package = outlet.msg_type.__module__.partition(".")[0]
+                package, qos = outlet.msg_type.__module__.partition(".")[0], outlet.qos_profile
                 assert f"{package}/msg/{outlet.msg_type.__name__}" == topic.type
-                assert outlet.qos_profile.depth == topic.depth
-                assert outlet.qos_profile.reliability.name == "RELIABLE"
-                assert (outlet.qos_profile.durability.name == "TRANSIENT_LOCAL") == (
-                    topic.durability == "transient local"
-                )
+                assert (qos.depth, qos.reliability.name) == (topic.depth, "RELIABLE")
+                assert qos.durability.name == topic.durability.replace(" ", "_").upper()
 
 
 @functools.cache
@@ -205,65 +201,39 @@ def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.M
     pages.run_python(page, tmp_path)
 
 
-@pytest.mark.parametrize("path", SCENARIOS, ids=name)
-class TestScenarios:
-    def test_passes_its_check(self, path: Path) -> None:
-        Cell(scenario.load(path).nodes).check()
-
-    def test_survives_being_written_out(self, path: Path, tmp_path: Path) -> None:
-        loaded = scenario.load(path)
-        again = tmp_path / path.name
-        again.write_text(loaded.to_yaml(), encoding="utf-8")
-        assert scenario.load(again) == loaded
-
-
 class Action(SimpleNamespace):
-    """Stands in for an action of launch: keeps what it is given."""
+    """An action of launch, replaced: it keeps what it is given."""
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         super().__init__(args=args, **kwargs)
 
 
-class Configuration:
-    """Stands in for LaunchConfiguration."""
-
-    def __init__(self, key: str) -> None:
-        self._key = key
+class Configuration(Action):
+    """LaunchConfiguration, replaced."""
 
     def perform(self, context: SimpleNamespace) -> str:
-        return str(context.launch_configurations[self._key])
+        return str(context.launch_configurations[self.args[0]])
+
+
+def stand_in(name: str) -> type:
+    """A class of launch by its name."""
+    return Configuration if name == "LaunchConfiguration" else type(name, (Action,), {})
 
 
 @pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The launch file, imported with stand-ins for launch and launch_ros."""
-    contents = {
-        "launch": ("LaunchContext", "LaunchDescription", "LaunchDescriptionEntity"),
-        "launch.actions": ("DeclareLaunchArgument", "IncludeLaunchDescription", "OpaqueFunction", "TimerAction"),
-        "launch.events": (),
-        "launch.events.process": ("ProcessExited",),
-        "launch.substitutions": ("LaunchConfiguration",),
-        "launch_ros": (),
-        "launch_ros.actions": ("Node",),
-    }
-    for module, names in contents.items():
-        made = ModuleType(module)
-        for attribute in names:
-            setattr(
-                made, attribute, Configuration if attribute == "LaunchConfiguration" else type(attribute, (Action,), {})
-            )
-        monkeypatch.setitem(sys.modules, module, made)
-    spec = importlib.util.spec_from_file_location("cell_launch", LAUNCH)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    packages = ("launch", "launch.actions", "launch.events", "launch.events.process", "launch.substitutions")
+    for package in (*packages, "launch_ros", "launch_ros.actions"):
+        module = ModuleType(package)
+        vars(module).update(__getattr__=stand_in)
+        monkeypatch.setitem(sys.modules, package, module)
+    return SimpleNamespace(**runpy.run_path(str(LAUNCH)))
 
 
 class TestLaunch:
     @pytest.fixture
-    def start(self, launch_file: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    def start(self, launch_file: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         """The actions that `ros2 launch` makes of the description, for given arguments.
 
         ``including``: a file that it was given instead, which includes ours and sets the arguments.
@@ -285,9 +255,13 @@ class TestLaunch:
         return run
 
     def test_starts_the_five_nodes_with_one_file(self, start: Callable[..., Any], tmp_path: Path) -> None:
-        nodes = start()
-        assert {tuple(node.arguments) for node in nodes} == {(f"{name}:{name}",) for name in FIVE}
+        """Also in a namespace, where the enclaves are as well."""
+        nodes = start(namespace="/left")
+        assert {(tuple(node.arguments), node.namespace, *node.ros_arguments) for node in nodes} == {
+            ((f"{name}:{name}",), "/left", "--enclave", f"/left/{name}") for name in FIVE
+        }
         assert all((node.package, node.executable) == ("lathe_rc", "container") for node in nodes)
+        assert {node.exec_name for node in nodes} == FIVE
         (file,) = {parameter for node in nodes for parameter in node.parameters}
         loaded = scenario.load(Path(file))
         assert set(loaded.nodes["spindle_encoder"].members) == FIVE - {"spindle_encoder"}
@@ -310,12 +284,7 @@ class TestLaunch:
         (together,) = start(scenario="full_cell.yaml")
         assert len(together.arguments) == 13
         assert together.arguments[3:5] == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator"]
-
-    def test_puts_the_cell_into_a_namespace(self, start: Callable[..., Any]) -> None:
-        nodes = start(namespace="/left")
-        assert {(node.namespace, *node.ros_arguments) for node in nodes} == {
-            ("/left", "--enclave", f"/left/{name}") for name in FIVE
-        }
+        assert together.exec_name == "spindle_encoder+learning_controller+11_more"
 
     def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
         with pytest.raises(InputError, match="exists"):
@@ -348,55 +317,55 @@ class TestLaunch:
         assert len(start("/mine.launch.py", turns="2", sigterm_timeout="9")) == 5
         assert len(start(sigterm_timeout="9")) == 5
 
-    def test_calls_processes_by_their_nodes(self, start: Callable[..., Any]) -> None:
-        assert {node.exec_name for node in start()} == FIVE
-        (together,) = start(scenario="full_cell.yaml")
-        assert together.exec_name == "spindle_encoder+learning_controller+11_more"
-
 
 class TestEndsUnderLaunch:
-    """The answer of launch: an error means that it ends the others and returns 1."""
+    """The answer of launch to ends of processes: an error means that it ends the others and returns 1."""
 
     @pytest.fixture
-    def ended(self, launch_file: ModuleType) -> Callable[..., Any]:
-        """Says that a process of a cell of three has ended."""
+    def ended(self, launch_file: Any) -> Callable[..., Any]:
+        """Report that a process of a cell of three has ended."""
         reacts = launch_file.Ends(3, replaced=False)
 
-        def say(name: str, code: int, *, told_to: bool = False) -> Any:
+        def report(name: str, code: int, *, told_to: bool = False) -> Any:
             event = SimpleNamespace(process_name=name, returncode=code)
             return reacts(event, SimpleNamespace(is_shutdown=told_to))
 
-        return say
+        return report
 
-    def test_a_cell_that_ends_in_order_has_not_failed(self, ended: Callable[..., Any]) -> None:
-        assert not any(ended(name, 0) for name in ("tool-1", "recorder-2", "spindle-3"))
-
-    def test_a_node_that_fails_is_named_at_once_and_those_that_are_ended_are_not(
-        self, ended: Callable[..., Any]
+    @pytest.mark.parametrize(
+        ("before", "last", "error"),
+        [
+            pytest.param([("tool-1", 0), ("recorder-2", 0)], ("spindle-3", 0), "", id="in order"),
+            pytest.param([], ("tool-1", 2), "tool-1 ended with exit code 2$", id="a failure is named at once"),
+            pytest.param(
+                [("tool-1", -9), ("recorder-2", 0)],
+                ("spindle-3", 0),
+                "tool-1 was killed by SIGKILL$",
+                id="a killed one when the others have come to the safe state",
+            ),
+            pytest.param(
+                [("tool-1", -9)],
+                ("spindle-3", 1),
+                "tool-1 was killed by SIGKILL; spindle-3 ended with exit code 1$",
+                id="beside one that fails later",
+            ),
+        ],
+    )
+    def test_failed_and_killed_nodes_are_named(
+        self, ended: Callable[..., Any], before: list[tuple[str, int]], last: tuple[str, int], error: str
     ) -> None:
-        with pytest.raises(LatheError, match=r"^tool-1 ended with exit code 2$"):
-            ended("tool-1", 2)
-        assert not any(ended(name, code, told_to=True) for name, code in (("recorder-2", 1), ("spindle-3", -2)))
+        for name, code in before:
+            assert bool(ended(name, code)) == (code < 0), "a timer ends those that wait for a killed one"
+        with pytest.raises(LatheError, match=f"^{error}") if error else contextlib.nullcontext():
+            assert not ended(*last)
 
-    @pytest.mark.parametrize("code", [0, 1])
-    def test_a_killed_node_is_named_when_the_others_have_come_to_the_safe_state(
-        self, ended: Callable[..., Any], code: int
-    ) -> None:
-        ended("tool-1", -9)
-        if code == 0:
-            assert not ended("recorder-2", 0)
-        with pytest.raises(
-            LatheError, match=r"^tool-1 was killed by SIGKILL" + "; spindle-3 ended with exit code 1" * code
-        ):
-            ended("spindle-3", code)
-
-    def test_a_killed_node_is_named_when_the_user_ends_the_others(self, ended: Callable[..., Any]) -> None:
+    def test_nodes_that_are_told_to_end_are_not_named(self, ended: Callable[..., Any]) -> None:
         ended("tool-1", -11)
-        ended("recorder-2", 0, told_to=True)
+        assert not ended("recorder-2", 1, told_to=True)
         with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGSEGV$"):
-            ended("spindle-3", 0, told_to=True)
+            ended("spindle-3", -2, told_to=True)
 
-    def test_a_killed_node_is_not_waited_for_for_ever(self, ended: Callable[..., Any], launch_file: ModuleType) -> None:
+    def test_a_killed_node_is_not_waited_for_for_ever(self, ended: Callable[..., Any], launch_file: Any) -> None:
         """Launch ends a cell that has not begun 30 s after a node was killed.
 
         The cell has not begun, and the others do not know that they wait in vain.

@@ -27,18 +27,17 @@ def elements(html):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_a_page_has_the_same_lists_tables_and_blocks_on_the_site_as_on_github(page):
+def test_a_page_is_the_same_on_the_site_as_on_github(page):
+    """Lists, tables and blocks; and an equation in a line has nothing that GitHub takes for Markdown.
+
+    Before it looks for equations, GitHub takes \\, for a comma, and a bar ends a cell of a table.
+    """
     text = page.read_text(encoding="utf-8")
     github = MarkdownIt("commonmark").enable("table").render(text)
     site = Markdown(extensions=EXTENSIONS).convert(for_python_markdown(text))
     assert elements(site) == elements(github)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_an_equation_in_a_line_has_nothing_that_github_takes_for_markdown(page):
-    """Before it looks for equations, GitHub takes \\, for a comma, and a bar ends a cell of a table."""
-    text = re.sub(r"^( *`{3,}).*?^ *`{3,}$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    found = [tex for _, tex in equations._INLINE.findall(text) if tex]
+    prose = re.sub(r"^( *`{3,}).*?^ *`{3,}$", "", text, flags=re.MULTILINE | re.DOTALL)
+    found = [tex for _, tex in equations._INLINE.findall(prose) if tex]
     assert [tex for tex in found if re.search(r"\\[^a-zA-Z]|[|*]|<(?! )", tex)] == []
 
 
@@ -48,16 +47,13 @@ def imports():
     for path in sorted(root.rglob("*.py")):
         package = path.relative_to(root).parts[0].removesuffix(".py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module == "lathe_rc":
-                names = [f"lathe_rc.{alias.name}" for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                names = [node.module or ""]
-            else:
-                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            for name in names:
-                top, _, rest = name.partition(".")
-                if top == "lathe_rc" and rest and rest.split(".")[0] != package:
-                    yield package, rest.split(".")[0], path.relative_to(ROOT)
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            module = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            for alias in node.names:
+                top, _, rest = f"{module}{alias.name}".partition(".")
+                if top == "lathe_rc" and rest and (imported := rest.split(".")[0]) != package:
+                    yield package, imported, path.relative_to(ROOT)
 
 
 def test_the_picture_of_the_architecture_is_true():
