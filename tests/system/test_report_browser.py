@@ -10,6 +10,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from matplotlib.image import imread
 
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
@@ -165,17 +166,24 @@ def test_a_telephone_shows_the_page_without_scrolling_sideways(page, tmp_path, s
     assert all(250 < width <= 420 for width in told["charts"])
 
 
-def test_paper_and_a_browser_without_scripts_have_the_pictures(page, tmp_path):
-    """The printed figures are the pictures, light ones, in place of those of the script."""
-    from matplotlib.image import imread
+def painted(page, folder):
+    """Share of dark pixels and number of red ones in what a browser paints of a page."""
+    shot = folder / "shot.png"
+    Visit(page, folder, f"--screenshot={shot}", "--window-size=1000,1600")
+    pixels = imread(shot)[..., :3]
+    assert pixels.shape[:2] == (1600, 1000)
+    dark, red = pixels.max(axis=-1) < 0.4, (pixels[..., 0] > 0.6) & (pixels[..., 1:].max(axis=-1) < 0.4)
+    return dark.mean(), red.sum()
 
+
+def test_figures_are_painted_with_and_without_scripts_and_on_paper(page, tmp_path):
+    """Without scripts and on paper they are the pictures, light ones, in place of those of the script."""
+    dark, red = painted(page, tmp_path)
+    assert 0.005 < dark < 0.3
+    assert red > 500
     still = tmp_path / "still.html"
     still.write_text(re.sub(r"<script.*?</script>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL), "utf-8")
-    shot = tmp_path / "shot.png"
-    Visit(still, tmp_path, f"--screenshot={shot}", "--window-size=1000,1600")
-    pixels = imread(shot)[..., :3]
-    red = (pixels[..., 0] > 0.6) & (pixels[..., 1:].max(axis=-1) < 0.4)
-    assert red.sum() > 500
+    assert painted(still, tmp_path)[1] > 500
     pdf = tmp_path / "printed.pdf"
     Visit(page, tmp_path, f"--print-to-pdf={pdf}", "--blink-settings=preferredColorScheme=0")
     assert pdf.read_bytes().count(b"/Type /Page\n") > 2
@@ -192,19 +200,6 @@ def test_every_figure_of_the_report_renders(page, tmp_path):
     sizes = [tuple(map(int, size.split("x"))) for size in title[1].split(",")]
     assert len(sizes) == 8
     assert all(width > 400 and height > 150 for width, height in sizes)
-
-
-def test_a_page_of_many_figures_is_not_blank(page, tmp_path):
-    """The browser paints the figures in their colours."""
-    from matplotlib.image import imread
-
-    shot = tmp_path / "shot.png"
-    Visit(page, tmp_path, f"--screenshot={shot}", "--window-size=1000,1600")
-    pixels = imread(shot)[..., :3]
-    assert pixels.shape[:2] == (1600, 1000)
-    dark, red = pixels.max(axis=-1) < 0.4, (pixels[..., 0] > 0.6) & (pixels[..., 1:].max(axis=-1) < 0.4)
-    assert 0.005 < dark.mean() < 0.3
-    assert red.sum() > 500
 
 
 def test_the_check_would_see_a_request_and_a_complaint(page, tmp_path):
