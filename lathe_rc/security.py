@@ -19,7 +19,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace
-from lathe_rc.view.rerun_signals import drawn
+from lathe_rc.view.rerun_signals import is_drawn
 
 OPERATOR = "operator"  #: people with the tools of ROS: they read everything and call every service
 
@@ -125,7 +125,7 @@ class _Maker:
 
     def rerun_bridge(self) -> Profile:
         """It reads the signals that a scene shows."""
-        return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if drawn(source.type)])
+        return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
 
     def replayer(self) -> Profile:
         """It takes the place of the cell: it publishes what a bag of it holds, not as members but by itself."""

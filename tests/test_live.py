@@ -25,9 +25,9 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import dds
-from lathe_rc.view.rerun_live import Backlog, Live, Order
+from lathe_rc.view.rerun_live import Backlog, Live, RunOrder
 from lathe_rc.view.rerun_output import Output
-from lathe_rc.view.rerun_signals import drawn
+from lathe_rc.view.rerun_signals import is_drawn
 
 PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
 STEP_NS = 15625
@@ -38,21 +38,17 @@ LENGTH = 12.0  # revolutions
 # --- without ROS: the backlog, the order
 
 
-def test_a_full_backlog_is_left_out_as_a_whole():
-    backlog = Backlog(100)
-    for number in range(7):
-        backlog.put(("/a", "", bytes([number]) * 40))
-    backlog.put(None)
-    backlog.close()
-    assert [message and message[2][0] for message in backlog] == [6, None]
-
-
-def test_what_is_taken_makes_room():
+def test_a_full_backlog_is_left_out_as_a_whole_and_what_is_taken_makes_room():
     backlog = Backlog(100)
     taken = iter(backlog)
     for number in range(7):
         backlog.put(("/a", "", bytes([number]) * 80))
         assert next(taken)[2][0] == number
+    for number in range(7):
+        backlog.put(("/a", "", bytes([number]) * 40))
+    backlog.put(None)
+    backlog.close()
+    assert [message and message[2][0] for message in taken] == [6, None]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +64,7 @@ def test_what_is_taken_makes_room():
     ],
 )
 def test_runs_are_told_apart(heard, places):
-    order = Order()
+    order = RunOrder()
     steps = [(topic, text[0], int(text[1:])) for topic, _, text in (part.partition(":") for part in heard.split())]
     assert [order.place(topic, run, first, first + 1) for topic, run, first in steps] == places.split()
 
@@ -84,7 +80,7 @@ def turned(tmp_path_factory):
     learning = {"events": ["revolution 9: freeze"]}
     harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
     with Source(bag) as source:
-        types = {topic: kind.type for topic, kind in source.topics.items() if drawn(kind.type)}
+        types = {topic: kind.type for topic, kind in source.topics.items() if is_drawn(kind.type)}
         return bag, [(topic, types[topic], data) for topic, _, data in source.messages(set(types))], types
 
 
@@ -202,14 +198,10 @@ def offline():
 @contextlib.contextmanager
 def watching(domain, folder, *options):
     """A bridge as a process of its own, which saves; killed at the end if it has not ended by itself."""
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_LOG_DIR": str(folder),
-    }
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder)}
     command = [sys.executable, "-m", "lathe_rc", "view", "--live", "--json", "-o", folder / "live.rrd", *options]
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
         try:
             yield process
         finally:

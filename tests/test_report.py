@@ -14,12 +14,12 @@ from cells import scenario
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer as McapWriter
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
 from lathe_rc import __version__, harness, messages, part, resources
-from lathe_rc.bag import provenance, reader
+from lathe_rc.bag import provenance
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.budget import changing
 from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
@@ -33,67 +33,65 @@ from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS, Host
 from lathe_rc.view.report_series import Envelope, MeanRows
-from lathe_rc.view.report_verdict import judged
+from lathe_rc.view.report_verdict import assess
 
 HOSTILE = "<script>alert(1)</script>$x_{$\u202e\x07"
 
 
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory):
-    """A bag of six revolutions with an event, its recording, and its page."""
+    """A run with an event, a tolerance and a feed: its bag, result and page, and the numbers that the page has."""
     folder = tmp_path_factory.mktemp("report")
-    nodes = {"spindle_encoder": {"revolutions": 6.2}, "learning_controller": {"events": ["revolution 4: freeze"]}}
-    harness.run(scenario(**nodes), bag=folder / "bag")
+    cell = scenario(
+        spindle_encoder={"revolutions": 11.2},
+        learning_controller={"events": ["revolution 9: freeze"]},
+        tool={"tolerance": 2e-6, "feed": 1e-4, "nose_radius": 0.8e-3},
+    )
+    result = harness.run(cell, bag=folder / "bag")
     done = CliRunner().invoke(report, [str(folder / "bag"), "-o", str(folder / "page.html")])
     assert done.exit_code == 0, done.output
-    return folder / "bag", reader.read_bag(folder / "bag"), (folder / "page.html").read_text(encoding="utf-8")
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    return SimpleNamespace(bag=folder / "bag", result=result, page=page, shown=ShownPage(page))
 
 
 class TestPage:
     def test_tells_the_numbers_of_the_first_best_and_last_revolution(self, turned):
-        _, recording, page = turned
-        found = part.measured(recording)
-        cells = ShownPage(page).cells
+        found = turned.result.part
         best = int(np.argmin(found.form.rms))
+        rows = {row[0]: row[1:] for row in turned.shown.rows("Result")}
         for k, name in ((0, "first"), (best, "best"), (found.form.rms.size - 1, "last")):
-            told = part.numbers(found, k)
-            row = cells[cells.index(str(k + 1)) :][:11]
-            assert row[0] == str(k + 1)
-            assert name in row[1]
-            assert row[2:6] == [f"{told[key]:.4g}" for key in ("rms", "max", "peak_to_valley", "ront")]
-            cells = cells[cells.index(str(k + 1)) + 1 :] if k else cells
+            numbers = part.numbers(found, k)
+            label, *values = rows[str(k + 1)][:5]
+            assert name in label
+            assert values == [f"{numbers[key]:.4g}" for key in ("rms", "max", "peak_to_valley", "ront")]
 
     def test_counts_every_topic(self, turned):
-        _, recording, page = turned
-        cells = ShownPage(page).cells
+        rows = {row[0]: row[2:4] for row in turned.shown.rows("Topics")}
+        recording = turned.result.recording
         for topic, signals in recording.dense.items():
             samples = next(iter(signals.values())).size
-            row = cells[cells.index(topic) :][:4]
-            assert row[2:] == [str(-(-samples // 64)), str(samples)]
-        assert cells[cells.index("/coarse/learning") + 2] == str(len(recording.sparse["/coarse/learning"].stamps))
+            assert rows[topic] == [str(-(-samples // 64)), str(samples)]
+        assert rows["/coarse/learning"][0] == str(len(recording.sparse["/coarse/learning"].stamps))
 
-    def test_needs_nothing_else(self, turned):
-        page = ShownPage(turned[2])
+    def test_needs_nothing_else_and_runs_its_own_two_scripts_alone(self, turned):
+        page = turned.shown
         assert all(link.startswith("data:") or link.removeprefix("#") in page.ids for link in page.links)
-        body = turned[2][: turned[2].index("<script")]
+        body = turned.page[: turned.page.index("<script")]
         assert not re.search(r"https?:|@import|url\(", re.sub(r"base64,[^\"]+", "", body))
         assert page.policy.startswith("default-src 'none'; ")
-        assert len(turned[2].encode()) < 3_000_000
-
-    def test_runs_its_own_two_scripts_and_no_other(self, turned):
-        page = ShownPage(turned[2])
         assert "unsafe" not in page.policy.partition("script-src")[2]
         assert page.may_run() == [charts.library(), *page.scripts[2:]]
         assert len(page.scripts) == 3  # the first is data
+        assert len(turned.page.encode()) < 3_000_000
 
     def test_figures_to_enlarge_have_the_numbers_of_the_pictures(self, turned):
         """Each follows the schema of its language; the curve of the form error is that of the recording."""
-        specs = {name: spec for name, choices in ShownPage(turned[2]).specs.items() for spec in choices.values()}
-        assert len(specs) == 6  # the polar figure has two
+        specs = {name: spec for name, choices in turned.shown.specs.items() for spec in choices.values()}
+        assert len(specs) == 8  # the polar figure and that of the surface have two
         for spec in specs.values():
-            alt.Chart.from_dict(spec)
+            alt.Chart.from_dict(of_two_rows(spec))
             assert spec["usermeta"]["box"]
-        found = part.measured(turned[1])
+        found = turned.result.part
         curve = next(spec for spec in specs.values() if spec["encoding"]["x"].get("title") == "revolution or cycle")
         for label, values in (("form error, RMS", found.form.rms), ("form error, largest", found.form.largest)):
             rows = [row for row in curve["data"]["values"] if row["l"] == label]
@@ -101,9 +99,9 @@ class TestPage:
         field = specs["figure-0-0"]["data"]["values"]
         assert_allclose(field[-256:], found.profile[-1].reshape(256, 16).mean(axis=-1) * 1e6, rtol=1e-3, atol=1e-9)
 
-    def test_figures_are_whole_svg_without_links(self, turned):
-        images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned[2])
-        assert len(images) == 5  # two polar ones, spectrum, convergence, speed; the map is a JPEG
+    def test_pictures_are_whole_svg_without_links(self, turned):
+        images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned.page)
+        assert len(images) == 6  # two polar ones, spectrum, convergence, speed, surface; maps are JPEG
         for image in images:
             root = ET.fromstring(base64.b64decode(image))  # noqa: S314 - made here
             assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -111,92 +109,91 @@ class TestPage:
             assert all(link.startswith(("#", "data:image/png")) for link in links)
 
     def test_names_its_pages_and_the_command_at_every_figure_and_table(self, turned):
-        bag, _, page = turned
-        assert page.count(f"lathe report {bag} -o {bag.parent / 'page.html'}") >= page.count("<figure>") + page.count(
-            "<table>"
-        )
+        page, command = turned.page, f"lathe report {turned.bag} -o {turned.bag.parent / 'page.html'}"
+        assert page.count(command) >= page.count("<figure>") + page.count("<table>")
         assert page.count("docs/metrology.md") >= 5
 
-    def test_says_what_was_not_recorded(self, turned):
-        assert "nothing can be said of lateness and latency" in ShownPage(turned[2]).text
-
-    def test_tells_scenario_and_versions(self, turned):
-        text = ShownPage(turned[2]).text
-        assert "revolutions: 6.2" in text
+    def test_tells_scenario_versions_events_and_what_was_not_recorded(self, turned):
+        text = turned.shown.text
+        assert "revolutions: 11.2" in text
         assert f"lathe_rc{__version__}" in text
         assert "base64" not in text  # no files here
+        assert "nothing can be said of lateness and latency" in text
+        index = turned.result.recording.sparse["/learning_controller/events"].values["sample_index"][0]
+        event = ["/learning_controller/events", str(index), f"{index / 64000:.4g}", "freeze"]
+        assert event in turned.shown.rows("Topics")
 
-    def test_lists_events(self, turned):
-        cells = ShownPage(turned[2]).cells
-        index = turned[1].sparse["/learning_controller/events"].values["sample_index"][0]
-        place = cells.index("freeze")
-        assert cells[place - 3 : place] == ["/learning_controller/events", str(index), f"{index / 64000:.4g}"]
+    def test_says_first_whether_the_part_is_in_tolerance(self, turned):
+        text = turned.shown.text
+        verdict = re.sub("^i", "I", turned.result.verdict.told()) + "."
+        assert verdict.startswith("In tolerance (±2 µm)")
+        assert text.index(verdict) < text.index("Nothing was lost") < text.index("Result")
 
-    def test_is_the_same_every_time(self, turned):
-        bag, _, page = turned
-        reporting.write_report(bag, bag.parent / "page.html")
-        assert (bag.parent / "page.html").read_text(encoding="utf-8") == page
+    def test_has_the_surface_along_the_part_as_the_whole_run_has_it(self, turned):
+        last, surface = gather(turned.bag).forms[0].surface, turned.result.surface
+        assert_allclose(last.surface, surface.surface, rtol=0, atol=1e-15)
+        assert_allclose(last.height, surface.height, rtol=0, atol=1e-15)
+        assert "Along the part, last 8 revolutions at 100 µm/rev: Ra " in turned.shown.text
+
+    def test_is_the_same_every_time(self, turned, tmp_path):
+        again = tmp_path / "page.html"
+        reporting.write_report(turned.bag, again)
+        assert again.read_text(encoding="utf-8").replace(str(again), str(turned.bag.parent / again.name)) == turned.page
+
+
+def of_two_rows(spec):
+    """A figure with two rows of each data set: a schema takes long to skip the others."""
+    if isinstance(spec, dict):
+        return {k: v[:2] if k == "values" else of_two_rows(v) for k, v in spec.items()}
+    return [of_two_rows(each) for each in spec] if isinstance(spec, list) else spec
 
 
 class TestVerdict:
     """The head of the page."""
 
-    def told(self, cell, place):
-        harness.run(cell, bag=place / "bag")
-        found = gather(place / "bag")
-        return judged(found, reporting.losses(found), None)
+    @pytest.fixture
+    def head(self, tmp_path):
+        def of(cell):
+            harness.run(cell, bag=tmp_path / "bag")
+            gathered = gather(tmp_path / "bag")
+            return assess(gathered, reporting.losses(gathered), None)
 
-    def test_says_first_whether_the_part_is_in_tolerance(self, tmp_path):
-        cell = scenario(spindle_encoder={"revolutions": 6.2}, tool={"tolerance": 2e-6})
-        told = self.told(cell, tmp_path)
-        assert told.verdict.text == re.sub("^i", "I", harness.run(cell).verdict.told()) + "."
-        assert (told.verdict.mood, told.wrong) == ("good", [])
-        page = tmp_path / "page.html"
-        reporting.write_report(tmp_path / "bag", page)
-        text = ShownPage(page.read_text(encoding="utf-8")).text
-        assert text.index("In tolerance (±2 µm)") < text.index("Nothing was lost") < text.index("Result")
+        return of
 
-    def test_says_that_learning_is_not_over_and_when_it_would_be(self, tmp_path):
+    def test_says_that_learning_is_not_over_and_when_it_would_be(self, head):
         """With a small gain, each revolution is better than the one before."""
-        slow = scenario(
-            spindle_encoder={"revolutions": 12.2},
-            learning_controller={"learning_gain": 0.2},
-            tool={"tolerance": 1e-9},
+        told = head(
+            scenario(
+                spindle_encoder={"revolutions": 8.2},
+                learning_controller={"learning_gain": 0.2},
+                tool={"tolerance": 1e-9},
+            )
         )
-        told = self.told(slow, tmp_path)
         assert told.verdict.mood == "bad"
         assert re.search(r"falls by [\d.]+% a revolution; in tolerance after some \d+ more", told.limits[0].text)
         assert "repeats from revolution to revolution, most at 2 UPR" in told.limits[1].text
 
-    def test_noise_changes_from_revolution_to_revolution(self, tmp_path):
-        noisy = scenario(
-            spindle_encoder={"revolutions": 24.2}, electrodynamic_actuator={"noise_rms": 1e-6}, tool={"tolerance": 1e-6}
-        )
-        told = self.told(noisy, tmp_path)
+    def test_noise_changes_from_revolution_to_revolution(self, head):
+        noise = {"noise_rms": 1e-6}
+        told = head(scenario(spindle_encoder={"revolutions": 24.2}, electrodynamic_actuator=noise))
         assert re.search(r"^\d+% of .* changes from revolution to revolution: noise\.$", told.limits[0].text)
 
     @pytest.mark.parametrize(
         ("name", "causes"),
-        [
-            ("two_channel", ["feed"]),
-            ("vibration", ["vibration"]),
-            ("robust", ["noise", "quantisation"]),
-        ],
+        [("two_channel", ["feed"]), ("vibration", ["vibration"]), ("robust", ["noise", "quantisation"])],
     )
     def test_names_no_cause_that_the_scenario_does_not_contain(self, name, causes):
         cell = load(resources.find(Path(f"{name}.yaml")))
         assert changing(provenance.values_of({provenance.SCENARIO: cell.to_yaml()})) == causes
 
-    def test_says_who_came_to_a_limit(self, tmp_path):
-        limited = scenario(electrodynamic_actuator={"command_velocity": 5e-3})
-        told = self.told(limited, tmp_path)
+    def test_names_the_node_at_the_limits_of_its_command(self, head):
+        told = head(scenario(electrodynamic_actuator={"command_velocity": 5e-3}))
         assert re.search(r"^electrodynamic_actuator came to the limits of its command, ", told.limits[0].text)
 
-    def test_a_fault_and_what_the_supervisor_did_come_first(self, tmp_path):
+    def test_a_fault_and_what_the_supervisor_did_come_first(self, head):
         """And no word of what learning leaves: the error is the fault's."""
         fault = "electrodynamic_actuator.faults=['revolution 6: coarse/state.measured_position stuck']"
-        supervised = load(resources.find(Path("supervised.yaml")), ["spindle_encoder.revolutions=12", fault])
-        told = self.told(supervised, tmp_path)
+        told = head(load(resources.find(Path("supervised.yaml")), ["spindle_encoder.revolutions=8", fault]))
         assert re.match(
             r"electrodynamic_actuator/events: fault coarse/state.measured_position stuck, at 0.34", told.wrong[0].text
         )
@@ -205,34 +202,22 @@ class TestVerdict:
         assert told.limits == []
 
 
-def test_surface_along_the_part_is_that_of_the_whole_run(tmp_path):
-    feeds = scenario(spindle_encoder={"revolutions": 11.2}, tool={"feed": 1e-4, "nose_radius": 0.8e-3})
-    surface = harness.run(feeds, bag=tmp_path / "bag").surface
-    told = gather(tmp_path / "bag").forms[0].surface
-    assert_allclose(told.surface, surface.surface, rtol=0, atol=1e-15)
-    assert_allclose(told.height, surface.height, rtol=0, atol=1e-15)
-    done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
-    assert done.exit_code == 0, done.output
-    page = ShownPage((tmp_path / "page.html").read_text(encoding="utf-8"))
-    assert "Along the part, last 8 revolutions at 100 µm/rev: Ra " in page.text
-
-
 class TestForm:
-    """The measurement by pieces against that of the whole run."""
+    """The measurement by pieces."""
 
-    @pytest.mark.parametrize("piece", [700, 3840, 65536])
-    def test_equals_that_of_the_whole_run(self, turned, piece):
-        _, recording, _ = turned
-        found = part.measured(recording)
-        form = Form("/encoder", "/tool")
-        samples = recording.dense["/tool"]["error"].size
-        for first in range(0, samples, piece):
-            dense = {
-                topic: {name: array[first : first + piece] for name, array in recording.dense[topic].items()}
-                for topic in ("/encoder", "/tool")
-            }
-            form.chunk(first, dense["/tool"]["error"].size, dense, {})
+    @staticmethod
+    def of(angle, error, pieces=1):
+        form, first = Form("/encoder", "/tool"), 0
+        for part_, errors in zip(np.array_split(angle, pieces), np.array_split(error, pieces), strict=True):
+            form.chunk(first, part_.size, {"/encoder": {"angle_true": part_}, "/tool": {"error": errors}}, {})
+            first += part_.size
         form.finish()
+        return form
+
+    @pytest.mark.parametrize("pieces", [64, 1])
+    def test_equals_that_of_the_whole_run(self, turned, pieces):
+        recording, found = turned.result.recording, turned.result.part
+        form = self.of(recording.dense["/encoder"]["angle_true"], recording.dense["/tool"]["error"], pieces)
         assert form.refused == ""
         assert_allclose(form.rms.curve()[1], found.form.rms, rtol=1e-12)
         assert_allclose(form.largest.curve()[2], found.form.largest, rtol=1e-12)
@@ -243,39 +228,29 @@ class TestForm:
         assert_allclose(form.map.rows()[-1], found.profile[-1].reshape(512, 8).mean(axis=-1), rtol=0, atol=1e-15)
 
     @pytest.mark.parametrize(
-        ("angle", "said"),
+        ("angle", "reason"),
         [
-            (np.array([0.2, 0.1]), "the angle falls"),
-            (np.array([0.0, 1e300]), "more than a third of a turn"),
-            (np.array([1e9, 1e9 + 0.1]), "begins at"),
-            (np.array([0.0, np.nan]), "not finite"),
+            ([0.2, 0.1], "the angle falls"),
+            ([0.0, 1e300], "more than a third of a turn"),
+            ([1e9, 1e9 + 0.1], "begins at"),
+            ([0.0, np.nan], "not finite"),
+            (np.linspace(0.0, 5.0, 2**22 + 1), "longer than"),
         ],
     )
-    def test_refuses_angles_that_would_take_memory_or_make_no_sense(self, angle, said):
-        form = Form("/encoder", "/tool")
-        form.chunk(0, angle.size, {"/encoder": {"angle_true": angle}, "/tool": {"error": np.zeros(angle.size)}}, {})
-        form.finish()
-        assert said in form.refused
+    def test_refuses_angles_that_would_take_memory_or_make_no_sense(self, angle, reason):
+        form = self.of(np.array(angle), np.zeros(len(angle)))
+        assert reason in form.refused
         assert form.first is None
+        assert form._held.size == 0
 
     def test_measures_what_comes_before_a_sample_that_is_not_finite(self):
         """And says that it diverged until then."""
         angle = 2 * np.pi * np.arange(2100) / 200
         error = 1e-6 * 2.0 ** (angle // (2 * np.pi))
         error[2050:] = np.nan
-        form = Form("/encoder", "/tool")
-        form.chunk(0, angle.size, {"/encoder": {"angle_true": angle}, "/tool": {"error": error}}, {})
-        form.finish()
+        form = self.of(angle, error)
         assert form.refused == "samples that are not finite (after revolution 10)"
         assert (form.last.numbers["revolution"], form.growth.diverges, form.growth.since) == (10, True, 2)
-
-    def test_gives_up_a_revolution_that_never_ends(self):
-        form = Form("/encoder", "/tool")
-        for k in range(70):
-            angle = (k * 65536 + np.arange(65536.0)) * 1e-9
-            form.chunk(0, 65536, {"/encoder": {"angle_true": angle}, "/tool": {"error": angle}}, {})
-        assert "longer than" in form.refused
-        assert form._held.size == 0
 
 
 def test_a_fault_leaves_the_colours_of_the_rest_of_the_map():
@@ -332,14 +307,8 @@ def diagnostics(wall, name="/spindle", level=0, message="ready", **values):
 
 
 def master(wall, blocks, lateness="", latency=""):
-    values = {
-        "blocks": blocks,
-        "samples": 64 * blocks,
-        "schedule slipped [s]": 0.0,
-        LATENESS: lateness,
-        LATENCY: latency,
-    }
-    return diagnostics(wall, **{key: str(value) for key, value in values.items()}, **{"lost blocks": "2"})
+    values = {"blocks": str(blocks), "samples": str(64 * blocks), LATENESS: lateness, LATENCY: latency}
+    return diagnostics(wall, **values, **{"schedule slipped [s]": "0.0", "lost blocks": "2"})
 
 
 @given(st.lists(st.floats(0.0, 5000.0), max_size=50))
@@ -347,10 +316,8 @@ def test_durations_are_counted_in_bins_of_a_factor_of_two(seconds):
     found = Durations()
     for value in seconds:
         found.add(value)
-    assert sum(found.counts) == len(seconds)
-    for place, count in enumerate(found.counts):
-        low, high = (0.0 if place == 0 else 2.0 ** (place - 1)), (np.inf if place == 31 else 2.0**place)
-        assert count == sum(low <= int(value * 1e6) < high for value in seconds)
+    edges = [0.0, *2.0 ** np.arange(31), np.inf]  # [µs]
+    assert list(found.counts) == np.histogram([int(value * 1e6) for value in seconds], edges)[0].tolist()
     assert Durations.parse(str(found)).counts == found.counts
 
 
@@ -389,7 +356,7 @@ class TestHost:
         assert host.errors == ["/spindle: broken"]
         state = messages.store().types[messages.CELL_STATE]
         for k in range(200):
-            host.add(messages.CELL_STATE, messages.encode(messages.CELL_STATE, state("run", 3, k, "no tool", 0, [])))
+            host.add(messages.CELL_STATE, messages.encode(messages.CELL_STATE, state("run", 3, k, "no tool", 0, [], 0)))
             host.add(DIAGNOSTICS, diagnostics(1.0, name=f"/n{k}"))
         assert host.errors[1] == "the cell failed at sample 0: no tool"
         assert len(host.errors) <= 50
@@ -404,10 +371,8 @@ class TestHost:
         assert host.unreadable >= 4
 
 
-@pytest.fixture(scope="module")
-def hostile(tmp_path_factory):
-    """A bag whose every text is an attack, with samples as absurd as they come, and no end."""
-    path = tmp_path_factory.mktemp("hostile") / "bag"
+def write_hostile_bag(path):
+    """Write a bag whose every text is an attack, with samples as absurd as they come, and no end."""
     texts = {"lathe_rc.run_id": "x", "lathe_rc.scenario": HOSTILE * 20_000, HOSTILE: HOSTILE * 100}
     writer = BagWriter(path, compression="none", chunk_size=2**16, about=texts)
     types = messages.store().types
@@ -442,22 +407,11 @@ def hostile(tmp_path_factory):
         )
     writer.write("/diagnostics", 2 * 10**9, b"\xff" * 64)
     writer.close()
-    return path
 
 
-def test_a_bag_that_is_of_no_cell_is_called_so(tmp_path):
-    file = tmp_path / "foreign.mcap"
-    with file.open("wb") as stream:
-        foreign = McapWriter(stream)
-        foreign.start()
-        foreign.finish()
-    done = CliRunner().invoke(report, [str(file), "-o", str(tmp_path / "page.html")])
-    assert done.exit_code == 0, done.output
-    assert done.stderr == "incomplete recording: the bag has no encoder and no tool\n"
-
-
-def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
-    done = CliRunner().invoke(report, [str(hostile), "-o", str(tmp_path / "page.html")])
+def test_a_hostile_bag_gives_a_harmless_page(tmp_path):
+    write_hostile_bag(tmp_path / "bag")
+    done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
     assert done.exit_code == 0, done.output
     assert "incomplete recording" in done.stderr
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -470,7 +424,7 @@ def test_a_hostile_bag_gives_a_harmless_page(hostile, tmp_path):
     assert "\x07" not in text
     assert len(text.encode()) < 3_000_000
     assert page.text.index("What went wrong") < page.text.index("No tolerance to judge by") < page.text.index("Result")
-    assert "(540000 characters)" in page.text or "characters)" in page.text
+    assert "characters)" in page.text
     assert "the recording was cut off" in page.text
     assert "1 messages of host topics cannot be decoded" in page.text
 
@@ -479,42 +433,37 @@ def test_a_bag_of_something_else_has_a_page_too(tmp_path):
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
     writer.add_topic("/chatter", messages.JOINTS, offered_qos(10, "volatile"))
     writer.close()
-    reporting.write_report(tmp_path / "bag", tmp_path / "page.html")
+    done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
+    assert (done.exit_code, done.stderr) == (0, "incomplete recording: the bag has no encoder and no tool\n")
     assert "the bag has no encoder and no tool" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-def test_a_gap_is_told_and_what_came_before_is_shown(turned, tmp_path):
+def test_a_gap_stops_the_reading_and_is_reported(turned, tmp_path):
     """The same recording without one block of the tool, in the fifth revolution."""
-    from lathe_rc.bag.reading.source import Source
-
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
-    with Source(turned[0]) as source:
+    with Source(turned.bag) as source:
         for topic, found in source.topics.items():
             writer.add_topic(topic, found.type, offered_qos(10, "volatile"))
-        left_out = 300
+        blocks = 0
         for topic, log_ns, data in source.messages():
-            left_out -= topic == "/tool"
-            if topic != "/tool" or left_out != 0:
+            blocks += topic == "/tool"
+            if topic != "/tool" or blocks != 300:
                 writer.write(topic, log_ns, data)
     writer.close()
     told = gather(tmp_path / "bag")
     assert "/tool goes from sample 19136 to 19200" in told.stopped
     assert not told.complete
-    page = reporting.render(told, "bag", "lathe report")
-    assert "reading stopped: " in page
+    assert any(text.startswith("reading stopped: ") for text in reporting.losses(told))
 
 
-@pytest.mark.parametrize(
-    ("name", "said"), [("page.txt", "ends in .html"), ("no/page.html", "no such folder"), ("dir.html", "is a folder")]
-)
-def test_places_that_are_none_are_refused(turned, tmp_path, name, said):
+def test_places_and_bags_that_are_none_are_refused_and_leave_no_page(turned, tmp_path):
     (tmp_path / "dir.html").mkdir()
-    with pytest.raises(InputError, match=said):
-        reporting.write_report(turned[0], tmp_path / name)
-
-
-def test_what_is_no_bag_is_refused_and_leaves_no_page(tmp_path):
-    (tmp_path / "x").mkdir()
-    with pytest.raises(InputError):
-        reporting.write_report(tmp_path / "x", tmp_path / "page.html")
-    assert not (tmp_path / "page.html").exists()
+    for bag, name, reason in (
+        (turned.bag, "page.txt", "ends in .html"),
+        (turned.bag, "no/page.html", "no such folder"),
+        (turned.bag, "dir.html", "is a folder"),
+        (tmp_path / "dir.html", "page.html", "not a readable bag"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            reporting.write_report(bag, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["dir.html"]

@@ -51,16 +51,16 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
     """
     with Source(path, partial=True) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
-        types = {topic: said.type for topic, said in source.topics.items()}
+        types = {topic: entry.type for topic, entry in source.topics.items()}
         topics: dict[str, dict[str, Any]] = {
             topic: {
-                "type": said.type,
-                "messages": said.count,
-                "rate_hz": (said.count - 1) / span if span > 0 and said.count > 1 else None,
+                "type": entry.type,
+                "messages": entry.count,
+                "rate_hz": (entry.count - 1) / span if span > 0 and entry.count > 1 else None,
             }
-            for topic, said in sorted(source.topics.items())
+            for topic, entry in sorted(source.topics.items())
         }
-        told: dict[str, Any] = {
+        summary: dict[str, Any] = {
             "bag": str(path),
             "start_s": source.first_ns * 1e-9,
             "start": _date(source.first_ns),
@@ -72,30 +72,30 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
         }
-    told["error_um"] = _metrics(path, types) if metrics and not source.damage else None
+    summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
     if as_json:
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(summary))
         ctx.exit(_LOSSY if source.damage else 0)
     console = tables.console()
     table = tables.table("topic", "type", "messages", "rate [Hz]", left=2, no_wrap=True)
-    for topic, said in topics.items():
-        rate = f"{said['rate_hz']:.4g}" if said["rate_hz"] else ""
-        table.add_row(topic, said["type"].rpartition("/")[2], str(said["messages"]), rate)
+    for topic, entry in topics.items():
+        rate = f"{entry['rate_hz']:.4g}" if entry["rate_hz"] else ""
+        table.add_row(topic, entry["type"].rpartition("/")[2], str(entry["messages"]), rate)
     console.print(table)
     for each in source.unread:
         console.print(f"not read: {each}")
-    for what in (*told["contradictions"], *told["damage"]):
+    for what in (*summary["contradictions"], *summary["damage"]):
         click.echo(what, err=True)
-    for what in told["foreign"]:
+    for what in summary["foreign"]:
         console.print(what)
-    console.print(f"span: {span:.6g} s from {told['start'] or format(told['start_s'], '.6g') + ' s'} on")
-    if told["error_um"]:
-        first, last = told["error_um"]["first"], told["error_um"]["last"]
+    console.print(f"span: {span:.6g} s from {summary['start'] or format(summary['start_s'], '.6g') + ' s'} on")
+    if summary["error_um"]:
+        first, last = summary["error_um"]["first"], summary["error_um"]["last"]
         console.print(
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
-    _print_about(console, told["about"])
+    _print_about(console, summary["about"])
     ctx.exit(_LOSSY if source.damage else 0)
 
 
@@ -133,7 +133,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     does not hold get a line each.
     """
     found = check_bag(path)
-    told = {
+    summary = {
         "bag": str(path),
         "clean": not found.exit_code,
         "wrong": found.wrong,
@@ -146,7 +146,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "digest": found.digests,
     }
     if as_json:
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(summary))
     else:
         for what in (*found.wrong, *found.lost, *found.foreign, *(f"not read: {each}" for each in found.unread)):
             click.echo(what)
@@ -165,7 +165,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
     """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
     target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
     found = recover_bag(path, target)
-    told = {
+    summary = {
         "bag": str(path),
         "output": str(target),
         "saved": found.saved,
@@ -175,7 +175,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         "damage": list(found.damage),
     }
     if as_json:
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(summary))
     else:
         for what in found.damage:
             click.echo(what)

@@ -40,7 +40,7 @@ def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: s
     else:
         loop = hysteresis_fit.read_csv(measured)
     found = hysteresis_fit.identify(loop, stroke)
-    told = {
+    summary = {
         "identified_proportional": found.model.proportional,
         "identified_thresholds": found.model.thresholds.tolist(),
         "identified_weights": found.model.weights.tolist(),
@@ -48,14 +48,14 @@ def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: s
         "residual": found.residual,
     }
     if as_json:
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(summary))
         return
     out = console()
     out.print(f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:")
     for name in ("identified_proportional", "identified_thresholds", "identified_weights"):
-        values = np.atleast_1d(told[name])
+        values = np.atleast_1d(summary[name])
         text = ", ".join(f"{value:.6g}" for value in values)
-        out.print(f"{name}: {text if np.ndim(told[name]) == 0 else f'[{text}]'}")
+        out.print(f"{name}: {text if np.ndim(summary[name]) == 0 else f'[{text}]'}")
 
 
 def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
@@ -112,24 +112,24 @@ def channel(
     """
     given = reduced_order.read_csv(measured)
     model = reduced_order.fit(given, zeros=zeros, poles=poles, integrator=integrator, oscillating=not lags)
-    told: dict[str, Any] = {"model": _coefficients(model.transfer) | {"rms": model.rms}}
+    summary: dict[str, Any] = {"model": _coefficients(model.transfer) | {"rms": model.rms}}
     inverse: reduced_order.Fit | None = None
     missing = []
     try:
         inverse = reduced_order.fit_inverse(model.transfer, given, least_lag=lag)
-        told["inverse"] = _coefficients(inverse.transfer) | {"rms": inverse.rms}
+        summary["inverse"] = _coefficients(inverse.transfer) | {"rms": inverse.rms}
     except InputError as error:
         missing.append(str(error))
     try:
-        told |= _tuned(model.transfer, np.radians(phase_margin), gain_margin, delay)
+        summary |= _tuned(model.transfer, np.radians(phase_margin), gain_margin, delay)
     except InputError as error:
         missing.append(str(error))
     _draw(figure, model, inverse)
-    told["figure"] = str(figure)
+    summary["figure"] = str(figure)
     if as_json:
-        click.echo(json.dumps({"inverse": None, "pid": None, "loop": None, **told, "missing": missing}))
+        click.echo(json.dumps({"inverse": None, "pid": None, "loop": None, **summary, "missing": missing}))
     else:
-        _show(told, delay)
+        _show(summary, delay)
     if missing:
         raise LatheError(f"{measured}: {'; '.join(missing)}")
 
@@ -165,21 +165,21 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
     }
 
 
-def _show(told: Mapping[str, Any], delay: float) -> None:
+def _show(summary: Mapping[str, Any], delay: float) -> None:
     """Print all that has been found."""
     out = console()
 
     for name in ("model", "inverse"):
-        if found := told.get(name):
+        if found := summary.get(name):
             top, bottom = (", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator"))
             out.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}")
-    if "pid" in told:
-        loop = told["loop"]
-        out.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in told["pid"].items()))
+    if "pid" in summary:
+        loop = summary["loop"]
+        out.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in summary["pid"].items()))
         margin = "any" if loop["gain_margin"] is None else f"{loop['gain_margin']:.3g}"
         out.print(
             f"loop     rise {loop['rise_s']:.3g} s, settling {loop['settling_s']:.3g} s, "
             f"overshoot {loop['overshoot_pct']:.3g} %, margins {margin} and {loop['phase_margin_deg']:.3g}° "
             f"with a delay of {delay * 1e3:g} ms"
         )
-    out.print(f"figure:  {told['figure']}")
+    out.print(f"figure:  {summary['figure']}")

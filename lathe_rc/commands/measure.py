@@ -22,17 +22,17 @@ _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra"
 
 
 def table(found: Measurement, revolutions: list[int]) -> Table:
-    """One line a revolution, in µm."""
+    """Table of revolutions, in µm."""
     lines = tables.table(*_COLUMNS, title="form error and roundness [µm]")
     for revolution in revolutions:
-        told = part.numbers(found, revolution)
-        upr = told["largest_upr"]
+        numbers = part.numbers(found, revolution)
+        upr = numbers["largest_upr"]
         lines.add_row(
-            str(told["revolution"]),
-            *(f"{told[name]:#.4g}" for name in ("rms", "max", "peak_to_valley", "ront")),
-            f"{np.hypot(*told['centre']):.3g}",
+            str(numbers["revolution"]),
+            *(f"{numbers[name]:#.4g}" for name in ("rms", "max", "peak_to_valley", "ront")),
+            f"{np.hypot(*numbers['centre']):.3g}",
             f"{upr['upr']}: {upr['amplitude']:.3g}",
-            f"{told['ra']:.3g}",
+            f"{numbers['ra']:.3g}",
         )
     return lines
 
@@ -111,7 +111,7 @@ def measure(
     console = Console()
     console.print(table(found, chosen))
     if surface:
-        told = part.along_in_words(surface) if isinstance(surface, Lay) else surface
-        console.print(told, highlight=False, soft_wrap=True)
+        text = part.along_in_words(surface) if isinstance(surface, Lay) else surface
+        console.print(text, highlight=False, soft_wrap=True)
     if profile:
         console.print(f"profile: {profile}", highlight=False, soft_wrap=True)

@@ -16,10 +16,10 @@ _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help
 
 
 class _PassingThrough(click.Command):
-    """Hands on what it does not know; asks for help are its own where they come first."""
+    """A command that passes on unknown options; a first -h or --help is its own."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """See `click.Command`."""
+        """Show the help if it comes first; pass on everything else."""
         if args[:1] in (["-h"], ["--help"]):
             click.echo(ctx.get_help())
             ctx.exit()

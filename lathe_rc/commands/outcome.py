@@ -20,17 +20,17 @@ _ALIKE = 4  # of them that follow one another: those in between are left out
 
 
 def table(result: harness.Result) -> Table:
-    """The part in its first and last revolution."""
+    """Table of the part in its first and last revolution."""
     columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
     found = tables.table("", *columns.values(), left=1)
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
-        told = part.numbers(result.part, revolution)
-        found.add_row(label, *(f"{told[name]:#.4g}" for name in columns))
+        numbers = part.numbers(result.part, revolution)
+        found.add_row(label, *(f"{numbers[name]:#.4g}" for name in columns))
     return found
 
 
 def _events(result: harness.Result) -> Table:
-    """The event log, as far as there is room; of equal ones that follow one another the first and the last."""
+    """Table of the event log, as far as there is room; of a row of equal events the first and the last."""
     table = tables.table("time [s]", "topic", "what happened", left=3, overflow="fold")
     table.columns[0].justify = "right"
     step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
@@ -61,16 +61,18 @@ def facts(result: harness.Result) -> list[str]:
 
 def _margins(result: harness.Result) -> list[str]:
     """The stability margin of each learning controller, in one line."""
-    told = [f"{name} {'not known' if margin is None else f'{margin:.4g}'}" for name, margin in result.margins.items()]
-    return [f"stability margin: {', '.join(told)}"] if told else []
+    margins = [
+        f"{name} {'not known' if margin is None else f'{margin:.4g}'}" for name, margin in result.margins.items()
+    ]
+    return [f"stability margin: {', '.join(margins)}"] if margins else []
 
 
-def _lateness(told: Lateness) -> list[str]:
-    """How well the pace was kept, in words."""
-    within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in told.within.items())
+def _lateness(lateness: Lateness) -> list[str]:
+    """Lateness of the blocks, in words."""
+    within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in lateness.within.items())
     return [
-        f"{told.late} of {told.blocks} blocks late; the schedule slipped by {told.slipped:.3g} s",
-        f"lateness: {within}, worst {told.worst * 1e3:.3g} ms",
+        f"{lateness.late} of {lateness.blocks} blocks late; the schedule slipped by {lateness.slipped:.3g} s",
+        f"lateness: {within}, worst {lateness.worst * 1e3:.3g} ms",
     ]
 
 
@@ -86,15 +88,15 @@ def show_budget(found: Budget) -> None:
         console.print(f"not switched off: {name}: {why}", highlight=False)
 
 
-def show(result: harness.Result, further: Mapping[str, Path], *, told: str = "", budget: Budget | None = None) -> None:
-    """Print a run: its part, what happened, how it went, what its error is made of, and the files that it left."""
+def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "", budget: Budget | None = None) -> None:
+    """Print a run: its part, events, facts, budget and files; ``note``: one more fact."""
     console = Console()
     if result.errors.rms.size:
         console.print(table(result))
         plot.show(result, console)
     if result.event_log:
         console.print(_events(result))
-    for fact in [*facts(result), *filter(None, [told])]:
+    for fact in [*facts(result), *filter(None, [note])]:
         console.print(fact, highlight=False)
     if budget is not None:
         show_budget(budget)

@@ -17,7 +17,7 @@ _STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}
 
 
 def show(result: harness.Result, console: Console) -> None:
-    """Draw it if somebody looks: in no pipe and no file, and in no terminal that cannot show it."""
+    """Draw the plot in a terminal that can show it; not in a pipe or a file."""
     seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
     if seen and (text := drawn(result, console.width)):
         console.print(text)
@@ -43,15 +43,15 @@ def drawn(result: harness.Result, width: int) -> Text | None:
     if result.verdict:
         limit = result.verdict.tolerance * 1e6
         curves.insert(0, (f"tolerance {limit:.4g} µm", "orange+", np.full(rms.size, limit)))
-    plotext.clear_figure()
+    plotext.clear_figure()  # its figure is global
     plotext.limit_size(False, False)  # noqa: FBT003 - so it is called
     plotext.plot_size(width, _HEIGHT)
     for part in (plotext.canvas_color, plotext.axes_color, plotext.ticks_color):
         part("default")
     named = Text("form error [µm] by revolution: ")
     for label, colour, values in curves:
-        told = [math.log10(values[group].max()) for group in groups]
-        plotext.plot(revolution, told, marker="braille", color=colour)
+        decades = [math.log10(values[group].max()) for group in groups]
+        plotext.plot(revolution, decades, marker="braille", color=colour)
         named.append(f" ━ {label}", style=_STYLES[colour])
     ticks = _decades(min(values.min() for *_, values in curves), max(values.max() for *_, values in curves))
     plotext.ylim(ticks[0], ticks[-1])

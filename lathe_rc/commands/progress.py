@@ -23,13 +23,13 @@ _INTERRUPTED = 130  # exit code
 
 
 class Watch:
-    """Shows a run's progress on the error stream."""
+    """Progress of a run on the error stream."""
 
     def __init__(self, console: Console) -> None:
         self._step = 0.0
         self._start = time.monotonic()
         self._due = {"progress": 0.0, "cycle": 0.0}
-        self._silent = ""  # who was said to be
+        self._silent = ""  # member reported as silent
         self._compiles = False
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -108,7 +108,7 @@ def watched_budget(scenario: Scenario) -> Budget:
 
 
 class SweepWatch:
-    """Shows the progress of a sweep or a tuning: cells, how many a second, time left, what came of them.
+    """Progress of a sweep or a tuning: cells, cells a second, time left, outcomes.
 
     Ctrl-C ends the command with a line that says what is kept.
 
@@ -120,7 +120,7 @@ class SweepWatch:
 
     def __init__(self, place: Path, *, trials: int = 0, quiet: bool = False) -> None:
         self._place, self._trials, self._quiet = place, trials, quiet
-        self._cells = self._done = self._told = 0
+        self._cells = self._done = self._trials_done = 0
         self._statuses: Counter[str] = Counter()
         self._console = Console(stderr=True, highlight=False, quiet=quiet)
         self._bar = Progress(
@@ -144,7 +144,11 @@ class SweepWatch:
     def __exit__(self, kind: type[BaseException] | None, _error: object, _traceback: TracebackType | None) -> None:
         self._bar.stop()
         if kind is KeyboardInterrupt:
-            kept = f"{self._told} of {self._trials} trials" if self._trials else f"{self._done} of {self._cells} cells"
+            kept = (
+                f"{self._trials_done} of {self._trials} trials"
+                if self._trials
+                else f"{self._done} of {self._cells} cells"
+            )
             click.echo(f"lathe: stopped; {kept} are in {self._place}: the same command goes on", err=True)
             raise click.exceptions.Exit(_INTERRUPTED) from None
 
@@ -153,7 +157,7 @@ class SweepWatch:
         update = self._bar.update
         if event["event"] == "began":
             self._cells, self._done = event["cells"], event["computed"]
-            self._told = event.get("trials", 0)
+            self._trials_done = event.get("trials", 0)
             there = f", {self._done} of them are there already" if self._done else ""
             self._console.print(f"{self._cells} cells{there}")
             update(self._task, total=self._cells, completed=self._done)
@@ -166,17 +170,17 @@ class SweepWatch:
             update(self._task, description="another program computes the last trials")
         elif event["event"] == "told":
             tuning = event["tuning"]
-            self._told = len(tuning.trials)
+            self._trials_done = len(tuning.trials)
             if best := tuning.best:
-                told = ", ".join(tuning.goals_shown(best).values())
-                update(self._task, description=f"best: {told} (trial {best.number})")
+                goals = ", ".join(tuning.goals_shown(best).values())
+                update(self._task, description=f"best: {goals} (trial {best.number})")
         else:
             self._statuses += event["statuses"]
             self._done += event["statuses"].total()
             others = [f"{count} {status}" for status, count in self._statuses.most_common() if status != "done"]
             speed = self._bar.tasks[0].speed
-            told = f"{speed:.3g} cells/s" if speed else ""
-            update(self._task, completed=self._done, statuses=", ".join(others), speed=told)
+            rate = f"{speed:.3g} cells/s" if speed else ""
+            update(self._task, completed=self._done, statuses=", ".join(others), speed=rate)
 
 
 TROUBLE: dict[str, Callable[[harness.Event], str]] = {
@@ -194,4 +198,4 @@ TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     "warning": lambda event: f"warning: {event['message']}",
     "behind": lambda event: str(event["message"]),
     "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
-}  #: what is said of an event in any case
+}  #: lines for events that are printed in any case

@@ -9,18 +9,16 @@ from lathe_rc.commands import options
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, help="HTML file"
-)
+@options.bag
+@click.option("-o", "--output", type=options.PATH, default=Path("report.html"), show_default=True, help="HTML file")
 @options.allow_code
 @click.option("--budget", is_flag=True, help="what the form error is made of, by some ten runs of the bag's scenario")
 def report(bag: Path, output: Path, *, budget: bool) -> None:
     """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""
     from lathe_rc.view import report as reporting
 
-    told = reporting.write_report(bag, output, with_budget=budget)
-    if not told.complete:
-        why = told.stopped or ("" if told.samples else told.missing)
+    gathered = reporting.write_report(bag, output, with_budget=budget)
+    if not gathered.complete:
+        why = gathered.stopped or ("" if gathered.samples else gathered.missing)
         click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")

@@ -59,8 +59,8 @@ def _drive_lines(drive: Identified) -> list[str]:
     return lines
 
 
-def _told(drive: Identified) -> dict[str, Any]:
-    """A drive for JSON, in SI units."""
+def _drive_summary(drive: Identified) -> dict[str, Any]:
+    """Summary of a drive for JSON, in SI units."""
     fit = drive.fit
     return {
         "node": drive.node,
@@ -148,7 +148,7 @@ def resim(
     topics = _topics(topic)
     console = tables.console()
     if write_form:
-        _form(bag, topics, write_form, console, quiet=as_json)
+        _write_form(bag, topics, write_form, console, quiet=as_json)
     if identified and scenario is None and not _has_scenario(bag):
         if overrides or controller or output:
             raise InputError(
@@ -156,7 +156,9 @@ def resim(
             )
         drives, rest = _identified_alone(bag, topics, write_parameters)
         if as_json:
-            click.echo(json.dumps({"bag": str(bag), "drives": [_told(drive) for drive in drives], "asked_for": rest}))
+            click.echo(
+                json.dumps({"bag": str(bag), "drives": [_drive_summary(drive) for drive in drives], "asked_for": rest})
+            )
             return
         _show_drives(console, drives, write_parameters)
         console.print(rest)
@@ -189,7 +191,7 @@ def _summary(found: Resimulation, bag: Path, output: Path | None) -> dict[str, A
         "equal": bool(found.recorded) and not found.different,
         "different": found.different,
         "not_recorded": found.missing,
-        "drives": [_told(drive) for drive in found.drives],
+        "drives": [_drive_summary(drive) for drive in found.drives],
         "simulated_s": found.simulated_s,
         "wall_s": found.wall_s,
         "real_time_factor": found.simulated_s / found.wall_s,
@@ -215,8 +217,8 @@ def _show(console: Console, found: Resimulation, output: Path | None) -> None:
     if found.changed and min(found.rms.size, found.recorded_rms.size):
         console.print(_table(found))
     if found.positions:
-        told = " + ".join(f"{topic} {name}" for topic, name in found.positions)
-        console.print(f"recorded: {told}, against the scenario's form")
+        recorded = " + ".join(f"{topic} {name}" for topic, name in found.positions)
+        console.print(f"recorded: {recorded}, against the scenario's form")
     elif not found.recorded:
         console.print("the recording is not complete: nothing to compare the whole with")
     if found.recorded and not found.different:
@@ -230,7 +232,7 @@ def _show(console: Console, found: Resimulation, output: Path | None) -> None:
         console.print(f"bag: {output}")
 
 
-def _form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
+def _write_form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
     """Write the tool's recorded position by angle."""
     with Source(bag) as source:
         found = identify.form(Recorded(source, topics))

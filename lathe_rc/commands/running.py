@@ -85,9 +85,9 @@ def run(
         click.echo(json.dumps(result.summary() | ({"budget": found.summary()} if found else {})))
     else:
         asks_for_snapshots = loaded.recorder[1].mode != "continuous"
-        told = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
+        note = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
         files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
-        outcome.show(result, files, told=told, budget=found)
+        outcome.show(result, files, note=note, budget=found)
     if require_tolerance and result.verdict and not result.verdict.in_tolerance:
         alike = " with the same --set" if overrides else ""
         hint = "" if found else f"; lathe budget {scenario}{alike} tells why"

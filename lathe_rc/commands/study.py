@@ -108,7 +108,7 @@ class _StudyCommand(click.Command):
 
 
 class _Studies(click.Group):
-    """The studies, ours and those of other packages; refuses an unknown one in one line."""
+    """The studies of lathe_rc and of other packages; an unknown one is refused in one line."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete a name without importing its study, or an option."""
@@ -117,26 +117,30 @@ class _Studies(click.Group):
         return click.Command.shell_complete(self, ctx, incomplete)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """See `click.Group`."""
+        """Return the names of all studies."""
         return list(STUDIES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """See `click.Group`.
+        """Return the command of a study; None if there is none.
 
         Raises:
-            InputError: a study of others cannot be imported, or is none.
+            InputError: a study of another package cannot be imported, or is none.
         """
         return _StudyCommand(cmd_name, STUDIES[cmd_name]) if cmd_name in STUDIES else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """See `click.Group`."""
+        """List the studies with their subjects."""
         with formatter.section("Studies"):
             formatter.write_dl([(name, _summary(name)) for name in STUDIES])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """See `click.Group`."""
+        """Split off the name of a study.
+
+        Raises:
+            InputError: there is no such study.
+        """
         if args[0] not in STUDIES and not args[0].startswith("-") and not ctx.resilient_parsing:
             raise InputError(f"no study {args[0]!r}; {instead(args[0], STUDIES)}, or PACKAGE.MODULE:STUDY")
         return super().resolve_command(ctx, args)

@@ -46,15 +46,15 @@ def sweep() -> None:
 
 
 def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
-    """By target, of ``TARGET=...``."""
+    """Values by target, from texts ``TARGET=VALUE``."""
     found: dict[str, str] = {}
     for text in texts:
-        target, equals, told = (part.strip() for part in text.partition("="))
-        if not (target and equals and told):
+        target, equals, value = (part.strip() for part in text.partition("="))
+        if not (target and equals and value):
             raise InputError(f"{option} {text!r}; allowed: {allowed}")
         if target in found:
             raise InputError(f"{option} {text!r}: {target} is given twice; allowed: once")
-        found[target] = told
+        found[target] = value
     return found
 
 
@@ -66,9 +66,9 @@ def space_of(
 
     varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
     drawn = pairs("--draw", draw, "NODE.PARAM=normal:DEVIATION, =normal:MEAN:DEVIATION or =uniform:LOW:HIGH")
-    ranges = {target: told for target, told in varied.items() if sample and told.removesuffix(":log").count(":") == 1}
+    ranges = {target: text for target, text in varied.items() if sample and text.removesuffix(":log").count(":") == 1}
     return Space(
-        grid={target: told for target, told in varied.items() if target not in ranges},
+        grid={target: text for target, text in varied.items() if target not in ranges},
         sampled=ranges | drawn,
         ties=pairs("--tie", tie, "NODE.PARAM=FORMULA"),
         sample=sample,
@@ -159,16 +159,16 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
 
     statuses, top, folder = found.statuses(), best(found), found.folder
     if as_json:
-        told = {"folder": str(folder.path), "scenario": folder.scenario.name, "statuses": statuses, "best": top}
+        summary = {"folder": str(folder.path), "scenario": folder.scenario.name, "statuses": statuses, "best": top}
         if written:
-            told |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
-        click.echo(json.dumps(told))
+            summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
+        click.echo(json.dumps(summary))
         return
     out = console()
     if top:
         lines = table(*top[0], title="smallest errors", overflow="fold")
         for each in top:
-            lines.add_row(*(_said(name, value) for name, value in each.items()))
+            lines.add_row(*(_formatted(name, value) for name, value in each.items()))
         out.print(lines, soft_wrap=False)
     out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
     out.print(f"rows:    {folder.path}/rows")
@@ -177,7 +177,7 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
         out.print(f"figures: {written.figures[0].parent} ({len(written.figures)} PNG)")
 
 
-def _said(name: str, value: object) -> str:
+def _formatted(name: str, value: object) -> str:
     if isinstance(value, float):
         return f"{value * 1e6:.4g} µm" if name.endswith("_error") else f"{value:.6g}"
     return "" if value is None else str(value)

@@ -134,8 +134,8 @@ def _show(tuning: "Tuning", picture: Path) -> None:
 
     out = console()
     folder, start, best = tuning.folder.path, tuning.start, tuning.best
-    if told := _history(tuning):
-        out.print(told)
+    if improvements := _history(tuning):
+        out.print(improvements)
     if len(tuning.front) > 1:
         out.print(_front_table(tuning), soft_wrap=False)
         out.print(f"{folder / 'front'}: a parameter file of each")
@@ -160,18 +160,18 @@ def _show(tuning: "Tuning", picture: Path) -> None:
 
 
 def _best_table(tuning: "Tuning", start: "Trial", best: "Trial") -> "Table":
-    """Parameters and what came of them: of the start, the best, and what the formulas give."""
+    """Table of parameters and results: of the start, the best, and the formulas."""
     from lathe_rc.commands.tables import table
 
-    def said(value: object) -> str:
+    def text(value: object) -> str:
         return f"{value:.6g}" if isinstance(value, float) else str(value)
 
-    given = {target: said(found.value) for target, found in tuning.formulas.items()}
+    given = {target: text(found.value) for target, found in tuning.formulas.items()}
     made = table("", "start", "best", *(["by formula"] if given else []), left=1, overflow="fold")
     for column in made.columns[1:]:
         column.no_wrap = True
     for target, value in best.values.items():
-        made.add_row(target, said(start.values[target]), said(value), *([given.get(target, "")] if given else []))
+        made.add_row(target, text(start.values[target]), text(value), *([given.get(target, "")] if given else []))
     made.add_section()
     trials = [trial for trial in (start, best, tuning.by_formula) if trial]
     results = [_results(tuning, trial) for trial in trials]
@@ -182,7 +182,7 @@ def _best_table(tuning: "Tuning", start: "Trial", best: "Trial") -> "Table":
 
 
 def _results(tuning: "Tuning", trial: "Trial") -> dict[str, str]:
-    """Goals and margin of a trial, by what they are."""
+    """Goals and margin of a trial, by their names."""
     percentile = tuning.objectives.percentile
     which = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g} %"
     shown = {f"{name}{which}": value for name, value in tuning.goals_shown(trial).items()}
@@ -201,15 +201,15 @@ def _cost_of(start: "Trial", best: "Trial") -> str:
 
 
 def _history(tuning: "Tuning") -> str:
-    """The trials that were better than all before, in a line."""
+    """Trials that were better than all before, in a line."""
     column = tuning.objectives.goals[0].column
     steps: dict[str, int] = {}
     for trial in tuning.improvements:
         steps.setdefault(tuning.goals_shown(trial)[column], trial.number)
     shown = list(steps.items())
     shown = shown if len(shown) <= _STEPS else [shown[0], *shown[1 - _STEPS :]]
-    told = " → ".join(f"{value} (trial {number})" for value, number in shown)
-    return f"{column}: {told}" if told else ""
+    values = " → ".join(f"{value} (trial {number})" for value, number in shown)
+    return f"{column}: {values}" if values else ""
 
 
 def _front_table(tuning: "Tuning") -> "Table":
@@ -225,9 +225,9 @@ def _front_table(tuning: "Tuning") -> "Table":
 
 
 def _summary(tuning: "Tuning") -> dict[str, Any]:
-    """The tuning for programs; in SI units, null for what is not known."""
+    """Summary of a tuning for JSON; in SI units, null for unknown numbers."""
 
-    def told(trial: "Trial | None") -> dict[str, Any] | None:
+    def summary(trial: "Trial | None") -> dict[str, Any] | None:
         if trial is None:
             return None
         goals = tuning.goals(trial).items()
@@ -245,10 +245,10 @@ def _summary(tuning: "Tuning") -> dict[str, Any]:
         "trials": len(tuning.trials),
         "feasible": len(tuning.feasible),
         "cells": tuning.cells,
-        "start": told(tuning.start),
-        "best": told(tuning.best),
-        "by_formula": told(tuning.by_formula),
+        "start": summary(tuning.start),
+        "best": summary(tuning.best),
+        "by_formula": summary(tuning.by_formula),
         "formulas": {target: found._asdict() for target, found in tuning.formulas.items()},
-        "front": [told(trial) for trial in tuning.front],
-        "history": [told(trial) for trial in tuning.improvements],
+        "front": [summary(trial) for trial in tuning.front],
+        "history": [summary(trial) for trial in tuning.improvements],
     }

@@ -11,9 +11,10 @@ from rich.console import Console
 
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.beside import RERUN_PORT, RERUN_RATE, RerunOutput
+from lathe_rc.commands import options
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.view.rerun_bag import write
-from lathe_rc.view.rerun_output import Viewer, end, require, viewer
+from lathe_rc.view.rerun_output import Viewer, end_viewer, require, viewer
 
 
 def _show(bag: Path, rate: float, shown: Viewer) -> None:
@@ -21,13 +22,13 @@ def _show(bag: Path, rate: float, shown: Viewer) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name_of(bag)}.rrd"
         write(bag, file, rate=rate)
-        click.echo(shown.said)
+        click.echo(shown.message)
         with shown.start(file) as process:
             try:
                 if process.wait():
                     raise LatheError(f"Rerun ended with code {process.returncode}")
             except KeyboardInterrupt:
-                end(process)
+                end_viewer(process)
 
 
 def _live(values: Mapping[str, object], *, as_json: bool) -> None:
@@ -40,7 +41,7 @@ def _live(values: Mapping[str, object], *, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path), required=False)
+@click.argument("bag", type=options.PATH, required=False)
 @click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False), help="write a .rrd file, show nothing")
 @click.option("--web", is_flag=True, help="show it in a browser")
 @click.option("--port", type=click.IntRange(1, 65535), default=RERUN_PORT, show_default=True, help="of the web page")

@@ -28,9 +28,9 @@ from lathe_rc.errors import LatheError
 from lathe_rc.nodes import arguments
 from lathe_rc.nodes.ports import message_class
 from lathe_rc.nodes.standalone_node import standalone_node
-from lathe_rc.view.rerun_live import Backlog, Live, Shown
+from lathe_rc.view.rerun_live import Backlog, Live, ShownRun
 from lathe_rc.view.rerun_output import Output, require
-from lathe_rc.view.rerun_signals import drawn
+from lathe_rc.view.rerun_signals import is_drawn
 
 _QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -67,7 +67,7 @@ class RerunBridge:
         """End after what has been heard is shown; a signal handler."""
         self._stop = True
 
-    def run(self) -> list[Shown]:
+    def run(self) -> list[ShownRun]:
         """Show one run after the other until it is told to stop.
 
         Returns:
@@ -103,7 +103,7 @@ class RerunBridge:
             topic: kind
             for topic, kinds in self._node.get_topic_names_and_types()
             for kind in kinds
-            if drawn(kind) and topic.startswith(namespace) and self._node.count_publishers(topic)
+            if is_drawn(kind) and topic.startswith(namespace) and self._node.count_publishers(topic)
         }
         for topic in sorted(present.keys() - self._subscriptions.keys()):
             self._subscribe(topic, present[topic])
@@ -148,7 +148,7 @@ def _nothing(_: bytes) -> None:
     """No executor calls back."""
 
 
-def run(values: Mapping[str, object], args: Sequence[str]) -> list[Shown]:
+def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
     """Show what runs until Ctrl-C, the end of the viewer, or of the first run if so asked.
 
     Args:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as one HTML page that needs nothing else.
+"""The report of a bag: one HTML page that needs nothing else.
 
 Texts of a bag are foreign: they are escaped by the template, cut to a length, and shown without characters that do not
 print.
@@ -31,7 +31,7 @@ from lathe_rc.view.charts import Charts, page_template
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
-from lathe_rc.view.report_verdict import judged
+from lathe_rc.view.report_verdict import assess
 
 _LONGEST_SCENARIO = 200_000  # characters
 _LONGEST_TEXT = 300
@@ -74,16 +74,16 @@ def _grid(
 def _metrics(form: Form) -> Grid | None:
     rows = []
     for name, revolution in figures.shown_revolutions(form):
-        told = revolution.numbers
-        waves = f"{told['largest_upr']['upr']}: {_number(told['largest_upr']['amplitude'])}"
-        values = (float(told[key]) for key in ("rms", "max", "peak_to_valley", "ront", "ronq"))
-        rows.append([told["revolution"], name, *values, *map(float, told["centre"]), waves, float(told["ra"])])
+        numbers = revolution.numbers
+        waves = f"{numbers['largest_upr']['upr']}: {_number(numbers['largest_upr']['amplitude'])}"
+        values = (float(numbers[key]) for key in ("rms", "max", "peak_to_valley", "ront", "ronq"))
+        rows.append([numbers["revolution"], name, *values, *map(float, numbers["centre"]), waves, float(numbers["ra"])])
     columns = ("revolution", "", "RMS", "max", "P-V", "RONt", "RONq", "centre x", "centre y", "largest UPR", "Ra")
     return _grid(columns, rows, ("",))
 
 
 def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
-    """The section of a tool; ``maps``: of the page."""
+    """Section of a tool; ``maps``: number of maps in the page."""
     if form.first is None:
         return {"form": form, "refused": form.refused or "the bag holds no complete revolution", "metrics": None}
     drawn = {
@@ -92,35 +92,35 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts)
         "spectrum": [figures.spectrum(form)],
         "convergence": [figures.convergence(form, cycles)],
     }
-    refused, told = form.refused, ""
+    refused, words = form.refused, ""
     if isinstance(form.surface, Lay):
-        drawn["along"], told = figures.along(form.surface), along_in_words(form.surface)
+        drawn["along"], words = figures.along(form.surface), along_in_words(form.surface)
     elif form.surface:
         refused = f"{refused} {form.surface}".strip()
     places = {name: charts.place(specs) for name, specs in drawn.items()}
-    return {"form": form, "refused": refused, "metrics": _metrics(form), "along": None, "told": told, **places}
+    return {"form": form, "refused": refused, "metrics": _metrics(form), "along": None, "words": words, **places}
 
 
-def _signals(told: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
+def _signals(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
     for field, name, unit, scale, page in (
         ("speed_true", "Spindle speed", "speed [1/min]", _RPM, "docs/signals.md"),
         ("force", "Cutting force", "main cutting force [N]", 1.0, "docs/cutting.md"),
         ("wear", "Wear", "wear VB [µm]", 1e6, "docs/cutting.md"),
     ):
-        curves = {topic: series for (topic, own), series in told.curves.signals.items() if own == field and series.size}
+        curves = {topic: series for (topic, own), series in data.curves.signals.items() if own == field and series.size}
         if curves:
             low, high = (np.array([series.extremes for series in curves.values()]) * scale).T
             yield {
                 "name": name,
                 "page": page,
-                "places": charts.place([figures.against_time(told, curves, unit, scale)]),
+                "places": charts.place([figures.against_time(data, curves, unit, scale)]),
                 "low": _number(float(low.min())),
                 "high": _number(float(high.max())),
                 "group": max(series.group for series in curves.values()),
             }
 
 
-def _nodes(told: Gathered) -> Grid | None:
+def _nodes(data: Gathered) -> Grid | None:
     levels = ("ok", "warning", "error", "stale")
     rows = (
         [
@@ -130,26 +130,26 @@ def _nodes(told: Gathered) -> Grid | None:
             *(printable(node.values.get(key, "–"), 20) for key in ("blocks", "lost blocks")),
             node.message,
         ]
-        for name, node in told.host.nodes.items()
+        for name, node in data.host.nodes.items()
     )
     columns = ("node", "reports", "worst", "blocks", "lost", "message")
     return _grid(columns, rows, ("node", "worst", "message"))
 
 
-def losses(told: Gathered) -> list[str]:
+def losses(data: Gathered) -> list[str]:
     """Refusals, losses and failures, a line each."""
-    host = told.host
-    found = [f"reading stopped: {told.stopped}"] if told.stopped else []
-    for topic, tally in islice(told.topics.items(), _MOST_ROWS):
-        if tally.open_end and not told.stopped and not told.complete:  # a snapshot ends before the run
+    host = data.host
+    found = [f"reading stopped: {data.stopped}"] if data.stopped else []
+    for topic, tally in islice(data.topics.items(), _MOST_ROWS):
+        if tally.open_end and not data.stopped and not data.complete:  # a snapshot ends before the run
             found.append(f"{topic} does not say that the run ends with its last block: the recording was cut off")
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
     found += host.errors
-    found += [f"{form.tool}: {form.refused}" for form in told.forms if form.refused]
-    if told.unjudged:
-        found.append(f"no tolerance is known: {told.unjudged}")
-    if told.about.get(RECOVERED):
-        found.append(f"the bag was cut off and has been recovered: {told.about[RECOVERED]}")
+    found += [f"{form.tool}: {form.refused}" for form in data.forms if form.refused]
+    if data.unjudged:
+        found.append(f"no tolerance is known: {data.unjudged}")
+    if data.about.get(RECOVERED):
+        found.append(f"the bag was cut off and has been recovered: {data.about[RECOVERED]}")
     if host.unreadable:
         found.append(f"{host.unreadable} messages of host topics cannot be decoded")
     if host.left_out:
@@ -157,14 +157,14 @@ def losses(told: Gathered) -> list[str]:
     return [printable(text) for text in found]
 
 
-def _topics(told: Gathered) -> Grid | None:
+def _topics(data: Gathered) -> Grid | None:
     dense = messages.block_types()
     rows = (
         [
             topic,
             tally.type.rpartition("/")[2],
             tally.count,
-            told.samples if tally.type in dense else "",
+            data.samples if tally.type in dense else "",
             tally.rate,
             *(
                 f"{(ns - messages.START_NS) * 1e-9:.4f}" if tally.count else "–"
@@ -172,21 +172,21 @@ def _topics(told: Gathered) -> Grid | None:
             ),
             f"{tally.size / 1e3:.0f}",
         ]
-        for topic, tally in told.topics.items()
+        for topic, tally in data.topics.items()
     )
     columns = ("topic", "type", "messages", "samples", "rate [1/s]", "from [s]", "to [s]", "kB")
-    return _grid(columns, rows, ("topic", "type"), len(told.topics))
+    return _grid(columns, rows, ("topic", "type"), len(data.topics))
 
 
-def _events(told: Gathered) -> Grid | None:
-    rows = ([each.topic, each.sample, each.sample * told.step_ns * 1e-9, each.text] for each in told.curves.events)
+def _events(data: Gathered) -> Grid | None:
+    rows = ([each.topic, each.sample, each.sample * data.step_ns * 1e-9, each.text] for each in data.curves.events)
     columns = ("topic", "sample", "time [s]", "action")
-    return _grid(columns, rows, ("topic", "action"), told.curves.event_count)
+    return _grid(columns, rows, ("topic", "action"), data.curves.event_count)
 
 
-def _versions(told: Gathered) -> Grid | None:
+def _versions(data: Gathered) -> Grid | None:
     try:
-        given = json.loads(told.about.get(VERSIONS, ""))
+        given = json.loads(data.about.get(VERSIONS, ""))
     except (ValueError, RecursionError):
         return None
     columns = ("made with", "version")
@@ -194,17 +194,17 @@ def _versions(told: Gathered) -> Grid | None:
     return _grid(columns, rows, columns, len(rows))
 
 
-def _origins(told: Gathered) -> Grid | None:
-    found = origins(told.about)
+def _origins(data: Gathered) -> Grid | None:
+    found = origins(data.about)
     rows = ([origin.name, origin.package or "–", ", ".join(origin.used), origin.source] for origin in found)
     columns = ("class of others", "of", "used by", "source")
     return _grid(columns, rows, columns, len(found))
 
 
-def _about(told: Gathered) -> Grid | None:
+def _about(data: Gathered) -> Grid | None:
     rows = [
         (key, f"{len(text)} characters of base64" if key.startswith(FILE) else text)
-        for key, text in sorted(told.about.items())
+        for key, text in sorted(data.about.items())
         if key not in (SCENARIO, VERSIONS, ORIGINS)
     ]
     return _grid(("key", "text"), rows, ("key", "text"), len(rows))
@@ -216,45 +216,45 @@ def _budget(found: Budget) -> Grid | None:
     return _grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, ("cause",))
 
 
-def _facts(told: Gathered) -> Iterator[tuple[str, str, str]]:
+def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
     """The figures of the run at the top: name, value and mood."""
-    yield ("recording", "complete", "good") if told.complete else ("recording", "incomplete", "bad")
-    yield "simulated", f"{told.seconds:.4g} s", ""
-    yield "samples", f"{told.samples:,}".replace(",", " "), ""
-    for form in told.forms[:1]:
+    yield ("recording", "complete", "good") if data.complete else ("recording", "incomplete", "bad")
+    yield "simulated", f"{data.seconds:.4g} s", ""
+    yield "samples", f"{data.samples:,}".replace(",", " "), ""
+    for form in data.forms[:1]:
         if form.first and form.last:
             yield "revolutions", str(form.rms.size), ""
             yield "RMS, first revolution", f"{_number(form.first.numbers['rms'])} µm", ""
             yield "RMS, last revolution", f"{_number(form.last.numbers['rms'])} µm", ""
-    if told.run_id:
-        yield "run", printable(told.run_id, 16), ""
+    if data.run_id:
+        yield "run", printable(data.run_id, 16), ""
 
 
-def render(told: Gathered, name: str, command: str, made_of: Budget | None = None) -> str:
-    """The page.
+def render(data: Gathered, name: str, command: str, made_of: Budget | None = None) -> str:
+    """Return the page as HTML.
 
     Args:
-        told: what was gathered.
+        data: figures of the bag.
         name: of the bag.
         command: that makes the page again.
-        made_of: what the form error is made of; None: nobody has asked.
+        made_of: budget of the form error; None: without one.
     """
     charts = Charts()
     template = page_template(Path(__file__).with_name("report.html.j2"), printable=printable)
-    with np.errstate(over="ignore", invalid="ignore"):
-        cycles = {f"{topic}: {field}": found for (topic, field), found in told.curves.cycles.items() if found.size}
-        forms = [_form(form, cycles, len(told.forms), charts) for form in told.forms]
-        signals = list(_signals(told, charts))
+    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers: they are shown as they are
+        cycles = {f"{topic}: {field}": found for (topic, field), found in data.curves.cycles.items() if found.size}
+        forms = [_form(form, cycles, len(data.forms), charts) for form in data.forms]
+        signals = list(_signals(data, charts))
         alone = cycles and not any(form["metrics"] for form in forms)
         text: str = template.render(
             title=f"Report of {printable(name, 80)}",
             command=printable(command),
             version=__version__,
             charts=charts,
-            judged=judged(told, losses(told), made_of),
-            budget_hint=made_of is None and any(form.newest for form in told.forms[:1]),
-            facts=_facts(told),
-            missing=told.missing,
+            assessment=assess(data, losses(data), made_of),
+            budget_hint=made_of is None and any(form.newest for form in data.forms[:1]),
+            facts=_facts(data),
+            missing=data.missing,
             made_of=made_of,
             least=TOLD,
             budget=_budget(made_of) if made_of else None,
@@ -262,15 +262,15 @@ def render(told: Gathered, name: str, command: str, made_of: Budget | None = Non
             forms=forms,
             signals=signals,
             cycles=charts.place([figures.convergence(None, cycles)]) if alone else None,
-            timing=charts.place(figures.timing(told.host, told.step_ns * 1e-9)) if len(told.host.pace) else None,
-            host=told.host,
-            nodes=_nodes(told),
-            topics=_topics(told),
-            events=_events(told),
-            versions=_versions(told),
-            origins=_origins(told),
-            about=_about(told),
-            scenario=printable(told.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
+            timing=charts.place(figures.timing(data.host, data.step_ns * 1e-9)) if len(data.host.pace) else None,
+            host=data.host,
+            nodes=_nodes(data),
+            topics=_topics(data),
+            events=_events(data),
+            versions=_versions(data),
+            origins=_origins(data),
+            about=_about(data),
+            scenario=printable(data.about.get(SCENARIO, ""), _LONGEST_SCENARIO),
         )
     return text
 
@@ -281,7 +281,7 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
     Args:
         bag: the bag.
         page: the HTML file.
-        with_budget: tell what the form error is made of, by runs of the bag's scenario.
+        with_budget: add the budget of the form error, by runs of the bag's scenario.
 
     Raises:
         InputError: not a bag, or no place for a page; with a budget, a bag without a scenario that can run offline.
@@ -296,16 +296,16 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"-o {page}; allowed: a file name that ends in .html")
     check_place("-o", page)
-    told = gather(bag)
+    data = gather(bag)
     made_of = None
     if with_budget:
         with tempfile.TemporaryDirectory(prefix="lathe-report-") as folder:
-            made_of = budget(scenario_of(told.about, Path(folder)))
+            made_of = budget(scenario_of(data.about, Path(folder)))
     command = shlex.join(["lathe", "report", str(bag), *(["--budget"] if with_budget else []), "-o", str(page)])
-    text = render(told, name_of(bag), command, made_of)
+    text = render(data, name_of(bag), command, made_of)
     try:
         with replacing(page) as file:
-            file.write(text.encode("utf-8", "replace"))
+            file.write(text.encode("utf-8", "replace"))  # texts of a bag may hold lone surrogates
     except OSError as error:
         raise LatheError(f"{page}: cannot be written ({error.strerror})") from None
-    return told
+    return data

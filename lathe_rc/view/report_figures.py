@@ -46,7 +46,7 @@ def um(length: Samples) -> Samples:
     return cut
 
 
-def _limited(values: Samples) -> Samples:
+def _clipped(values: Samples) -> Samples:
     """Other signals; absurd values are cut."""
     cut: Samples = np.clip(values, -_MOST_VALUE, _MOST_VALUE)
     return cut
@@ -89,6 +89,7 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
     """A field for each number; across and up say where they begin, how large they are, and how their axis looks."""
+    # The page holds one number a field; Vega computes the places. Written out, they would make it five times as large.
     place = "(datum.k - 1)"
     return _rectangles(
         340,
@@ -113,8 +114,8 @@ def _across(step: float, ticks: int) -> Spec:
     return {"start": 0, "step": step, "axis": {"values": list(range(0, 361, ticks)), "grid": False}}
 
 
-def _thinner(fields: Samples, most: int) -> tuple[Samples, int]:
-    """Means of neighbours in each column, of so many rows that no more than ``most`` are left; and of how many."""
+def _downsample(fields: Samples, most: int) -> tuple[Samples, int]:
+    """Return means of neighbouring rows, ``most`` at most, and the number of rows in each mean."""
     group = -(-len(fields) // most)
     starts = np.arange(0, len(fields), group)
     counts = np.minimum(starts + group, len(fields)) - starts
@@ -126,7 +127,7 @@ def form_map(form: Form, maps: int) -> Spec:
     fields = um(form.map.rows())
     largest, linear = colour_range(fields)
     fields = fields.reshape(len(fields), _ACROSS, -1).mean(axis=-1)
-    fields, group = _thinner(fields, max(2, _FIELDS // _ACROSS // maps))
+    fields, group = _downsample(fields, max(2, _FIELDS // _ACROSS // maps))
     end = form.map.size + 0.5
     up = {"title": "revolution", "start": 0.5, "step": group * form.map.group, "end": end}
     up["scale"] = {**axis_scale(ends=(0.5, end)), "reverse": True}
@@ -144,8 +145,8 @@ def along(surface: Lay) -> list[Spec]:
     place = np.clip(surface.height, -_LONGEST_LENGTH, _LONGEST_LENGTH) * 1e3
     low, high = float(place[0]), float(place[-1])
     step = (high - low) / (place.size - 1) if place.size > 1 else 1.0
-    fields, group = _thinner(deviation.T, 128)
-    fields, wide = _thinner(fields.T, _ACROSS)
+    fields, group = _downsample(deviation.T, 128)
+    fields, wide = _downsample(fields.T, _ACROSS)
     up = {"title": "height [mm]", "start": low - step / 2, "step": step * group, "end": high + step / 2}
     up["scale"] = axis_scale(ends=sorted((low - step / 2, high + step / 2)))
     colour = quantity("data", "radius deviation [µm]", scale={"scheme": "viridis"}, legend=_GRADIENT)
@@ -176,7 +177,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     deviation = profile[:: max(1, profile.size // _POINTS)]
     deviation = np.append(deviation, deviation[0])
     size = max(float(np.abs(profile).max()), _FLOOR)
-    told = revolution.numbers
+    numbers = revolution.numbers
 
     def at(radius: Samples | float, angle: Samples | float, **more: Any) -> Rows:
         """Places, the desired form in the middle and the largest deviation 1 from it."""
@@ -198,7 +199,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     line = {"type": "line", "clip": True}
     return _figure(
         _SQUARE,
-        title=f"revolution {told['revolution']}: {told['rms']:.3g} µm RMS",
+        title=f"revolution {numbers['revolution']}: {numbers['rms']:.3g} µm RMS",
         encoding={"x": quantity("u", "", **where), "y": quantity("v", "", **where)},
         layer=[
             {
@@ -358,17 +359,17 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
 
 
-def against_time(told: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
+def against_time(gathered: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
     """Signals by simulated time, their extremes as a band.
 
     Args:
-        told: for the time.
+        gathered: holds the sampling step.
         signals: by name.
         unit: of the axis, with its quantity.
         scale: from the signals' unit to that one.
     """
     drawn = {_plain(name): (series, colour, False) for colour, (name, series) in enumerate(signals.items())}
-    scaled = told.at, lambda values: _limited(values) * scale
+    scaled = gathered.at, lambda values: _clipped(values) * scale
     return _lines(drawn, scaled, ("time since sample 0 [s]", unit), height=220, log=False)
 
 
@@ -393,7 +394,7 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
 
 def timing(host: Host, step: float) -> list[Spec]:
     """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
-    pace = _limited(np.array(host.pace)) * step
+    pace = _clipped(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))
     if high - low <= least:  # paces that are all but the same need a range that can be cut into bins

@@ -49,7 +49,7 @@ class Form:
         encoder: topic with the angle.
         tool: topic with the form error.
         tolerance: form error that is allowed to each side [m]; 0: none.
-        nose_radius: of the tool in the plane of the feed [m]; 0: nobody asks for the surface along the part.
+        nose_radius: of the tool in the plane of the feed [m]; 0: without the surface along the part.
 
     Attributes:
         tool, tolerance: see above.
@@ -57,7 +57,7 @@ class Form:
         rms, largest: envelope by revolution [m].
         map: radius deviation [m], by revolution and angle.
         newest: radius deviation of the last revolutions at even angles [m], shape (points,) each.
-        surface: along the part, or why there is none; None if nobody asks.
+        surface: along the part, or why there is none; None without a nose radius.
         refused: why the form, or its rest, is not measured; empty if it is.
     """
 
@@ -65,9 +65,8 @@ class Form:
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of every revolution, and those before the first
-        self._held = np.empty(
-            (3, 0)
-        )  # angle, form error and height, of 0 if nobody asks; from a margin before the next
+        # Angle, form error and height (0 without a nose radius) from a margin before the next revolution on.
+        self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
         self._done = 0  # revolutions measured
@@ -80,7 +79,7 @@ class Form:
         self.refused = ""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take consecutive samples; revolutions are measured as soon as they are complete."""
         if self.refused:
             return
         angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
@@ -120,11 +119,12 @@ class Form:
         finite = np.isfinite(self._held).all(axis=0)
         broken = not finite.all()
         if broken:
+            # Nothing can follow: the revolutions before it are measured up to their very end.
             margin, self._held = 0, self._held[:, : np.argmin(finite)]
         try:
             self._check()
             with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples; they show in the numbers
-                while self._next(margin):
+                while self._measure_some(margin):
                     pass
         except InputError as error:
             self._refuse(str(error))
@@ -150,7 +150,7 @@ class Form:
         if angle.size > _LONGEST:
             raise InputError(f"a revolution longer than {_LONGEST} samples")
 
-    def _next(self, margin: int) -> bool:
+    def _measure_some(self, margin: int) -> bool:
         """Measure some revolutions; whether there were any."""
         _, error, height = self._held
         angle = self._held[0] - self._done * _TURN
@@ -158,12 +158,14 @@ class Form:
         whole = int(np.count_nonzero(edges[1:] + margin < angle.size)) if margin else _AT_ONCE
         if not whole:
             return False
+        # The spline through a revolution depends on the samples beyond its end: with them the numbers are those of the
+        # whole run, however it is cut.
         stop = int(edges[whole]) + _MARGIN
         found = measure(angle[:stop], error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
         whole = min(whole, found.form.rms.size)
         if not whole:
             return False
-        self._take(found, whole)
+        self._record(found, whole)
         if self._nose_radius:
             heights = evenly(angle[:stop], height[:stop])
             self._along.extend(zip(found.profile[:whole], heights[:whole], strict=True))
@@ -171,7 +173,7 @@ class Form:
         self._held = self._held[:, max(0, int(np.searchsorted(angle, whole * _TURN)) - _MARGIN) :]
         return True
 
-    def _take(self, found: Measurement, whole: int) -> None:
+    def _record(self, found: Measurement, whole: int) -> None:
         self.map.add(found.profile[:whole].reshape(whole, ACROSS, POINTS // ACROSS).mean(axis=-1))
         self.newest.extend(found.profile[max(0, whole - LAST) : whole].copy())
         rms = found.form.rms[:whole]
@@ -181,10 +183,11 @@ class Form:
         if self.first is None:
             self.first = self._revolution(found, 0)
         best = int(np.argmin(rms))
-        if self.best is None or rms[best] * 1e6 < self.best.numbers["rms"]:
+        if self.best is None or rms[best] * 1e6 < self.best.numbers["rms"]:  # numbers are in µm
             self.best = self._revolution(found, best)
         self.last = self._revolution(found, whole - 1)
 
     def _revolution(self, found: Measurement, k: int) -> Revolution:
+        # Copies: a view would keep all revolutions measured with this one in memory.
         numbers = {**part.numbers(found, k), "revolution": self._done + k + 1}
         return Revolution(numbers, found.profile[k].copy(), found.undulations.amplitude[k].copy())

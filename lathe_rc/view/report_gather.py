@@ -60,14 +60,14 @@ class Tally:
 
 
 @dataclass
-class Alike:
-    """Events of a topic that say the same, but for numbers behind a colon.
+class EventKind:
+    """Events of a topic with the same text, but for numbers behind a colon.
 
     Attributes:
-        topic, text: who said what, the first time.
+        topic, text: of the first.
         alarm: it is of a supervisor, and the cell is not as it should be.
-        first, last: samples at which it was said.
-        count: how many times.
+        first, last: samples of the first and the last.
+        count: number of events.
     """
 
     topic: str
@@ -94,10 +94,10 @@ class Curves:
         self.cycles = {(topic, name): Envelope() for kind, name in _CYCLES for topic in of_type(types, kind)}
         self.events: list[LogEntry] = []
         self.event_count = 0
-        self.kinds: dict[tuple[str, str], Alike] = {}
+        self.kinds: dict[tuple[str, str], EventKind] = {}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take consecutive samples and the messages among them."""
         for (topic, name), envelope in self.signals.items():
             envelope.add(dense[topic][name])
         for (topic, name), envelope in self.cycles.items():
@@ -111,10 +111,10 @@ class Curves:
                 # Of an alarm: monitor and subject, which come before what was found.
                 key = topic, " ".join(text.split()[:2]) if alarm else text.partition(":")[0]
                 if key not in self.kinds and len(self.kinds) < _MOST_EVENTS:
-                    self.kinds[key] = Alike(topic, text, alarm, event.index)
-                if alike := self.kinds.get(key):
-                    alike.last = event.index
-                    alike.count += 1
+                    self.kinds[key] = EventKind(topic, text, alarm, event.index)
+                if kind := self.kinds.get(key):
+                    kind.last = event.index
+                    kind.count += 1
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:
@@ -124,7 +124,7 @@ def of_type(types: Mapping[str, str], kind: str) -> list[str]:
 
 @dataclass
 class Gathered:
-    """All that a report tells.
+    """Figures of a bag for its report.
 
     Attributes:
         about: what the bag says of itself.
@@ -134,7 +134,7 @@ class Gathered:
         run_id: identity of the run.
         forms: of each tool.
         curves: signals and cycles.
-        host: what the host topics say.
+        host: figures of the host topics.
         stopped: why the bag was not read to its end; empty if it was.
         nodes: values of the bag's scenario by node and parameter, none of them checked; empty if it has none.
         unjudged: why nothing is known of the scenario, tolerances among it; empty if it is.
@@ -203,34 +203,34 @@ def gather(path: Path) -> Gathered:
             for tool in of_type(types, messages.TOOL)
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
-        told = Gathered(source.about, tallies, forms, Curves(types), nodes=nodes, unjudged=unjudged)
+        gathered = Gathered(source.about, tallies, forms, Curves(types), nodes=nodes, unjudged=unjudged)
         first = first_sample(source.about)
-        feeder = Feeder(types, [*forms, told.curves], _PIECE, first)
+        feeder = Feeder(types, [*forms, gathered.curves], _PIECE, first)
         try:
-            _read(source, feeder, told)
+            _feed(source, feeder, gathered)
         except LatheError as error:
-            told.stopped = str(error)
+            gathered.stopped = str(error)
         for form in forms:
             form.finish()
-        told.samples, told.step_ns, told.run_id = feeder.first - first, feeder.step_ns, feeder.run_id
-    return told
+        gathered.samples, gathered.step_ns, gathered.run_id = feeder.first - first, feeder.step_ns, feeder.run_id
+    return gathered
 
 
-def _read(source: Source, feeder: Feeder, told: Gathered) -> None:
+def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
     """Count every message, and hand it to the feeder or to the host's figures."""
     newest: dict[str, bytes] = {}
     for topic, log_ns, data in source.messages():
-        tally = told.topics[topic]
+        tally = gathered.topics[topic]
         tally.first_ns = tally.first_ns if tally.count else log_ns
         tally.count, tally.size, tally.last_ns = tally.count + 1, tally.size + len(data), log_ns
         if topic in feeder.types:
             feeder.add(topic, log_ns, data)
-            newest[topic] = data
+            newest[topic] = data  # decoded at the end alone: the feeder has decoded it already
         elif tally.type in HOST_TYPES:
-            told.host.add(tally.type, data)
+            gathered.host.add(tally.type, data)
     left = feeder.finish()
     if left:
-        told.stopped = f"some topics have {left} samples more than others"
-    for topic, tally in told.topics.items():
+        gathered.stopped = f"some topics have {left} samples more than others"
+    for topic, tally in gathered.topics.items():
         if tally.type in messages.block_types():
             tally.open_end = topic not in newest or not Decoder(tally.type).decode(newest[topic]).last

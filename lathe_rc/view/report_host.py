@@ -38,7 +38,7 @@ class Node:
 
 
 class Host:
-    """Takes the messages of host topics.
+    """Figures from the messages of host topics.
 
     Attributes:
         nodes: by name.
@@ -73,7 +73,8 @@ class Host:
         for status in message.status:
             self._status(messages.stamp_ns(message) * 1e-9, status)
 
-    def _line(self, lines: list[str], text: str) -> None:
+    def _append(self, lines: list[str], text: str) -> None:
+        """Add a line, unless it repeats the last one or there are too many."""
         if text in lines[-1:]:
             return
         if len(lines) < _MOST_LINES:
@@ -84,26 +85,27 @@ class Host:
     def _state(self, message: Any) -> None:
         named = _STATES[message.state] if message.state < len(_STATES) else f"state {message.state}"
         text = f"{named} from sample {message.first_index}" + (f": {message.message}" if message.message else "")
-        self._line(self.states, text)
+        self._append(self.states, text)
         failures = {_SAFE: "safe state from sample {} on: {}", _FAILED: "the cell failed at sample {}: {}"}
         if failure := failures.get(message.state):
-            self._line(self.errors, failure.format(message.first_index, message.message))
+            self._append(self.errors, failure.format(message.first_index, message.message))
 
     def _status(self, wall: float, status: Any) -> None:
         if status.name not in self.nodes and len(self.nodes) >= _MOST_NODES:
             self.left_out += 1
             return
         node = self.nodes.setdefault(status.name, Node())
+        # ROS has it as a byte: an int for rosbags, bytes of length 1 for rclpy.
         level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
         node.reports += 1
         node.level = max(node.level, level)
         node.message = status.message
         node.values = {pair.key: pair.value for pair in status.values[:_MOST_VALUES]}
         if level >= _ERROR:
-            self._line(self.errors, f"{status.name}: {status.message}")
-        self._measure(status.name, wall, node.values)
+            self._append(self.errors, f"{status.name}: {status.message}")
+        self._compare_reports(status.name, wall, node.values)
 
-    def _measure(self, name: str, wall: float, values: dict[str, str]) -> None:
+    def _compare_reports(self, name: str, wall: float, values: dict[str, str]) -> None:
         """Compare a report of the time master with the one before."""
         if "schedule slipped [s]" not in values:
             return  # of another node

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Series of any length in little memory: neighbours are put together until they fit."""
+"""Series of any length in bounded memory: neighbours are combined until they fit."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ class _Groups:
     Args:
         capacity: groups that are kept, even.
         shape: of a value.
-        how: ufuncs that put values of a group together, by what they leave of none.
+        how: ufuncs that combine the values of a group, each with its identity.
 
     Attributes:
         group: values in a group.
@@ -32,6 +32,7 @@ class _Groups:
             for ufunc, empty, kept in self._how:
                 kept[: self._capacity // 2] = ufunc(kept[::2], kept[1::2])
                 kept[self._capacity // 2 :] = empty
+        # One call of reduceat for all new values: where the group changes a segment begins.
         place = np.arange(first, self.size) // self.group
         edges = np.flatnonzero(np.diff(place, prepend=-1))
         groups = place[edges]
@@ -85,6 +86,6 @@ class MeanRows(_Groups):
     def rows(self) -> Samples:
         """The mean of each group, shape (groups, width)."""
         (sums,) = self._kept()
-        counts = np.minimum(self.size - np.arange(len(sums)) * self.group, self.group)
+        counts = np.minimum(self.size - np.arange(len(sums)) * self.group, self.group)  # the last may be smaller
         mean: Samples = sums / counts[:, None]
         return mean

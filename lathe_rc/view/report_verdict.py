@@ -17,7 +17,7 @@ from lathe_rc.cell.budget import changing
 from lathe_rc.cell.stages.command_limits import LIMITED
 from lathe_rc.view.report_figures import um
 from lathe_rc.view.report_form import Form
-from lathe_rc.view.report_gather import Alike, Gathered
+from lathe_rc.view.report_gather import EventKind, Gathered
 
 GOOD, BAD, WARN = "good", "bad", "warn"
 
@@ -37,7 +37,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Told:
+class Assessment:
     """The head of the page.
 
     Attributes:
@@ -51,43 +51,43 @@ class Told:
     limits: Sequence[Finding]
 
 
-def judged(told: Gathered, losses: Sequence[str], made_of: Budget | None) -> Told:
-    """Judge what was gathered.
+def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Assessment:
+    """Judge what was data.
 
     Args:
-        told: of the bag.
+        data: of the bag.
         losses: what was refused, lost or failed, a line each.
-        made_of: what the form error is made of, if somebody has asked.
+        made_of: budget of the form error, if one was asked for.
     """
-    form = next(iter(told.forms), None)
-    happened = list(_happened(told))
+    form = next(iter(data.forms), None)
+    incidents = list(_incidents(data))
     growth = form.growth if form else None
-    wrong = [Finding(text, BAD) for text in [*happened, *losses]]
+    wrong = [Finding(text, BAD) for text in [*incidents, *losses]]
     limits = []
     if made_of:
         largest = max((*made_of.causes, made_of.rest), key=lambda part: part.share)
         text = f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power."
         limits.append(Finding(text))
-    for alike in told.curves.kinds.values():
-        if alike.text.startswith(LIMITED):
-            node = alike.topic.strip("/").removesuffix("/events")
-            limits.append(Finding(f"{node} came to the limits of its command, {_at(told, alike)}.", WARN))
-    if form and not happened and not growth:  # else the form error is what those have made of it
-        limits += _form(told, form)
-    verdict = _verdict(told, form)
+    for kind in data.curves.kinds.values():
+        if kind.text.startswith(LIMITED):
+            node = kind.topic.strip("/").removesuffix("/events")
+            limits.append(Finding(f"{node} came to the limits of its command, {_when(data, kind)}.", WARN))
+    if form and not incidents and not growth:  # else the form error is what those have made of it
+        limits += _form(data, form)
+    verdict = _verdict(data, form)
     if growth:
         mood = BAD if growth.diverges or verdict.mood == BAD else WARN
         verdict = Finding(f"{_sentence(growth.told())} {verdict.text}", mood)
-    return Told(verdict, wrong, limits)
+    return Assessment(verdict, wrong, limits)
 
 
 def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _verdict(told: Gathered, form: Form | None) -> Finding:
+def _verdict(data: Gathered, form: Form | None) -> Finding:
     if form is None:
-        return Finding(f"No form to judge: {told.missing}.")
+        return Finding(f"No form to judge: {data.missing}.")
     if form.refused or form.last is None:
         return Finding("Not judged: the form cannot be measured to its end.", BAD)
     if form.verdict is None:
@@ -99,24 +99,24 @@ def _verdict(told: Gathered, form: Form | None) -> Finding:
     return Finding(_sentence(form.verdict.told()), GOOD if form.verdict.in_tolerance else BAD)
 
 
-def _at(told: Gathered, alike: Alike) -> str:
-    """When it happened."""
-    first, last = (sample * told.step_ns * 1e-9 for sample in (alike.first, alike.last))
-    if alike.count == 1:
+def _when(data: Gathered, kind: EventKind) -> str:
+    """Time of an event, or the span of several."""
+    first, last = (sample * data.step_ns * 1e-9 for sample in (kind.first, kind.last))
+    if kind.count == 1:
         return f"at {first:.4g} s"
-    return f"{alike.count} times from {first:.4g} s to {last:.4g} s"
+    return f"{kind.count} times from {first:.4g} s to {last:.4g} s"
 
 
-def _happened(told: Gathered) -> Iterator[str]:
+def _incidents(data: Gathered) -> Iterator[str]:
     """Faults, and what the supervisor did."""
-    kinds = [alike for alike in told.curves.kinds.values() if alike.text.startswith("fault ") or alike.alarm]
-    for alike in kinds[:_MOST]:
-        yield f"{alike.topic.strip('/')}: {alike.text}, {_at(told, alike)}"
+    kinds = [kind for kind in data.curves.kinds.values() if kind.text.startswith("fault ") or kind.alarm]
+    for kind in kinds[:_MOST]:
+        yield f"{kind.topic.strip('/')}: {kind.text}, {_when(data, kind)}"
     if len(kinds) > _MOST:
         yield f"{len(kinds) - _MOST} further kinds of faults and alarms, see the events"
 
 
-def _form(told: Gathered, form: Form) -> Iterator[Finding]:
+def _form(data: Gathered, form: Form) -> Iterator[Finding]:
     """How the form error ends, and of what kind it is."""
     profiles = um(np.array(form.newest))
     if len(profiles) < _FEWEST:
@@ -127,12 +127,13 @@ def _form(told: Gathered, form: Form) -> Iterator[Finding]:
         return
     yield from _trend(rms, form)
     count = len(profiles)
+    # The mean of so many revolutions still holds 1/count of the power that changes; the factor takes that out.
     mean = profiles.mean(axis=0)
     share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
     amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
     order = int(np.argmax(amplitude[1:])) + 1
-    left = ": what learning and its Q filter leave" if told.has(messages.LEARNING) else ""
-    causes = [*changing(told.nodes), *(["cut"] if told.has(messages.CUT) else []), *_speed(told)]
+    left = ": what learning and its Q filter leave" if data.has(messages.LEARNING) else ""
+    causes = [*changing(data.nodes), *(["cut"] if data.has(messages.CUT) else []), *_speed(data)]
     parts = [
         (1.0 - share, f"repeats from revolution to revolution, most at {order} UPR ({amplitude[order]:.3g} µm){left}"),
         (share, f"changes from revolution to revolution{': ' if causes else ''}{', '.join(causes)}"),
@@ -158,9 +159,9 @@ def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
         yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
 
 
-def _speed(told: Gathered) -> Iterator[str]:
+def _speed(data: Gathered) -> Iterator[str]:
     """By how much the spindle speed varies, if it does."""
-    for (_, name), series in told.curves.signals.items():
+    for (_, name), series in data.curves.signals.items():
         low, high = series.extremes
         if name == "speed_true" and low > 0.0 and math.isfinite(high):
             deviation = (high - low) / (high + low)

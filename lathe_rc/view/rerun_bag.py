@@ -78,6 +78,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
         LatheError: the bag is not whole, or the recording cannot be written.
     """
     scene = _scene(recording, bag, rate)
+    # Pieces of whole windows: the points of the curves then do not depend on where the bag is cut.
     header = stream.feed(bag, [scene], piece=max(scene.window, _PIECE // scene.window * scene.window))
     scene.close()
     return header.samples
@@ -98,6 +99,7 @@ def write(bag: Path, output: Path, *, rate: float = RERUN_RATE) -> int:
     if not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}")
     recording = rr.RecordingStream("lathe_rc", recording_id=name_of(bag))
+    # Rerun writes as it goes: under another name, so that a failure leaves an older file as it was.
     beside = output.with_name(f".{output.name}.{os.getpid()}")
     try:
         recording.save(beside)

@@ -21,7 +21,7 @@ from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_scene import Scene
-from lathe_rc.view.rerun_signals import wanted
+from lathe_rc.view.rerun_signals import drawn_fields
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -49,7 +49,7 @@ class Backlog:
         self._closed = False
 
     def put(self, *added: Message | None) -> None:
-        """Add messages; None: nobody sends any more."""
+        """Add messages; None: no publisher is left."""
         with self._news:
             for message in added:
                 size = len(message[2]) if message else 0
@@ -78,8 +78,8 @@ class Backlog:
             yield message
 
 
-class Order:
-    """Tells runs apart in what comes from many topics, each in its own order, none in step with the others.
+class RunOrder:
+    """Assigns the samples of many topics to runs; each topic has its own order, none is in step with the others.
 
     A run has a name, but equal scenarios have equal names: it also begins anew when a topic goes back. What a topic
     still brings of the run before goes on from where that topic was.
@@ -95,12 +95,14 @@ class Order:
         """Where samples of a topic belong: to the run that goes on, to a new one, or to the one before."""
         newest = max(self._ends.values(), default=0)
         if run == self._run and first >= self._ends.get(topic, 0):
+            # The same name twice in a row: a topic that is first heard may still belong to the run before, if it goes
+            # on from there and is ahead of all topics of this one.
             again = run == self._before and topic not in self._ends
             if again and newest < first and first >= self._old.get(topic, first + 1):
                 return "old"
             self._ends[topic] = end
             return "same"
-        if run == self._before != self._run and first >= self._old.get(topic, 0):
+        if run == self._before != self._run and first >= self._old.get(topic, 0):  # a late topic of the run before
             return "old"
         self._run, self._before = run, self._run
         self._ends, self._old = {topic: end}, self._ends
@@ -108,7 +110,7 @@ class Order:
 
 
 @dataclass
-class Shown:
+class ShownRun:
     """The view of a run.
 
     Attributes:
@@ -130,7 +132,7 @@ class Shown:
     complete: bool = False
 
 
-class _Run:
+class _RunView:
     """One run, on its way to a recording; a sink between `Pieces` and `Scene`.
 
     Args:
@@ -138,7 +140,7 @@ class _Run:
         types: message type by topic, of those that are known to be there.
         open_recording: makes its recording.
         rate: points of a curve in a second, at most.
-        say: tells people.
+        say: takes lines for the user.
     """
 
     def __init__(
@@ -152,10 +154,10 @@ class _Run:
         self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True)
         self._size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
         self._pieces = Pieces(types, self._size, self)
-        self._shown = Shown(block.run_id, file, end=block.first_index)
+        self._shown = ShownRun(block.run_id, file, end=block.first_index)
         self._begun = False
         self._types = dict(types)
-        self._ended = {topic: False for topic, kind in types.items() if wanted(kind)}
+        self._ended = {topic: False for topic, kind in types.items() if drawn_fields(kind)}
         self.message = self._pieces.message
 
     def block(self, topic: str, msgtype: str, block: Block) -> bool:
@@ -172,15 +174,15 @@ class _Run:
         return block.last and all(self._ended.values())
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Hand consecutive samples on to the scene, and what was left out before them."""
         if not self._begun:
             self._begun = True
             late = f" from {self._pieces.first * self._step_ns * 1e-9:.2f} s on" if self._pieces.first else ""
             self._say(f"{self._name} is shown{late}")
-        self._tell(first)
+        self._report_losses(first)
         self._scene.chunk(first, samples, dense, sparse)
 
-    def _tell(self, index: int) -> None:
+    def _report_losses(self, index: int) -> None:
         """Say what has been left out before a sample since this was last said."""
         if missing := self._pieces.lost - self._shown.left_out:
             self._shown.left_out = self._pieces.lost
@@ -189,11 +191,11 @@ class _Run:
             self._scene.note(index, text)
             self._say(f"{self._name}: {text}")
 
-    def close(self) -> Shown:
+    def close(self) -> ShownRun:
         """Show what is left, and end the recording."""
         shown = self._shown
         self._pieces.close()
-        self._tell(shown.end)
+        self._report_losses(shown.end)
         shown.first, shown.complete = self._pieces.first, all(self._ended.values())
         if not shown.complete:
             self._scene.note(shown.end, "the end of the run was not heard")
@@ -208,12 +210,12 @@ class _Run:
 
 
 class Live:
-    """Shows one run after the other.
+    """View of running cells, one run after the other.
 
     Args:
         open_recording: makes a recording of a name, and says what file it goes to.
         rate: points of a curve in a second, at most.
-        say: tells people.
+        say: takes lines for the user.
 
     Attributes:
         present: message type by topic, of all topics that can be heard; a run begins with these.
@@ -223,10 +225,10 @@ class Live:
     def __init__(self, open_recording: Open, *, rate: float, say: Callable[[str], None]) -> None:
         self._open, self._rate, self._say = open_recording, rate, say
         self.present: Mapping[str, str] = {}
-        self.shown: list[Shown] = []
-        self._order = Order()
+        self.shown: list[ShownRun] = []
+        self._order = RunOrder()
         self._decoders: dict[str, Decoder] = {}
-        self._run: _Run | None = None
+        self._run: _RunView | None = None
         self._over = False  # the run that goes on is; what still comes of it is passed over
         self._early: list[Sparse] = []  # before the first block
 
@@ -239,7 +241,7 @@ class Live:
         try:
             if msgtype in messages.block_types():
                 if topic not in self._decoders:
-                    self._decoders[topic] = Decoder(msgtype, sorted(wanted(msgtype)))
+                    self._decoders[topic] = Decoder(msgtype, sorted(drawn_fields(msgtype)))
                 block = self._decoders[topic].decode(data)
                 if self._belongs(topic, block.run_id, block.first_index, block.first_index + block.samples):
                     self._block(topic, msgtype, block)
@@ -254,7 +256,7 @@ class Live:
 
     def _block(self, topic: str, msgtype: str, block: Block) -> None:
         if self._run is None:
-            self._run = _Run(block, {**self.present, topic: msgtype}, self._open, self._rate, self._say)
+            self._run = _RunView(block, {**self.present, topic: msgtype}, self._open, self._rate, self._say)
             for message in self._early:
                 self._run.message(message)
         if self._run.block(topic, msgtype, block):
@@ -269,7 +271,7 @@ class Live:
         return where != "old" and not self._over
 
     def end(self) -> None:
-        """The run is over, or nobody is there any more to send the rest of it.
+        """Close the view of the run: it is over, or its publishers are gone.
 
         Raises:
             LatheError: the view cannot be written.

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 _HOST = "127.0.0.1"
 _START = 30.0  # [s] for a viewer to come up
-_LOOK = 0.05  # [s] between looks whether it has
+_POLL = 0.05  # [s] between attempts to reach it
 
 
 def require() -> None:
-    """Check that Rerun is there.
+    """Check that Rerun is installed.
 
     Raises:
         LatheError: it is not.
@@ -36,7 +36,10 @@ def require() -> None:
 
 
 def _free_port() -> int:
-    """A port that nobody listens on now."""
+    """Return a port that is free now.
+
+    Another program may take it before the viewer does: then the viewer does not start, which is reported.
+    """
     with socket.socket() as listener:
         listener.bind((_HOST, 0))
         return int(listener.getsockname()[1])
@@ -57,12 +60,12 @@ class Viewer:
     Attributes:
         options: of its command line.
         port: where it takes recordings.
-        said: what the user is told.
+        message: for the user.
     """
 
     options: list[str]
     port: int
-    said: str
+    message: str
 
     def start(self, *files: Path) -> "subprocess.Popen[bytes]":
         """Start it, with files to show; it gets no Ctrl-C of its own."""
@@ -74,7 +77,7 @@ class Viewer:
         )
 
 
-def end(process: "subprocess.Popen[bytes]") -> None:
+def end_viewer(process: "subprocess.Popen[bytes]") -> None:
     """End a viewer that was started: what Python started is but the parent of the viewer itself."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGTERM)
@@ -134,21 +137,21 @@ class Output:
             LatheError: it does not.
         """
         if self._kind == "connect":
-            self._reach(self._url)
+            self._check_viewer(self._url)
         if self._viewer:
             self._process = self._viewer.start()
             due = time.monotonic() + _START
             while not _answers(_HOST, self._viewer.port):
                 if self.ended or time.monotonic() > due:
-                    self.__exit__()
+                    self.__exit__()  # Python does not call it where __enter__ raises
                     raise LatheError("Rerun does not start")
-                time.sleep(_LOOK)
+                time.sleep(_POLL)
             self._url = f"rerun+http://{_HOST}:{self._viewer.port}/proxy"
-            print(self._viewer.said, file=sys.stderr)
+            print(self._viewer.message, file=sys.stderr)
         return self
 
     @staticmethod
-    def _reach(url: str) -> None:
+    def _check_viewer(url: str) -> None:
         """Refuse what is no viewer's URL, or one where nobody answers."""
         try:
             parts = urlsplit(url)
@@ -163,7 +166,7 @@ class Output:
     def __exit__(self, *exception: object) -> None:
         """End the viewer that was started."""
         if self._process:
-            end(self._process)
+            end_viewer(self._process)
 
     @property
     def ended(self) -> bool:

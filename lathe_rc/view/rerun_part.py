@@ -16,7 +16,7 @@ from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
 Array = npt.NDArray[np.float64]
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
-Edge = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
+Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
 COLOURS: Final = "turbo"  #: Rerun has it under the same name
 LOG_RANGE = (-1.5, 2.5)  #: of the colours: log10 of |form error| in µm
@@ -94,7 +94,7 @@ class Scale:
         return f"radius deviation ×{self.deviation / 1e3:.0f}, {along}"
 
 
-def edge(revolution: Revolution, scale: Scale) -> Edge:
+def ring(revolution: Revolution, scale: Scale) -> Ring:
     """The part in a revolution; two of them are a strip, see `TRIANGLES`."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
@@ -127,5 +127,6 @@ TOOL = (
 
 def rotations(angle: Array) -> Array:
     """Quaternions that turn the place under the tool at a spindle angle [rad] to it, shape (n, 4)."""
+    # A quaternion has half the angle, so that 4π is its period: with 2π its sign would jump at every revolution.
     half = -0.5 * np.mod(angle, 4.0 * np.pi)
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)

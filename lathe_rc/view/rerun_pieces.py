@@ -13,7 +13,7 @@ import numpy as np
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.view.rerun_signals import wanted
+from lathe_rc.view.rerun_signals import drawn_fields
 
 _AHEAD = 4  # pieces that wait for the topics that are late
 
@@ -24,7 +24,7 @@ def _length(signals: Mapping[str, Samples]) -> int:
     return next(iter(signals.values())).size
 
 
-def _joined(first: int, cuts: _Cuts) -> Signals | None:
+def _join(first: int, cuts: _Cuts) -> Signals | None:
     """The signals from a sample on; None if there is a gap."""
     for begin, signals in cuts:
         if begin != first:
@@ -60,7 +60,7 @@ class Pieces:
 
     def learn(self, types: Mapping[str, str]) -> None:
         """Wait for these topics as well from now on."""
-        new = {full(topic): fields for topic, kind in types.items() if (fields := wanted(kind))}
+        new = {full(topic): fields for topic, kind in types.items() if (fields := drawn_fields(kind))}
         if self._begun:
             self._late |= new.keys() - self._fields.keys()
         self._fields |= new
@@ -93,7 +93,7 @@ class Pieces:
         # Hand on what nothing more can come for, and what has waited long enough.
         complete = min(self._ends.get(each, 0) for each in self._fields) // size
         while self._waiting and ((oldest := min(self._waiting)) < complete or len(self._waiting) > _AHEAD):
-            self._give(oldest)
+            self._emit(oldest)
 
     def message(self, message: Sparse) -> None:
         """Take a message at a chosen sample."""
@@ -102,15 +102,15 @@ class Pieces:
     def close(self) -> None:
         """Hand on what is left."""
         while self._waiting:
-            self._give(min(self._waiting), closing=True)
+            self._emit(min(self._waiting), closing=True)
         if self._sparse:
             self._sink.chunk(
                 self._next * self._size, 0, {}, self._messages(max(each.index for each in self._sparse) + 1)
             )
 
-    def _give(self, piece: int, *, closing: bool = False) -> None:
+    def _emit(self, piece: int, *, closing: bool = False) -> None:
         begin = piece * self._size
-        joined = {topic: _joined(begin, cuts) for topic, cuts in self._waiting.pop(piece).items()}
+        joined = {topic: _join(begin, cuts) for topic, cuts in self._waiting.pop(piece).items()}
         samples = max((_length(signals) for signals in joined.values() if signals), default=0)
         dense = {topic: signals for topic, signals in joined.items() if signals and _length(signals) == samples}
         cut = samples < self._size and not (closing and not self._waiting)  # only the last may be short

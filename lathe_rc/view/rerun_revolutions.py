@@ -110,12 +110,13 @@ class Revolutions:
             return
         self._step = float(step[-1])
         if self._entire is None:
+            # Its first sample is less than a step behind its beginning; half a step more for a speed that varies.
             self._entire = bool(turns[0] % 1.0 <= 1.5 * step[0])
         begins = [0] * self._entire + (np.flatnonzero(np.diff(np.floor(turns))) + 1).tolist()
         for a, b in pairwise(begins):
             yield from _measured(held[:, a:b], step[a:b], start + b)
         self._entire = bool(begins) and turns.size - begins[-1] <= _LONGEST
-        self._held = held[:, begins[-1] if self._entire else -1 :]
+        self._held = held[:, begins[-1] if self._entire else -1 :]  # one sample at least, for the step to the next
 
     def finish(self) -> Iterator[Revolution]:
         """The last revolution, if less than two samples of it are missing."""

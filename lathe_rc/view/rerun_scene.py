@@ -22,7 +22,7 @@ from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, envelope, supervisor
+from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
 
 _POSES = 250.0  # of part and tool in a second
 _ROWS = 512  # of the map
@@ -74,7 +74,7 @@ class Scene:
         self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
         self._scale: parts.Scale | None = None
         self._revolutions = Revolutions()
-        self._edge: parts.Edge | None = None
+        self._ring: parts.Ring | None = None
         self._rows: list[npt.NDArray[np.float16]] = []
         self._every = 1  # how many-th revolution has a row and a ring
         self._sent = 0  # rows
@@ -96,24 +96,24 @@ class Scene:
         self._describe()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`.
+        """Log consecutive samples and the messages among them.
 
         Raises:
             LatheError: the recording cannot be written, or no part can have been turned with such an angle.
         """
         del samples
-        self._begin(first)
+        self._log_nominal(first)
         named = {full(topic): signals for topic, signals in dense.items()}
         angle = named[self._encoder]["angle_true"] if self._encoder in named else None
         turns = None if angle is None else angle / (2.0 * np.pi)
         for topic, signals in named.items():
             for field, curve in self._curves.get(topic, {}).items():
-                self._curve(curve_path(topic, field), first, signals[field] * curve.scale, turns)
+                self._log_curve(curve_path(topic, field), first, signals[field] * curve.scale, turns)
         for topic, found in sparse.items():
             if found:
-                self._tell(full(topic), found)
+                self._log_messages(full(topic), found)
         if angle is not None and self._tool in named:
-            self._part(first, angle, named[self._tool])
+            self._log_part(first, angle, named[self._tool])
 
     def close(self) -> None:
         """Log what is left and wait until it is written; the recording stays open.
@@ -121,10 +121,10 @@ class Scene:
         Raises:
             LatheError: it cannot be written.
         """
-        self._form(list(self._revolutions.finish()))
+        self._log_revolutions(list(self._revolutions.finish()))
         if self._newest and self._sent != len(self._rows):
             self._send_map(self._newest)
-        with _written():
+        with _write_errors():
             self._recording.flush(timeout_sec=_FLUSH if self._live else _EVER)
 
     def note(self, index: int, text: str) -> None:
@@ -169,28 +169,28 @@ class Scene:
         self._static("machine/scale", scale)
 
     def _static(self, path: str, what: rr.AsComponents) -> None:
-        with _written():
+        with _write_errors():
             self._recording.log(path, what, static=True, strict=True)
 
     # --- pieces
 
-    def _begin(self, first: int) -> None:
+    def _log_nominal(self, first: int) -> None:
         """A supervisor says nothing until it changes: until then the cell is nominal."""
         for topic, kind in self._types.items():
             if kind == messages.SAFETY_STATUS and topic not in self._nominal:
                 self._nominal.add(topic)
                 colours = np.array(list(STATE_COLOURS.values()), dtype=np.uint32)
                 self._static(supervisor(topic), rr.StateConfiguration(values=list(STATE_COLOURS), colors=colours))
-                self._change(supervisor(topic), next(iter(STATE_COLOURS)), first)
+                self._log_state(supervisor(topic), next(iter(STATE_COLOURS)), first)
 
-    def _curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
+    def _log_curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
         """Points of a curve."""
-        at = envelope(values, self.window)
+        at = extreme_samples(values, self.window)
         self.points += at.size
         number = None if turns is None else np.floor(turns[at]) + 1
         self._send(path, rr.Scalars.columns(scalars=values[at]), first + at, number)
 
-    def _tell(self, topic: str, found: list[Sparse]) -> None:
+    def _log_messages(self, topic: str, found: list[Sparse]) -> None:
         """The controllers' reports of their cycles, and events."""
         index, kind = np.array([message.index for message in found]), found[0].type
         if kind in CYCLES:
@@ -201,11 +201,11 @@ class Scene:
         elif kind in LOGGED:
             for message in found:
                 if change := band(message):
-                    self._change(*change, message.index)
+                    self._log_state(*change, message.index)
             texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
             self._send("events", rr.TextLog.columns(text=texts), index)
 
-    def _part(self, first: int, angle: Samples, tool: Signals) -> None:
+    def _log_part(self, first: int, angle: Samples, tool: Signals) -> None:
         """The part, the tool and the form error."""
         error, reference, height = tool["error"], tool["reference"], tool["height"]
         if self._scale is None:
@@ -221,11 +221,11 @@ class Scene:
             place[:, 0] = self._scale.x((reference - error)[at])
             place[:, 2] = self._scale.z(turns, height[at])
             self._send("machine/tool", rr.Transform3D.columns(translation=place), *when)
-        self._form(list(self._revolutions.add(first, angle, error, reference, height)))
+        self._log_revolutions(list(self._revolutions.add(first, angle, error, reference, height)))
 
     # --- revolutions
 
-    def _form(self, complete: list[Revolution]) -> None:
+    def _log_revolutions(self, complete: list[Revolution]) -> None:
         """Rings, rows, spectra and the learning curve of revolutions that are complete."""
         if not complete:
             return
@@ -233,27 +233,28 @@ class Scene:
         self.revolutions += len(complete)
         for name in ("rms", "largest"):
             values = parts.log_um(np.array([getattr(revolution, name) for revolution in complete]))
-            self._send(f"learning/form_error/{name}", rr.Scalars.columns(scalars=values), *_when(complete))
+            self._send(f"learning/form_error/{name}", rr.Scalars.columns(scalars=values), *_times_of(complete))
         rings: list[Revolution] = []
-        strips: list[parts.Edge] = []
+        strips: list[parts.Ring] = []
         for revolution in complete:
             bars = rr.BarChart.columns(values=revolution.harmonics()[1:] * 1e6, abscissa=_BARS)
-            self._send("form_error/spectrum", bars, *_when([revolution]))
+            self._send("form_error/spectrum", bars, *_times_of([revolution]))
             if (revolution.number - 1) % self._every == 0:
                 assert self._scale is not None
-                after = parts.edge(revolution, self._scale)
-                strips += [self._edge or after, after]
-                self._edge = after
+                after = parts.ring(revolution, self._scale)
+                strips += [self._ring or after, after]
+                self._ring = after
                 rings.append(revolution)
-                self._row(revolution)
+                self._add_row(revolution)
         if rings:
             vertices, normals, colours = map(np.concatenate, zip(*strips, strict=True))
             columns = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals, vertex_colors=colours)
-            self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_when(rings))
+            self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_times_of(rings))
 
-    def _row(self, revolution: Revolution) -> None:
+    def _add_row(self, revolution: Revolution) -> None:
         """Add a row to the map; when it is full, every second one goes."""
-        self._rows.append(parts.log_um(revolution.error).astype(np.float16))
+        self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the scale of colours
+        # Each map is sent whole: after a part more rows, so that all of them together stay a multiple of the last.
         if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
             self._send_map(revolution)
         if len(self._rows) == _ROWS:
@@ -267,11 +268,11 @@ class Scene:
         names = ["revolution" if self._every == 1 else f"revolution / {self._every}", f"angle / {360 // ANGLES}°"]
         tensor = rr.encodings.TensorData(array=np.stack(self._rows), dim_names=names)
         columns = rr.Tensor.columns(data=tensor, value_range=[parts.LOG_RANGE])
-        self._send("form_error/map", columns, *_when([revolution]))
+        self._send("form_error/map", columns, *_times_of([revolution]))
 
     # --- sending
 
-    def _change(self, path: str, state: str, index: int) -> None:
+    def _log_state(self, path: str, state: str, index: int) -> None:
         self._send(path, rr.StateChange.columns(state=[state]), np.array([index]))
 
     def _send(
@@ -281,17 +282,17 @@ class Scene:
         when = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
         if revolution is not None:
             when.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
-        with _written():
+        with _write_errors():
             self._recording.send_columns(path, when, columns, strict=True)
 
 
-def _when(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
+def _times_of(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
     """Samples after revolutions, and their numbers."""
     return np.array([each.end for each in revolutions]), np.array([each.number for each in revolutions])
 
 
 @contextlib.contextmanager
-def _written() -> Iterator[None]:
+def _write_errors() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError) as error:

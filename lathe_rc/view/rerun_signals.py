@@ -85,14 +85,14 @@ def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
     return found | slides
 
 
-def wanted(msgtype: str) -> set[str]:
+def drawn_fields(msgtype: str) -> set[str]:
     """The fields of a block type that a scene uses."""
     return set(_CURVES.get(msgtype, {})) | _PART.get(msgtype, set())
 
 
-def drawn(msgtype: str) -> bool:
+def is_drawn(msgtype: str) -> bool:
     """Whether a scene has any use for messages of a type."""
-    return bool(wanted(msgtype)) or msgtype in CYCLES or msgtype in LOGGED
+    return bool(drawn_fields(msgtype)) or msgtype in CYCLES or msgtype in LOGGED
 
 
 def curve_path(topic: str, field: str) -> str:
@@ -100,7 +100,7 @@ def curve_path(topic: str, field: str) -> str:
     return f"signals{full(topic)}/{field}"
 
 
-def envelope(values: Samples, window: int) -> npt.NDArray[np.intp]:
+def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
     """Places of the smallest and the largest value in every ``window`` samples, in order.
 
     What is drawn of a signal are then samples of it at their own times, and no peak is lost.
@@ -114,6 +114,7 @@ def envelope(values: Samples, window: int) -> npt.NDArray[np.intp]:
     """
     if window <= 2 or not values.size:
         return np.arange(values.size)
+    # Copies of the last value: argmin and argmax give the first of equal ones, and so never a place beyond the end.
     rows = np.pad(values, (0, -values.size % window), mode="edge").reshape(-1, window)
     ends = np.sort([rows.argmin(axis=1), rows.argmax(axis=1)], axis=0)
     keep = np.stack([np.ones(len(rows), dtype=bool), ends[0] != ends[1]], axis=1)
