@@ -259,7 +259,9 @@ def run(parameters: CouplingParameters, track: Track = untracked) -> CouplingRes
         moved.append(state[last, 0] - true["position"][last])
         made = acts[delay : delay + samples]
         invented.append(_energy(parameters, state[last, 1], acts[:samples][last], made[last]))
-        slowed.append(_spun(parameters, _SPINDLE_TURNS * turn, delay)[-turn:] - swinging)
+        # A delay of one sample is the reference itself: the run that takes longest, since every sample is a block.
+        late = swinging if delay == 1 else _spun(parameters, _SPINDLE_TURNS * turn, delay)[-turn:]
+        slowed.append(late - swinging)
     return CouplingResult(
         parameters,
         angle[last],

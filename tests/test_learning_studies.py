@@ -6,38 +6,21 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from matplotlib.figure import Figure
 
 from lathe_papers.formulas.tuning import LIMITS
 from lathe_papers.speed_deviation import LAWS
-from lathe_rc import cli
 from lathe_rc.commands.study import read
 from lathe_rc.study import STUDIES
 
 
 @functools.cache
 def study(name, **parameters):
-    """The result of a study, as it is printed."""
+    """The result of a study, as it is printed, once its figure has been drawn."""
     subject = STUDIES[name]
-    given = read(subject, [f"{key}={value}" for key, value in parameters.items()])
-    return json.loads(json.dumps(subject.run(given).to_json(), allow_nan=False))
-
-
-def command(folder, name, **parameters):
-    """The result of a study as its command prints it, when it has drawn its figure."""
-    changes = [part for key, value in parameters.items() for part in ("--set", f"{key}={value}")]
-    place = folder / "figure.png"
-    result = CliRunner().invoke(cli.main, ["study", name, *changes, "--figure", str(place), "--json"])
-    assert result.exit_code == 0, result.output
-    assert place.read_bytes().startswith(b"\x89PNG")
-    found = json.loads(result.stdout)
-    assert found.pop("figure") == str(place)
-    return found
-
-
-def test_the_command_prints_what_the_study_finds(tmp_path):
-    parameters = {"omega": 500, "samples_per_revolution": 128}
-    assert command(tmp_path, "multichannel", **parameters) == study("multichannel", **parameters)
+    result = subject.run(read(subject, [f"{key}={value}" for key, value in parameters.items()]))
+    result.draw(Figure())
+    return json.loads(json.dumps(result.to_json(), allow_nan=False))
 
 
 # In the order of the spec; second-order inverse with dΩ/dt and exact preview stand last.
@@ -47,14 +30,7 @@ ORDER = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"wd": "40,300", "harmonic": 4, "amplitude_um": 60},
-        {"wd": "25", "harmonic": 1},
-    ],
-)
+@pytest.mark.parametrize("settings", [{}, {"wd": 40, "harmonic": 4, "amplitude_um": 60}])
 def test_ordering_of_the_laws_holds_at_every_frequency(settings):
     found = study("speed-deviation", **settings)
     assert set(found) == {"wd", "max_um", "rms_um"}
@@ -74,12 +50,11 @@ def test_figures_of_the_paper_s_three_frequencies():
     assert np.ptp(found["exact_invariance"]) < 1e-3 * found["exact_invariance"][0]
 
 
-def test_learning_that_goes_on_depends_on_the_cycle(tmp_path):
+def test_learning_that_goes_on_depends_on_the_cycle():
     """106 and 213 rad/s are nearly synchronous with the revolution, so that a memory can learn the deviation."""
-    frozen, learning = (
-        command(tmp_path, "speed-deviation", wd=106, protocol=protocol)["max_um"] for protocol in ("frozen", "learning")
-    )
-    assert learning["constant_lead"][0] < 0.3 * frozen["constant_lead"][0]
+    frozen, learning = study("speed-deviation"), study("speed-deviation", wd=106, protocol="learning")
+    place = frozen["wd"].index(106.0)
+    assert learning["max_um"]["constant_lead"][0] < 0.3 * frozen["max_um"]["constant_lead"][place]
 
 
 @pytest.mark.parametrize("correction", ["none", "lead_lag"])
@@ -92,8 +67,6 @@ def test_table_of_paper_001(correction):
     assert np.all(np.abs(analytic / printed - 1) < limits)
     assert np.all(np.abs(simulated / analytic - 1) < 0.01)
     assert max(found["sup_q_minus_z"].values()) < 1.0
-    if correction == "none":
-        np.testing.assert_allclose(found["contraction"]["coarse"], [0.259, 0.506, 0.652, 0.744], atol=5e-4)
 
 
 @pytest.mark.parametrize(("samples", "low", "high"), [(128, 0.05, 0.13), (512, 1e-4, 0.013), (2048, 1e-6, 7e-4)])
@@ -102,14 +75,14 @@ def test_coarse_sampling_errs_as_the_spec_says(samples, low, high):
 
     Also at a frequency that the paper does not have.
     """
-    found = study("multichannel", samples_per_revolution=samples, omega="500,1234.5,2000")
+    found = study("multichannel", samples_per_revolution=samples, omega="1234.5,2000")
     assert all(row[1] is None for row in found["printed"])
     worst = np.abs(np.array(found["simulated"]) / found["analytic"] - 1).max()
     assert low < worst < high
 
 
-def test_piston_in_the_four_structures(tmp_path):
-    found = command(tmp_path, "piston", height_mm=5)
+def test_piston_in_the_four_structures():
+    found = study("piston", height_mm=5)
     for measure in ("max_um", "rms_um"):
         analytic, simulated = np.array(found["analytic"][measure]), np.array(found["simulated"][measure])
         np.testing.assert_allclose(simulated[:2], analytic[:2], rtol=0.02)

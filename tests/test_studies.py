@@ -12,11 +12,11 @@ from cells import cuts, in_blocks
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 
 from lathe_papers import angle_domain, drive_models, invariance
 from lathe_papers.angle_domain import AngleDomainParameters
-from lathe_papers.drive_models import DriveModelsParameters
 from lathe_papers.formulas.invariance import FirstOrderInvariance
 from lathe_papers.formulas.loaded import compliance
 from lathe_papers.formulas.regeneration import Regeneration
@@ -31,30 +31,19 @@ from lathe_rc.study import STUDIES
 from lathe_rc.transfer import TransferFunction
 
 KEYS = {
-    "invariance": [
-        "speeds", "angles", "corrected", "uncorrected", "max_spread_corrected", "max_spread_uncorrected",
-        "deviation_amplitude", "deviation_frequencies", "deviation_spread_corrected", "deviation_spread_uncorrected",
-        "deviation_spread_wrong_order", "figure",
-    ],
-    "angle-domain": [
-        "amplitudes", "frequencies", "tolerance", "gost", "exact", "quasi_static", "linearised",
-        "good_to_exact", "good_to_quasi_static", "good_to_linearised", "figure",
-    ],
-    "drive-models": ["file", "time_s", "measured", "harmonic_rad_s", "models", "figure"],
-    "sampled-servo": ["table", "links", "series", "uncorrected", "analog", "figure"],
-    "saturation": [
-        "period_max_error", "u_max", "memory_max", "corners", "saturated_samples", "integrator", "eq_15", "eq_14",
-        "learning", "required_u", "checks", "curves", "figure",
-    ],
-    "decoupling": [
-        "preset", "plant", "stability", "robustness", "single_loop", "cross", "noise", "delay", "engagement",
-        "reduced_order", "figure",
-    ],
-    "coupling": [
-        "delays", "position_difference", "invented_energy", "limits", "speed_deviation", "speed_difference",
-        "edge_difference", "angle", "force", "moved", "speed", "slowed", "figure",
-    ],
-}  # fmt: skip
+    "invariance": "speeds angles corrected uncorrected max_spread_corrected max_spread_uncorrected "
+    "deviation_amplitude deviation_frequencies deviation_spread_corrected deviation_spread_uncorrected "
+    "deviation_spread_wrong_order",
+    "angle-domain": "amplitudes frequencies tolerance gost exact quasi_static linearised "
+    "good_to_exact good_to_quasi_static good_to_linearised",
+    "drive-models": "file time_s measured harmonic_rad_s models",
+    "sampled-servo": "table links series uncorrected analog",
+    "saturation": "period_max_error u_max memory_max corners saturated_samples integrator eq_15 eq_14 learning "
+    "required_u checks curves",
+    "decoupling": "preset plant stability robustness single_loop cross noise delay engagement reduced_order",
+    "coupling": "delays position_difference invented_energy limits speed_deviation speed_difference "
+    "edge_difference angle force moved speed slowed",
+}
 #: settings with which a study takes a moment only
 QUICK = {
     "invariance": ["deviation_frequencies=213"],
@@ -63,7 +52,7 @@ QUICK = {
     "sampled-servo": ["t=0.16"],
     "saturation": ["periods=2", "step_ms=10"],
     "decoupling": ["seconds=4"],
-    "coupling": ["delays=16,64"],
+    "coupling": ["delays=1,16,64"],
 }
 
 
@@ -78,27 +67,27 @@ def folder(tmp_path, monkeypatch):
 
 def study(*arguments, sets=()):
     options = [part for override in sets for part in ("--set", override)]
-    return CliRunner().invoke(main, ["study", *arguments, *options])
+    return CliRunner(env={"COLUMNS": "80"}).invoke(main, ["study", *arguments, *options])
 
 
 @functools.cache
 def quick(name):
-    """The result of a study with its quick settings, and how much of its loop it has told."""
-    seen = []
+    """The result of a study with its quick settings, and the items that its progress has counted."""
+    items = []
 
-    def track(items):
-        for item in items:
-            seen.append(item)
+    def track(sequence):
+        for item in sequence:
+            items.append(item)
             yield item
 
-    return STUDIES[name].run(read(STUDIES[name], QUICK[name]), track), len(seen)
+    return STUDIES[name].run(read(STUDIES[name], QUICK[name]), track), items
 
 
-def told(name, sets=()):
+def printed(name, sets=()):
     """The result of a study, as it is printed; no figure is drawn, which takes longest."""
     subject = STUDIES[name]
-    found = subject.run(read(subject, sets)) if sets else quick(name)[0]
-    return json.loads(json.dumps(found.to_json(), allow_nan=False))
+    result = subject.run(read(subject, sets)) if sets else quick(name)[0]
+    return json.loads(json.dumps(result.to_json(), allow_nan=False))
 
 
 # --- the frame
@@ -111,62 +100,39 @@ def test_without_a_name_the_studies_are_listed():
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_help_lists_the_parameters(name):
+def test_help_lists_the_parameters_whose_defaults_are_allowed(name):
     result = study(name, "--help")
     assert result.exit_code == 0
     for row in STUDIES[name].parameters.rows().values():
         assert row.name in result.stdout
         assert row.unit == "1" or f"[{row.unit}]" in result.stdout
-
-
-@pytest.mark.parametrize("name", STUDIES)
-def test_parameters_have_defaults_within_their_limits(name):
     assert STUDIES[name].parameters().model_dump()
 
 
 @pytest.mark.parametrize("name", KEYS)
-def test_json_has_exactly_the_promised_keys(folder, name, monkeypatch):
-    """A study prints one line of JSON with these keys and what Python finds, draws its figure and says nothing more."""
-
-    def refuse(constant):
-        raise ValueError(constant)
-
-    computed = replace(STUDIES[name], run=lambda _parameters, _track: quick(name)[0])
+def test_study_prints_a_table_or_json_and_draws_a_figure(folder, name, monkeypatch):
+    """A table of 80 columns, or one line of JSON with exactly the promised keys; nothing on the error stream."""
+    result, items = quick(name)
+    assert items
+    with pytest.raises(FrozenInstanceError):
+        setattr(result, fields(result)[0].name, None)
+    computed = replace(STUDIES[name], run=lambda _parameters, _track: result)
     monkeypatch.setattr(commands_study, "STUDIES", {name: computed})
-    result = study(name, "--json", sets=QUICK[name])
-    assert result.exit_code == 0, result.stderr
-    assert result.stdout.count("\n") == 1
-    assert result.stderr == ""
-    printed = json.loads(result.stdout, parse_constant=refuse)
-    assert list(printed) == KEYS[name]
-    assert printed == {**told(name), "figure": f"study-{name}.png"}
+    as_json = study(name, "--json", sets=QUICK[name])
+    assert (as_json.exit_code, as_json.stderr) == (0, "")
+    assert as_json.stdout.count("\n") == 1
+    assert list(json.loads(as_json.stdout)) == [*KEYS[name].split(), "figure"]
+    assert json.loads(as_json.stdout) == {**printed(name), "figure": f"study-{name}.png"}
     assert [path.name for path in folder.iterdir()] == [f"study-{name}.png"]
     assert (folder / f"study-{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("name", KEYS)
-def test_people_get_a_table_of_80_columns_and_the_place_of_the_figure(name, monkeypatch):
-    places = []
-    computed = replace(STUDIES[name], run=lambda _parameters, _track: quick(name)[0])
-    monkeypatch.setattr(commands_study, "STUDIES", {name: computed})
-    monkeypatch.setattr(commands_study, "_save", lambda _study, _result, path: places.append(str(path)))
-    result = CliRunner(env={"COLUMNS": "80"}).invoke(
-        main, ["study", name, "--figure", "a.png", *(p for s in QUICK[name] for p in ("--set", s))]
-    )
-    assert result.exit_code == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == "figure: a.png"
-    assert max(map(len, result.stdout.splitlines())) <= 80
-    assert "…" not in result.stdout
-    assert result.stderr == ""
-    assert places == ["a.png"]
-
-
-@pytest.mark.parametrize("name", KEYS)
-def test_result_is_frozen_and_its_loop_is_told(name):
-    found, seen = quick(name)
-    assert seen
-    with pytest.raises(FrozenInstanceError):
-        setattr(found, fields(found)[0].name, None)
+    paths = []
+    monkeypatch.setattr(commands_study, "_save", lambda _study, _result, path: paths.append(str(path)))
+    table = study(name, "--figure", "a.png", sets=QUICK[name])
+    assert (table.exit_code, table.stderr) == (0, "")
+    assert table.stdout.splitlines()[-1] == "figure: a.png"
+    assert max(map(len, table.stdout.splitlines())) <= 80
+    assert "…" not in table.stdout
+    assert paths == ["a.png"]
 
 
 @pytest.mark.parametrize(
@@ -177,20 +143,13 @@ def test_result_is_frozen_and_its_loop_is_told(name):
         (["invariance", "--set", "t0_ms"], "--set 't0_ms'; allowed: PARAM=VALUE"),
         (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; did you mean t0_ms?"),
         (["invariance", "--set", "t0_ms=0"], "invariance.t0_ms = 0; allowed: a finite number above 0 up to 1000 [ms]"),
-        (["invariance", "--set", "t0_ms=nan"], "invariance.t0_ms = nan; allowed: a finite number"),
         (["invariance", "--set", "t0_ms=2,3"], "invariance.t0_ms = '2,3'; allowed: a finite number"),
-        (["invariance", "--set", "t0_ms=[2]"], "invariance.t0_ms = [2]; allowed: a finite number"),
-        (["invariance", "--set", "t0_ms="], "invariance.t0_ms = ''; allowed: a finite number"),
         (["invariance", "--set", "t0_ms=[2"], "--set t0_ms"),
-        (["invariance", "--set", "t0_ms={a: 2}"], "--set t0_ms"),
         (["invariance", "--set", "speeds=84,fast"], "invariance.speeds = [84, 'fast']; allowed: a list, each a finite"),
-        (["invariance", "--set", "speeds=84,-1"], "invariance.speeds = [84, -1]; allowed: a list"),
         (["invariance", "--set", "speeds=[]"], "invariance.speeds = ['']; allowed: a list"),
-        (["invariance", "--set", "speeds=84,,126"], "invariance.speeds = [84, '', 126]; allowed: a list"),
         (["invariance", "--set", "speeds=1,105"], "allowed: from 10.5 rad/s"),
         (["angle-domain", "--set", "waves=2.5"], "angle-domain.waves = 2.5; allowed: an integer from 1"),
         (["angle-domain", "--set", "amplitudes=0.1"], "amplitudes = [0.1]; allowed: two or more, increasing"),
-        (["angle-domain", "--set", "frequencies=9,8"], "frequencies = [9.0, 8.0]; allowed: two or more, increasing"),
         (["drive-models", "--set", "file=no.csv"], "no.csv: cannot be read"),
         (["drive-models", "--figure", "a.pdf"], "--figure a.pdf; allowed: a file name that ends in .png"),
         (["drive-models", "--figure", "no/a.png"], "no such folder"),
@@ -208,14 +167,11 @@ def test_bad_input_is_refused_in_one_line(folder, arguments, text):
 
 @pytest.mark.parametrize("text", ["84,105,126.5", "[84, 105, 126.5]", " 84 , 1.05e2,126.5"])
 def test_lists_are_numbers_with_commas(text):
-    assert told("invariance", sets=["deviation_frequencies=213", f"speeds={text}"])["speeds"] == [84.0, 105.0, 126.5]
+    assert read(STUDIES["invariance"], [f"speeds={text}"]).speeds == [84.0, 105.0, 126.5]
 
 
 def test_one_number_is_a_list_of_one_and_the_last_setting_counts():
-    assert told("invariance", sets=[*QUICK["invariance"], "speeds=84,105", "speeds=120"])["speeds"] == [120.0]
-
-
-def test_empty_lists_are_refused_from_python_too():
+    assert read(STUDIES["invariance"], ["speeds=84,105", "speeds=120"]).speeds == [120.0]
     with pytest.raises(InputError, match="at least one"):
         InvarianceParameters(speeds=[])
 
@@ -285,7 +241,7 @@ def test_spindle_may_stand_but_not_turn_back():
 
 
 def test_corrected_responses_coincide_and_others_do_not():
-    found = told("invariance")
+    found = printed("invariance")
     corrected_, alone, angles = (np.array(found[key]) for key in ("corrected", "uncorrected", "angles"))
     assert corrected_.shape == alone.shape == (3, angles.size)
     assert_allclose(corrected_, np.tile(-np.expm1(-angles / 0.21), (3, 1)), atol=1e-6)
@@ -296,7 +252,7 @@ def test_corrected_responses_coincide_and_others_do_not():
 
 
 def test_deviation_changes_nothing_in_the_right_order_only():
-    found = told("invariance", sets=["deviation_frequencies=10.7,213,1000"])
+    found = printed("invariance", sets=["deviation_frequencies=10.7,213,1000"])
     right, wrong, alone = (
         np.array(found[f"deviation_spread_{chain}"]) for chain in ("corrected", "wrong_order", "uncorrected")
     )
@@ -318,7 +274,7 @@ def test_at_constant_speed_the_order_does_not_matter():
 
 
 def test_errors_stand_by_amplitude_and_frequency():
-    found = told("angle-domain")
+    found = printed("angle-domain")
     for kind in ("exact", "quasi_static", "linearised"):
         assert np.shape(found[kind]) == (2, 2)
     errors = np.array(found["quasi_static"])
@@ -333,21 +289,22 @@ def test_good_to_is_the_last_frequency_within_the_tolerance():
     found = angle_domain.run(
         AngleDomainParameters(amplitudes=[0.01, 0.1, 0.3], frequencies=[10.0, 50.0, 200.0], tolerance=2e-3)
     )
-    told_ = found.to_json()
+    by_key = found.to_json()
     for kind in ("exact", "quasi_static", "linearised"):
-        for row, limit in zip(told_[kind], told_[f"good_to_{kind}"], strict=True):
-            good = [f for f, error in zip(told_["frequencies"], row, strict=True) if error <= 2e-3]
+        for row, limit in zip(by_key[kind], by_key[f"good_to_{kind}"], strict=True):
+            good = [f for f, error in zip(by_key["frequencies"], row, strict=True) if error <= 2e-3]
             assert limit == (max(good) if good else None)
-    assert told_["good_to_exact"] == [200.0] * 3
-    assert told_["good_to_quasi_static"] == [200.0, 50.0, 10.0]
-    assert told_["good_to_linearised"][2] is None
+    assert by_key["good_to_exact"] == [200.0] * 3
+    assert by_key["good_to_quasi_static"] == [200.0, 50.0, 10.0]
+    assert by_key["good_to_linearised"][2] is None
 
 
-def test_figure_of_a_map_that_is_good_or_bad_everywhere():
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("tolerance", [0.9, 1e-12])
+def test_figure_of_a_map_that_is_good_or_bad_everywhere(tolerance):
     """No contour of the tolerance then, and no warning."""
-    for tolerance in ("0.9", "1e-12"):
-        result = study("angle-domain", "--json", sets=[*QUICK["angle-domain"], f"tolerance={tolerance}"])
-        assert (result.exit_code, result.stderr) == (0, "")
+    found = quick("angle-domain")[0]
+    replace(found, parameters=found.parameters.model_copy(update={"tolerance": tolerance})).draw(Figure())
 
 
 # --- drive models
@@ -359,7 +316,7 @@ def model(found, name, *, fitted=True):
 
 
 def test_fits_of_the_simulated_drive():
-    found = told("drive-models")
+    found = printed("drive-models")
     assert found["file"] is None
     assert model(found, "first order")["parameters"]["time_constant"] == pytest.approx(2e-3, rel=0.02)
     assert model(found, "delay")["parameters"]["delay"] == pytest.approx(2e-3, rel=0.1)
@@ -374,29 +331,24 @@ def test_fits_of_the_simulated_drive():
 
 def test_learning_with_each_model():
     """|Q - Z| by hand at the oval's harmonic; where the inverse is that of the drive only Q is left."""
-    found = told("drive-models")
+    found = printed("drive-models")
     omega = 2 * 1000 * np.pi / 30
     q = 1 / (1 + (omega * 130e-6) ** 2)
     drive = SecondOrder(1038.0, 0.804, 0.36e-3).response(np.array([omega]))[0]
     assert found["harmonic_rad_s"] == pytest.approx(omega)
     assert model(found, "second order with delay")["contraction"] == pytest.approx(1 - q, rel=0.02)
-    printed = model(found, "delay", fitted=False)
-    assert printed["contraction"] == pytest.approx(abs(q - drive * np.exp(2e-3j * omega)), rel=1e-6)
+    delay = model(found, "delay", fitted=False)
+    assert delay["contraction"] == pytest.approx(abs(q - drive * np.exp(2e-3j * omega)), rel=1e-6)
     first = model(found, "first order", fitted=False)
     assert first["contraction"] == pytest.approx(abs(q - drive * (1 + 2e-3j * omega)), rel=1e-6)
-    converges = {m["name"]: m["converges"] for m in found["models"] if m["fitted"]}
-    assert converges == {
-        "first order": False,
-        "delay": True,
-        "second order": False,
-        "second order with delay": True,
-    }
+    converging = [m["name"] for m in found["models"] if m["fitted"] and m["converges"]]
+    assert converging == ["delay", "second order with delay"]
 
 
 def test_lead_of_the_paper_needs_its_filter():
     """T0 = 2 ms converges with Q of 104 µs and more (spec)."""
     for q_time, converges in (("100e-6", False), ("108e-6", True)):
-        found = told("drive-models", sets=[f"q_time={q_time}"])
+        found = printed("drive-models", sets=[f"q_time={q_time}"])
         assert model(found, "delay", fitted=False)["converges"] is converges
 
 
@@ -405,27 +357,24 @@ def test_measured_response_takes_the_place_of_the_simulated(folder):
     response = SecondOrder(500.0, 1.2, 1e-3).step(time)
     rows = "".join(f"{t * 1e3},{h}\n" for t, h in zip(time, response, strict=True))
     (folder / "step.csv").write_text("time_ms,response\n" + rows)
-    found = told("drive-models", sets=["file=step.csv"])
+    found = printed("drive-models", sets=["file=step.csv"])
     assert found["file"] == "step.csv"
     assert_allclose(found["measured"], response)
     best = model(found, "second order with delay")["parameters"]
     assert best == pytest.approx({"natural_frequency": 500.0, "damping": 1.2, "delay": 1e-3}, rel=1e-3)
-    by_python = drive_models.run(DriveModelsParameters(file="step.csv"))
-    assert by_python.to_json()["models"] == found["models"]
 
 
-def test_step_test_has_no_half_step_of_latency():
+@pytest.mark.parametrize("drive", [SecondOrder(1038.0, 0.804, 0.36e-3), SecondOrder(100.0, 3.0), SecondOrder(5e3, 0.1)])
+def test_step_test_has_no_half_step_of_latency(drive):
     """The simulated measurement is the step response itself, for any drive."""
-    for wn, damping, delay in ((1038.0, 0.804, 0.36e-3), (100.0, 3.0, 0.0), (5000.0, 0.1, 1e-3)):
-        true = SecondOrder(wn, damping, delay)
-        found = drive_models.run(DriveModelsParameters(natural_frequency=wn, damping=damping, delay=delay))
-        assert_allclose(found.measured.response, true.step(found.measured.time), atol=2e-3)
-        assert found.measured.rms(true) < 3e-4
+    measured = drive_models._simulated(drive)
+    assert_allclose(measured.response, drive.step(measured.time), atol=2e-3)
+    assert measured.rms(drive) < 3e-4
 
 
 def test_a_delay_between_drive_and_cut_lowers_the_limit_of_chatter_and_brings_energy_in():
     """Without a delay the limit is that of `Regeneration`; the error of the edge grows with the delay from 0 on."""
-    found = told("coupling", sets=["delays=1,16,64"])
+    found = printed("coupling")
     give = compliance(natural_frequency=1038.0, damping=0.804, moving_mass=1.2)
     radial = TransferFunction(tuple(0.4 * each for each in give.numerator), give.denominator)
     assert found["limits"][0] == pytest.approx(Regeneration(radial).worst().stiffness, rel=1e-4)
