@@ -2,6 +2,7 @@
 """The coupled loops of paper 004: poles against the spec and against hand-made systems, the simulation against both."""
 
 from dataclasses import replace
+from itertools import product
 
 import control
 import numpy as np
@@ -11,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_papers.formulas.coupled_loops import CONNECTIONS, faster, loops, plant, with_errors
+from lathe_papers.formulas.coupled_loops import CONNECTIONS, loops, with_errors
 from lathe_papers.formulas.coupled_simulation import STEP, CoupledSimulation
-from lathe_rc.analysis.pid_tuning import closed_loop, response
-from lathe_rc.control.decoupler import FULL_W1, LEAK, PAPER, REALISTIC, Channels, gain, lags
+from lathe_rc.analysis.pid_tuning import response
+from lathe_rc.control.decoupler import LEAK, PAPER, Channels, gain
 from lathe_rc.control.pid import FORCE, POSITION
 from lathe_rc.errors import InputError
 
@@ -36,26 +37,25 @@ def simulate(system, samples, *, force=0.0, position=0.0, noise=None, lengths=No
 
 @both_plants
 def test_paper_preset_is_stable_as_the_spec_says(force_plant):
+    """Without K1 the loops oscillate and grow, slowly; with it they do not."""
     growth = {name: loops("paper", force_plant, name).growth() for name in CONNECTIONS}
     assert 0.1 < growth["none"] < 0.24
-    assert growth["k1"] < 0.0
     assert 0.1 < growth["k2"] < 0.24
-    assert growth["both"] < 0.0
+    assert max(growth["k1"], growth["both"]) < 0.0
 
 
 @both_plants
-@pytest.mark.parametrize("wait", [0.0, 1e-3])
-def test_realistic_preset_is_stable_either_way(force_plant, wait):
-    for name in CONNECTIONS:
+def test_realistic_preset_is_stable_either_way(force_plant):
+    for name, wait in product(CONNECTIONS, (0.0, 1e-3)):
         assert loops("realistic", force_plant, name, wait).growth() < 0.0
 
 
 @both_plants
 @pytest.mark.parametrize("preset", ["paper", "realistic"])
 def test_errors_of_half_the_plant_leave_both_compensators_stable(preset, force_plant):
-    found = {name: system.growth() for name, system in with_errors(loops(preset, force_plant))}
-    assert len(found) == 10
-    assert max(found.values()) < 0.0, found
+    growth = [system.growth() for _, system in with_errors(loops(preset, force_plant))]
+    assert len(growth) == 10
+    assert max(growth) < 0.0
 
 
 def test_errors_change_the_plant_and_not_the_compensators():
@@ -64,19 +64,6 @@ def test_errors_change_the_plant_and_not_the_compensators():
     assert (off.k1, off.k2) == (known.k1, known.k2)
     assert np.abs(off.channels.w3.poles) == pytest.approx(0.5 * np.abs(known.channels.w3.poles))
     assert off.channels.w3.response(0.0) == pytest.approx(known.channels.w3.response(0.0))
-
-
-@given(st.floats(0.3, 3.0))
-def test_faster_scales_the_frequency(factor):
-    assert_allclose(
-        faster(REALISTIC.w3, factor).response(FREQUENCY * factor), REALISTIC.w3.response(FREQUENCY), rtol=1e-9
-    )
-
-
-def test_uncoupled_loops_have_the_poles_of_each():
-    alone = replace(loops(connection="none"), channels=replace(PAPER, w4=gain(0.0), w3=gain(0.0)))
-    expected = [closed_loop(PAPER.w1, FORCE).poles(), closed_loop(PAPER.w2, POSITION).poles()]
-    assert_allclose(np.sort_complex(alone.poles()), np.sort_complex(np.concatenate(expected)), rtol=1e-6)
 
 
 def test_closed_loop_answers_as_the_equations_say():
@@ -211,10 +198,3 @@ def test_cuts_change_nothing(lengths, wait, connection):
 def test_plant_that_answers_at_once_is_refused():
     with pytest.raises(InputError, match="acts on a measurement at once"):
         CoupledSimulation(replace(loops(connection="none"), channels=Channels(gain(5.0), PAPER.w2, PAPER.w3, PAPER.w4)))
-
-
-def test_plant_is_that_of_the_equations():
-    w1, w2, w3, w4 = (p.response(FREQUENCY) for p in (FULL_W1, PAPER.w2, PAPER.w3, lags(0.1)))
-    found = response(plant(Channels(FULL_W1, PAPER.w2, PAPER.w3, lags(0.1))), FREQUENCY)
-    expected = np.array([[w1, w4 * w2, np.ones(40)], [w3 * w1, w2 * (1 + w3 * w4), w3]])
-    assert_allclose(found, expected, rtol=1e-8)

@@ -9,31 +9,29 @@ import pytest
 from lathe_papers.decoupling import STUDY
 from lathe_papers.decoupling_runs import disturbance
 
-SHORT = {"seconds": 4.0}
-
 
 @pytest.fixture(scope="module", params=["paper", "realistic"])
-def told(request):
+def outcome(request):
     """The result of a preset with the full plant, and its JSON."""
-    result = STUDY.run(STUDY.parameters(preset=request.param, plant="full", **SHORT))
+    result = STUDY.run(STUDY.parameters(preset=request.param, plant="full", seconds=4.0))
     return result, json.loads(json.dumps(result.to_json(), allow_nan=False))
 
 
-def test_signs_of_the_growth_are_those_of_the_spec(told):
-    found = told[1]
+def test_signs_of_the_growth_are_those_of_the_spec(outcome):
+    found = outcome[1]
     signs = [value < 0.0 for value in found["stability"].values()]
     assert signs == ([False, True, False, True] if found["preset"] == "paper" else [True] * 4)
     assert max(found["robustness"].values()) < 0.0
 
 
-def test_force_loop_is_as_printed(told):
-    loop, printed = told[1]["single_loop"]["force"], told[1]["single_loop"]["printed"]["force"]
+def test_force_loop_is_as_printed(outcome):
+    loop, printed = outcome[1]["single_loop"]["force"], outcome[1]["single_loop"]["printed"]["force"]
     for name in ("rise_s", "settling_s", "overshoot_pct", "gain_margin_db", "gain_margin_rad_s", "crossover_rad_s"):
         assert loop[name] == pytest.approx(printed[name], rel=0.03), name
 
 
-def test_compensators_and_smooth_entry_help(told):
-    found = told[1]
+def test_compensators_and_smooth_entry_help(outcome):
+    found = outcome[1]
     for pair in (found["cross"]["position_step_to_force"], found["cross"]["force_step_to_position"]):
         assert pair["compensated"] < pair["uncompensated"] / 1.5
     entry = found["engagement"]
@@ -41,8 +39,8 @@ def test_compensators_and_smooth_entry_help(told):
     assert entry["step"]["force_overshoot_pct"] > 5.0
 
 
-def test_efficiencies_follow_from_their_rms(told):
-    noise = told[1]["noise"]
+def test_efficiencies_follow_from_their_rms(outcome):
+    noise = outcome[1]["noise"]
     for loop, unit in (("force", "n"), ("position", "mm")):
         ratio = noise[f"{loop}_disturbance_rms_{unit}"] / noise[f"{loop}_error_rms_{unit}"]
         assert noise[f"{loop}_efficiency"] == pytest.approx(ratio)
@@ -51,16 +49,16 @@ def test_efficiencies_follow_from_their_rms(told):
     assert noise["position_static_deflection_mm"] == pytest.approx(0.05775, rel=0.02)
 
 
-def test_delay_costs_little(told):
-    prompt, late = told[1]["single_loop"]["force"], told[1]["delay"]["single_loop"]["force"]
+def test_delay_costs_little(outcome):
+    prompt, late = outcome[1]["single_loop"]["force"], outcome[1]["delay"]["single_loop"]["force"]
     lost = np.degrees(prompt["crossover_rad_s"] * 1e-3)
     assert prompt["phase_margin_deg"] - late["phase_margin_deg"] == pytest.approx(lost, rel=1e-3)
     assert late["gain_margin_db"] < prompt["gain_margin_db"]
 
 
-@pytest.mark.parametrize("told", ["paper"], indirect=True)
-def test_result_is_the_same_again(told):
-    assert STUDY.run(told[0].parameters).to_json() == told[1]
+@pytest.mark.parametrize("outcome", ["paper"], indirect=True)
+def test_result_is_the_same_again(outcome):
+    assert STUDY.run(outcome[0].parameters).to_json() == outcome[1]
 
 
 def test_disturbance_is_that_of_the_paper_in_the_mean():

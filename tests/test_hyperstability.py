@@ -101,12 +101,6 @@ def test_needed_input_is_that_of_the_spec():
     assert needed[1:].max() == pytest.approx(1.10, abs=0.015)
 
 
-def test_needed_input_of_a_drive_at_rest_is_its_static_one():
-    still = np.zeros((5, 1))
-    still[0] = 0.7
-    assert hs.required_input(hs.NOMINAL[None], still, np.array([0.2])) == pytest.approx(0.7 * 21.5 / 19 - 0.2)
-
-
 def test_bound_of_a_constant():
     theta = np.full(1000, 3.0)
     assert hs.popov_bound(PUBLISHED, 20.0, theta, 0.025) == pytest.approx(-9 * 25 / 80 - 400 / 400)

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The saturation study and the numbers of spec/feed-and-force.md for paper 002."""
 
+import io
 import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from lathe_papers.formulas.hyperstability import NOMINAL, corners
 from lathe_papers.formulas.periodic_example import Case, limited_ideal_error, simulate
-from lathe_rc import cli
 from lathe_rc.control.periodic import PRESETS
 from lathe_rc.errors import InputError
 from lathe_rc.study import STUDIES
@@ -37,25 +35,20 @@ def test_coarse_steps_agree_with_fine_ones(step, within):
     assert coarse == pytest.approx(fine, rel=within)
 
 
-def test_published_law_diverges_slowly():
-    """The published law diverges slowly, 5e-4, 1.1e-2, 0.45 in the spec.
+@pytest.mark.parametrize("step", [0.001, STEP])
+def test_published_law_diverges_slowly_and_eq_15_shows_it(step):
+    """The published law diverges slowly, 5e-4, 1.1e-2, 0.45 in the spec; with the filter eq. 15 holds.
 
     How soon it shows depends on the high frequencies of the first period.
     """
-    for step in (0.001, STEP):
-        errors = simulate(
-            Case(periods=200, step=step, memory_filter=0.0, anti_windup=False), NOMINAL
-        ).period_max_error  # fmt: skip
-        assert errors.argmin() < 20
-        assert 4e-4 < errors[19] < 4e-3
-        assert errors[39] == pytest.approx(1.85e-2, rel=0.05)
-        assert 0.3 < errors[199] < 0.8
-
-
-def test_eq_15_tells_the_divergence():
-    published = simulate(Case(periods=200, step=STEP, memory_filter=0.0, anti_windup=False), NOMINAL)
-    filtered = simulate(Case(periods=200, step=STEP), NOMINAL)
+    published = simulate(Case(periods=200, step=step, memory_filter=0.0, anti_windup=False), NOMINAL)
+    errors = published.period_max_error
+    assert errors.argmin() < 20
+    assert 4e-4 < errors[19] < 4e-3
+    assert errors[39] == pytest.approx(1.85e-2, rel=0.05)
+    assert 0.3 < errors[199] < 0.8
     assert not published.controller.popov_holds
+    filtered = simulate(Case(periods=200, step=STEP), NOMINAL)
     assert filtered.controller.popov_holds
     assert filtered.period_integral[-1] == pytest.approx(filtered.period_integral[0], rel=0.01)
 
@@ -93,11 +86,6 @@ def test_quantisation_and_its_gains():
         assert simulate(case, drive).period_max_error[30:].max() < 4e-4
 
 
-def test_quantised_gains_at_a_finer_step():
-    case = Case(periods=40, step=0.001, quantisation=1e-4, gains=PRESETS["quantised"])
-    assert simulate(case, NOMINAL).period_max_error[20:].max() < 3e-4
-
-
 def test_json_has_what_was_asked_for(result):
     found = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert len(found["period_max_error"]) == 8
@@ -122,9 +110,9 @@ def test_corners_are_named_and_the_worst_is_told():
 
 
 def printed(result):
-    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console = Console(width=80, file=io.StringIO())
     console.print(result.table())
-    return console.export_text()
+    return console.file.getvalue()
 
 
 def test_table_shows_each_number_beside_the_expected(result):
@@ -136,24 +124,6 @@ def test_table_shows_each_number_beside_the_expected(result):
         assert f"{check.computed:.3g}" in line
 
 
-def test_figure_has_the_figures_of_the_paper(result):
-    figure = Figure()
-    result.draw(figure)
-    titles = [axes.get_title() for axes in figure.axes]
-    assert [title.split(":")[0] for title in titles[:3]] == ["Fig. 2", "Fig. 3", "Fig. 4"]
-    assert all(axes.lines for axes in figure.axes)
-
-
 def test_step_must_divide_the_period():
     with pytest.raises(InputError, match=r"period of 25 s is 3571\.43 steps of 0\.007 s"):
         STUDY.run(STUDY.parameters(step_ms=7.0))
-
-
-def test_command_takes_the_parameters_of_the_issue(tmp_path):
-    figure = tmp_path / "out.png"
-    words = ["periods=2", "s0=1.5", "memory_filter_s=0", "antiwindup=false", "quantisation=0", "corners=false"]
-    call = ["study", "saturation", "--json", "--figure", str(figure)]
-    done = CliRunner().invoke(cli.main, call + [part for word in words for part in ("--set", word)])
-    assert done.exit_code == 0, done.output
-    assert len(json.loads(done.output)["period_max_error"]) == 2
-    assert figure.stat().st_size > 10_000

@@ -38,17 +38,13 @@ def measure(model, time=TIME, noise=0.0):
 # --- models
 
 
-@pytest.mark.parametrize("damping", [0.1, 0.804, 0.999999, 1.0, 1.000001, 1.5, 20.0])
-def test_second_order_step_is_scipys(damping):
-    time = np.linspace(0.0, 20e-3, 400)
-    wn = 1038.0
-    _, expected = scipy_step(([1.0], [1 / wn**2, 2 * damping / wn, 1.0]), T=time)
-    assert_allclose(SecondOrder(wn, damping).step(time), expected, atol=1e-6)
-
-
-def test_first_order_step_is_scipys():
-    _, expected = scipy_step(([1.0], [2e-3, 1.0]), T=TIME)
-    assert_allclose(FirstOrder(2e-3).step(TIME), expected, atol=1e-9)
+@pytest.mark.parametrize("damping", [None, 0.1, 0.804, 0.999999, 1.0, 1.000001, 1.5, 20.0])
+def test_step_response_is_scipys(damping):
+    """Of a first-order model, and of second-order ones on either side of critical damping."""
+    time, wn = np.linspace(0.0, 20e-3, 400), 1038.0
+    model = SecondOrder(wn, damping) if damping else FirstOrder(2e-3)
+    _, expected = scipy_step(([1.0], [1 / wn**2, 2 * damping / wn, 1.0] if damping else [2e-3, 1.0]), T=time)
+    assert_allclose(model.step(time), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("model", [FirstOrder(2e-3), SecondOrder(1038.0, 0.3), SecondOrder(1038.0, 3.0), DRIVE])
@@ -140,13 +136,6 @@ def test_more_parameters_leave_less():
     assert rms[3] == pytest.approx(0.005, rel=0.1)
 
 
-def test_noise_moves_the_fit_little():
-    found = fit_second_order(measure(DRIVE, noise=0.01), delayed=True)
-    assert found.natural_frequency == pytest.approx(1038.0, rel=0.05)
-    assert found.damping == pytest.approx(0.804, rel=0.05)
-    assert found.delay == pytest.approx(0.36e-3, abs=0.05e-3)
-
-
 def test_residual_is_taken_over_time_not_over_samples():
     """Ten times as many samples in one part do not make it count more."""
     uneven = np.unique(np.concatenate((TIME, np.linspace(0.0, 2e-3, 2000))))
@@ -183,6 +172,7 @@ def test_csv_is_read(tmp_path):
     ("text", "reason"),
     [
         ("", "allowed: time_ms,response"),
+        (None, "cannot be read"),
         ("t,h\n" + GOOD, "header 't,h'"),
         ("time_ms,response\n", "0 times"),
         ("time_ms,response\n" + GOOD + "13\n", ":102: 1 values"),
@@ -190,22 +180,15 @@ def test_csv_is_read(tmp_path):
         ("time_ms,response\n" + GOOD + "13,nan\n", ":102: 'nan'; allowed: finite"),
         ("time_ms,response\n" + GOOD + "3,1\n", "is followed by 0.003 s; allowed: increasing"),
         ("time_ms,response\n" + GOOD + "13,225\n", "ends at 225; allowed: near 1"),
-        ("time_ms,response\n" + GOOD[: GOOD.index("2.")], "ends at"),
     ],
 )
 def test_bad_csv_is_refused_in_one_line(tmp_path, text, reason):
-    path = written(tmp_path, text)
+    path = tmp_path if text is None else written(tmp_path, text)
     with pytest.raises(InputError) as refusal:
         read_csv(path)
     assert str(refusal.value).startswith(str(path))
     assert reason in str(refusal.value)
     assert "\n" not in str(refusal.value)
-
-
-def test_missing_file_is_refused(tmp_path):
-    for path in (tmp_path / "no.csv", tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
-            read_csv(path)
 
 
 @pytest.mark.parametrize(

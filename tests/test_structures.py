@@ -14,7 +14,6 @@ from lathe_papers.formulas.structures import (
     Channel,
     contraction,
     cycles,
-    direct_compensation,
     iterative,
     lead_errors,
     limit_frequency,
@@ -47,15 +46,11 @@ def learn(q, z, count, gain=1.0, reference=lambda _: 1.0):
 
 
 @given(smoothings, factors, gains)
-def test_steady_error_is_what_many_cycles_leave(q, factor, gain):
+def test_cycles_shrink_by_the_contraction_to_the_steady_error(q, factor, gain):
     z = (q - factor) / gain
-    assert_allclose(learn(q, z, 1000, gain)[-1], steady_error(q, z, gain), rtol=1e-9, atol=1e-12)
-
-
-@given(smoothings, factors, gains)
-def test_each_cycle_shrinks_what_is_left_by_the_contraction(q, factor, gain):
-    z = (q - factor) / gain
-    left = np.abs(np.diff(learn(q, z, 8, gain)))
+    errors = learn(q, z, 1000, gain)
+    assert_allclose(errors[-1], steady_error(q, z, gain), rtol=1e-9, atol=1e-12)
+    left = np.abs(np.diff(errors[:8]))
     if left[0] > 1e-6:
         assert_allclose(left[1:], left[:-1] * contraction(q, z, gain), rtol=1e-6, atol=1e-12)
 
@@ -98,12 +93,6 @@ def test_form_that_does_not_repeat(waves, gain):
     assert_allclose(error[middle] / reference[middle], expected, atol=2e-4)
 
 
-@given(smoothings, factors, st.integers(0, 50))
-def test_whole_waves_repeat(q, factor, waves):
-    z = q - factor
-    assert_allclose(steady_error(q, z, 1.0, 2 * np.pi * waves), steady_error(q, z), rtol=1e-9, atol=1e-9)
-
-
 def test_slowly_changing_form_lags_by_a_cycle():
     """A form that changes by a part ε in a cycle, seen by a perfect drive, errs by ε."""
     change = 1e-4
@@ -122,25 +111,11 @@ def test_iterative_channels_multiply(q1, factor1, q2, factor2):
     assert_allclose(second[-1], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_any_number_of_channels():
-    errors = COARSE.steady_error(TABLE), FINE.steady_error(TABLE), FINE.steady_error(TABLE)
-    assert_allclose(iterative(errors[0]), errors[0])
-    assert_allclose(iterative(*errors), errors[0] * errors[1] ** 2)
-
-
-def test_direct_compensation_leaves_what_the_piezo_does_not_follow():
-    error = COARSE.steady_error(TABLE)
-    assert_allclose(direct_compensation(error, np.zeros(4)), error)
-    assert_allclose(direct_compensation(error, np.ones(4)), 0.0)
-    assert_allclose(direct_compensation(error, FINE.drive(TABLE)), error * uncompensated(FINE.drive(TABLE)))
-
-
 # --- figures of the papers
 
 
 def test_contraction_of_the_paper():
     assert_allclose(contraction(COARSE.q(TABLE), COARSE.z(TABLE)), [0.259, 0.506, 0.652, 0.744], atol=5e-4)
-    assert_allclose(np.abs(COARSE.factor(TABLE)), contraction(COARSE.q(TABLE), COARSE.z(TABLE)))
 
 
 def test_bandwidth_of_the_paper_is_half_an_error():
@@ -239,10 +214,6 @@ SERIES = {
 }
 
 
-def test_light_tool_does_not_move_the_carriage():
-    assert_allclose(in_series(TABLE, mass_ratio=0.0, **SERIES), FINE.drive(TABLE))
-
-
 def test_recoil_of_the_carriage_spoils_direct_compensation():
     """The figures of spec/learning.md come from ζ = 0.292, not 0.299."""
     piezo = {**SERIES, "damping": 0.292}
@@ -259,9 +230,3 @@ def test_series_obeys_the_equations_of_motion(ratio, frequency):
     )
     stroke, carriage = np.linalg.solve(equations, [wn**2, 0.0])
     assert_allclose(in_series(frequency, mass_ratio=ratio, **SERIES), stroke + carriage, rtol=1e-9)
-
-
-def test_free_carriage_shares_the_stroke_by_the_masses():
-    """Far above the carriage's loops and below the piezo's resonance the common centre of mass rests."""
-    stiff = {**SERIES, "natural_frequency": 1e7, "carriage_natural_frequency": 1.0}
-    assert_allclose(in_series(1e4, mass_ratio=0.25, **stiff), 1 / 1.25, rtol=1e-3)
