@@ -28,12 +28,12 @@ def load(name: str, shared: Values | None = None, **nodes: Values) -> Scenario:
 
 
 def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Result:
-    """Run it offline."""
+    """Run a scenario of ``config/`` offline, with the same changes as `load`."""
     return harness.run(load(name, shared, **nodes))
 
 
 def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterator[K | None]:
-    """Run many; what a keeper keeps of each, in their order, None of one that failed on its way.
+    """Run many scenarios; yield the result of each keeper in their order, None for a run that failed.
 
     Raises:
         InputError: one is refused.

@@ -201,6 +201,7 @@ def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array],
     sent = np.concatenate((np.zeros(table.delay + 2), command))
     moved, force = np.zeros((samples + 1, 2)), np.zeros(samples + delay + 1)
     driven = np.stack([sent[2 - k : samples + 2 - k] for k in range(3)], axis=1) @ weights.coarse.T
+    # A force that comes ``delay`` samples late lets as many samples be computed before the chip is asked again.
     for begin in range(0, samples, delay):
         block = slice(begin, min(begin + delay, samples))
         for n in range(block.start, block.stop):

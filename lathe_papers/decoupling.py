@@ -367,6 +367,7 @@ def run(parameters: DecouplingParameters, track: Track = untracked) -> Decouplin
     noise = disturbance(parameters)
     prompt, delayed = (behaviour(parameters, wait, noise) for wait in track([0.0, parameters.delay_ms * 1e-3]))
     none, both = (loops(parameters.preset, parameters.plant, name) for name in ("none", "both"))
+    # Without W4 and the force's controller the position loop is alone, under the deflection by the disturbance.
     off = PidGains(0.0, 0.0, 0.0, 1.0)
     uncoupled = replace(none, force=off, channels=replace(none.channels, w4=gain(0.0)))
     time = times(round(_FIT_SPAN / _FIT_STEP) + 1, _FIT_STEP)

@@ -75,14 +75,14 @@ class DriveToleranceResult:
         }
 
     def table(self) -> "RichTable":
-        """The same in words."""
+        """Errors that 50, 95 and 99 % of the drives stay below, and the share of refused drives."""
         columns = ("tolerance (1σ)", *(f"{100 * share:g} % below [µm]" for share in _SHARES), "refused [%]")
         at = [self._at(share) for share in _SHARES]
         rows = [("none", *(f"{self.nominal:.3g}" for _ in _SHARES), "0")]
         for place, tolerance in enumerate(self.parameters.tolerance):
-            told = [f"{errors[place]:.3g}" if np.isfinite(errors[place]) else "diverges" for errors in at]
+            limits = [f"{errors[place]:.3g}" if np.isfinite(errors[place]) else "diverges" for errors in at]
             refused = 100.0 * np.isinf(self.error[place]).mean()
-            rows.append((f"{100 * tolerance:g} %", *told, f"{refused:.3g}"))
+            rows.append((f"{100 * tolerance:g} %", *limits, f"{refused:.3g}"))
         title = f"{self.parameters.scenario}: largest error of the last revolution over {self.parameters.drives} drives"
         return comparison(title, columns, rows)
 

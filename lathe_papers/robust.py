@@ -203,7 +203,7 @@ class RobustResult:
 
 
 def _worst(values: Array) -> Array:
-    """Over the last axis, drives or seeds; a run that was stopped is the worst."""
+    """Largest value over the last axis, drives or seeds; a stopped run (NaN) is the worst."""
     return np.asarray(np.where(np.isnan(values).any(axis=-1), np.nan, values.max(axis=-1)))
 
 
@@ -229,7 +229,7 @@ class _Judged:
 
     def settled(self, tolerance: float) -> float:
         """The revolution from which on the error stays within a tolerance [µm]; inf: it does not."""
-        out = np.flatnonzero(~(self.largest <= tolerance))
+        out = np.flatnonzero(~(self.largest <= tolerance))  # not `>`: NaN is out of tolerance, too
         first = int(out[-1]) + 1 if out.size else 0
         return float(first) if first < self.largest.size else np.inf
 
@@ -250,19 +250,20 @@ class Judge:
         self._angle, self._error, self._current = np.empty((3, samples))
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Store angle, error and current of a chunk."""
         part = slice(first, first + samples)
         self._angle[part] = dense["encoder"]["angle_true"]
         self._error[part] = dense["tool"]["error"]
         self._current[part] = dense["coarse/state"]["effort"]
 
     def kept(self) -> _Judged:
-        """See `lathe_rc.cell.batch.Keeper`; of the complete revolutions."""
+        """Error and current of the complete revolutions."""
         error = np.abs(self._error) * 1e6
         for start, width in self._gaps:
             error[np.mod(self._angle - start, _TURN) < width] = 0.0
         revolution = np.floor(self._angle / _TURN)
         starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
+        # The run ends within a revolution: its last start only closes the one before.
         largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
         last = error[starts[-1 - _LAST] : starts[-1]]
         return _Judged(

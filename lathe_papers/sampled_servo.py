@@ -41,11 +41,11 @@ class SampledServoResult(SampledServoNumbers):
     """The result of the study; see `SampledServoNumbers`."""
 
     def table(self) -> "Group":
-        """See `lathe_papers.sampled_servo_table`."""
+        """All numbers beside those that the paper prints."""
         return sampled_servo_table.table(self)
 
     def draw(self, figure: "Figure") -> None:
-        """See `lathe_papers.sampled_servo_figure`."""
+        """Figs 2-4 of the paper, with the motion between samples and behind a gap."""
         sampled_servo_figure.draw(self, figure)
 
 

@@ -53,7 +53,7 @@ def _polynomials(link: Link) -> str:
 
 
 def table(result: "SampledServoNumbers") -> Group:
-    """All of it beside what is printed."""
+    """All numbers of the study beside those that the paper prints."""
     parts = (_steps, _drives, _designs, _desired, _links, _gap, _series)
     pieces: list[RichTable | str] = [piece for part in parts for piece in (part(result), "")]
     return Group(*pieces[:-1])

@@ -154,12 +154,12 @@ class _Largest:
         self._largest = 0.0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Take the error of a chunk, from the start of the swing on."""
         error = dense[self._tool]["error"][max(self._begins - first, 0) :]
         self._largest = max(self._largest, float(np.abs(error).max(initial=0.0)) * 1e6)
 
     def kept(self) -> float:
-        """See `lathe_rc.cell.batch.Keeper`."""
+        """Largest form error since the swing began [µm]."""
         return self._largest
 
 

@@ -235,7 +235,7 @@ def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> Speed
         largest[law].append(float(np.abs(error).max()))
         rms[law].append(float(np.sqrt(np.mean(error**2))))
         if law in traces:
-            every = max(error.size // 4000, 1)
+            every = max(error.size // 4000, 1)  # more points than the figure has pixels only cost memory
             traces[law].append((turns[::every], error[::every]))
     return SpeedDeviationResult(parameters, largest, rms, traces)
 

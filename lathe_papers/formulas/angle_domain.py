@@ -68,6 +68,7 @@ def operator_powers(derivatives: Array, order: int) -> Array:
     for i in range(1, order + 1):
         for k in range(1, i + 1):
             for j in range(1, i - k + 2):
+                # Recursion of the partial Bell polynomials, B_ik = Σ_j C(i-1, j-1)·x_j·B_(i-j)(k-1).
                 powers[i, k] += math.comb(i - 1, j - 1) * derivatives[j - 1] * powers[i - j, k - 1]
     return powers
 
@@ -103,7 +104,7 @@ class Harmonic:
     phase: float = 0.0
 
     def __call__(self, angle: Array, derivative: int, /) -> Array:
-        """See `Signal`."""
+        """The ``derivative``-th derivative at ``angle`` [rad], shape (n,)."""
         return np.asarray(
             self.order**derivative * np.sin(self.order * angle + self.phase + derivative * np.pi / 2),
         )
@@ -129,7 +130,7 @@ def _integrate(lower: Array, forcing: Array, steps: Array) -> Array:
             for i in range(order - 1):
                 slope[i] = at[i + 1]
             slope[order - 1] = highest
-            total += slope if stage in {0, 3} else 2.0 * slope
+            total += slope if stage in {0, 3} else 2.0 * slope  # weights 1, 2, 2, 1
             at[:] = x + steps[n] * slope * (1.0 if stage == 2 else 0.5)
         x += steps[n] / 6.0 * total
         out[:, n + 1] = x
@@ -190,7 +191,7 @@ class AngleDomain:
         step = float(np.diff(self._nodes).max()) / self.law.nominal
         table = np.arange(self.law.samples_until(float(self.angle[-1]), step) + 2) * step
         time = np.interp(self._nodes, self.law.at(table)[0], table)
-        for _ in range(4):
+        for _ in range(4):  # each doubles the digits; the table is good to a few, four times leave only rounding
             angle, speed, _ = self.law.at(time)
             time -= (angle - self._nodes) / speed
         return np.asarray(time)
@@ -235,6 +236,7 @@ class AngleDomain:
         Σ a_i·pⁱ w = Y it is X = Σ b_k·pᵏ w.
         """
         ends = self._time[::2]
+        # The middle of a step in time is not at the middle of the step in angle: Runge-Kutta needs its own.
         time = np.empty_like(self._time)
         time[::2], time[1::2] = ends, (ends[1:] + ends[:-1]) / 2.0
         forcing = signal(self.law.at(time)[0], 0) / self.denominator[-1]

@@ -41,6 +41,7 @@ def plant(channels: Channels) -> Lti:
 def _connected(parts: Lti, inside: npt.NDArray[np.float64], *around: npt.NDArray[np.float64]) -> Lti:
     """Parts with inputs inside·outputs + into·w and outputs out·outputs + through·w; ``around``: into, out, through."""
     into, out, through = around
+    # A static system as the feedback solves the algebra of all connections at once, loops without a lag included.
     closed = control.feedback(parts, control.ss([], [], [], inside), sign=1)
     return out * closed * into + control.ss([], [], [], through)
 
@@ -115,7 +116,7 @@ def loops(
 
 
 def faster(transfer: TransferFunction, factor: float) -> TransferFunction:
-    """The same system with all its frequencies ``factor`` times as high."""
+    """Return the system with all its frequencies ``factor`` times as high."""
 
     def scaled(part: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(np.array(part) / factor ** np.arange(len(part))[::-1])

@@ -74,6 +74,7 @@ def _advance(
     """
     order, size = table.transition.shape[0], line.shape[1]
     cut = 0
+    # Sums are written out: a product with @ would allocate, and its order of additions depends on the BLAS.
     for k in range(force.size):
         n = first + k
         for row in range(2):
@@ -93,6 +94,7 @@ def _advance(
             for column in range(order):
                 value += table.transition[row, column] * state[column]
             state[order + row] = value
+        # Only now: every row of the next x is made of the whole old one.
         for row in range(order):
             state[row] = state[order + row]
     return cut
@@ -136,6 +138,7 @@ class CoupledSimulation:
                 "allowed: a whole number of samples"
             )
         continuous = plant(loops.channels)
+        # The kernel measures before it commands, so no command may reach the measurement of its own sample.
         if np.any(continuous.D[:, :2]):
             raise InputError("coupled loops: a command acts on a measurement at once; allowed: W1 and W2 with a lag")
         system = control.c2d(continuous, step, "zoh")

@@ -114,6 +114,7 @@ def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Arr
     Returns:
         Shape (m, n).
     """
+    # a1 ... a4 belong to r ... r''', and the fourth derivative has the factor 1.
     weights = np.column_stack((drives[:, 1:], np.ones(len(drives)))) / drives[:, :1]
     return np.asarray(weights @ derivatives - disturbance)
 

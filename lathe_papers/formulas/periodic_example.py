@@ -96,6 +96,7 @@ def simulate(case: Case, drive: Array) -> Outcome:
         ideal=ideal_input(drive[None], time)[0],
     )
     loop = PeriodicLoop(controller, plant(drive))
+    # The load acts from a sample to the next, so its value in the middle is its mean to second order.
     steady, load = steady_derivatives(time)[0], disturbance(time + case.step / 2.0)
     errors, integrals = np.empty((2, case.periods))
     output, command = np.empty((2, time.size))

@@ -109,6 +109,7 @@ class Regeneration:
         found = scipy.optimize.minimize_scalar(
             lambda w: float(self.critical(w)), bounds=bounds, method="bounded", options={"xatol": 0}
         )
+        # The bounded search may end above the minimum on the grid.
         frequency = float(found.x) if found.fun < values[k] else float(grid[k])
         stiffness = float(self.critical(frequency))
         back = (1.0 + 1.0 / (stiffness * self._signed(frequency))) / self.overlap
@@ -124,6 +125,7 @@ class Regeneration:
             return np.asarray(-self._signed(w) * (1.0 - self.overlap * np.exp(-1j * w * period)))
 
         grid = self._grid()
+        # Even steps as well: e^{-jωT} turns by π/32 at most in each, so that no crossing is stepped over.
         grid = np.union1d(grid, np.arange(grid[0], grid[-1], min(np.pi / (32.0 * period), grid[-1] / _POINTS)))
         values = loop(grid)
         # K·loop passes 1 where it is real and positive.

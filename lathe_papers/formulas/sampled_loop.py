@@ -181,7 +181,7 @@ class StepResponse:
 
 def periods_to_settle(drive: SampledDrive, link: Link, delay: float = 0.0) -> int | None:
     """Periods until a loop is at rest; None if it never is."""
-    slowest = largest_pole(drive, link, delay)
+    slowest = largest_pole(drive, link, delay)  # 0 for a dead-beat loop: hence max() below
     if slowest >= 1.0:
         return None
     return int(np.clip(np.ceil(np.log(_SETTLED) / np.log(max(slowest, _SETTLED))), 10, _MOST_PERIODS))

@@ -63,6 +63,7 @@ class StepResponse:
     def residual(self, model: "Model") -> Array:
         """The model's residual, weighted so that its sum of squares is the mean square over time."""
         between = np.diff(self.time)
+        # Trapezoids: without them, parts of the response with many samples would count more.
         weight = (np.append(between, 0.0) + np.append(0.0, between)) / 2.0
         return np.asarray((model.step(self.time) - self.response) * np.sqrt(weight / weight.sum()))
 
@@ -88,11 +89,11 @@ class FirstOrder:
     time_constant: float
 
     def step(self, time: Array) -> Array:
-        """See `Model`."""
+        """Response to a unit step at time 0, shape (n,)."""
         return -np.expm1(-np.maximum(time, 0.0) / self.time_constant)
 
     def response(self, frequency: Array) -> Complex:
-        """See `Model`."""
+        """Wi(jω), shape (n,)."""
         return np.asarray(1.0 / (1.0 + 1j * frequency * self.time_constant))
 
 
@@ -103,11 +104,11 @@ class Delay:
     delay: float
 
     def step(self, time: Array) -> Array:
-        """See `Model`."""
+        """Response to a unit step at time 0, shape (n,)."""
         return np.where(time >= self.delay, 1.0, 0.0)
 
     def response(self, frequency: Array) -> Complex:
-        """See `Model`."""
+        """Wi(jω), shape (n,)."""
         return np.asarray(np.exp(-1j * frequency * self.delay))
 
 
@@ -120,7 +121,7 @@ class SecondOrder:
     delay: float = 0.0
 
     def step(self, time: Array) -> Array:
-        """See `Model`; any damping."""
+        """Response to a unit step at time 0, shape (n,); for any damping."""
         t = np.maximum(time - self.delay, 0.0) * self.natural_frequency
         # Poles -ζ ± d in units of ωn. At d = 0 the quotient below is 0/0; a d this small changes nothing.
         d = np.sqrt(complex(self.damping**2 - 1.0))
@@ -130,7 +131,7 @@ class SecondOrder:
         return np.asarray(1.0 - ((slow + fast) / 2.0 + self.damping * (slow - fast) / (2.0 * d)).real)
 
     def response(self, frequency: Array) -> Complex:
-        """See `Model`."""
+        """Wi(jω), shape (n,)."""
         return second_order(frequency, self.natural_frequency, self.damping, self.delay)
 
 
@@ -170,7 +171,7 @@ def fit_first_order(measured: StepResponse) -> FirstOrder:
     end, nearest = measured.time[-1], np.diff(measured.time).min()
     return _best(
         measured,
-        lambda x: FirstOrder(float(np.exp(x[0]))),
+        lambda x: FirstOrder(float(np.exp(x[0]))),  # the logarithm keeps it above 0 at any scale
         np.log([nearest / 100.0]),
         np.log([end * 10.0]),
         [np.log([max(_half(measured)[0], nearest)])],
@@ -188,6 +189,7 @@ def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
     size = 3 if delayed else 2
     low = np.array([np.log(0.1 / end), np.log(0.01), 0.0])[:size]
     high = np.array([np.log(100.0 / nearest), np.log(100.0), end / half])[:size]
+    # Several starts, because ωn and τ can stand in for each other and the fit has local minima.
     # Half of the step is reached at about (1 + 0.7ζ)/ωn after the delay.
     starts = [
         np.array([np.log((1.0 + 0.7 * damping) / (half * (1.0 - part))), np.log(damping), part])[:size]

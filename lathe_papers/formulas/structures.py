@@ -80,6 +80,7 @@ def cycles(factor: npt.ArrayLike, fraction: float) -> Array:
         raise InputError(f"cycles to reach the fraction {fraction:g}; allowed: between 0 and 1, ends excluded")
     factors = np.asarray(factor, dtype=np.float64)
     with np.errstate(divide="ignore"):  # a factor of 0 learns in one cycle, of 1 never
+        # Without 1e-9, rounding would add a cycle where a whole number of them suffices exactly.
         count = np.ceil(math.log(fraction) / np.log(factors) - 1e-9)
     return np.where(factors < 1.0, np.maximum(count, 1.0), np.inf)
 
@@ -102,6 +103,7 @@ def supremum(response: Response, highest: float) -> Peak:
     worst = int(np.argmax(magnitude))
     ends = float(grid[max(worst - 1, 0)]), float(grid[min(worst + 1, _GRID - 1)])
     near = scipy.optimize.minimize_scalar(lambda w: -abs(response(np.array([w]))[0]), bounds=ends, method="bounded")
+    # The bounded search never looks at its ends, where a response without a resonance is largest.
     if -near.fun > magnitude[worst]:
         return Peak(float(near.x), float(-near.fun))
     return Peak(float(grid[worst]), float(magnitude[worst]))

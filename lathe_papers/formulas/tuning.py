@@ -121,6 +121,7 @@ def _tuning(vector: Array) -> Tuning:
         lead_time = float(f"{net_lead + delay:.15g}")
         return Channel(natural_frequency, damping, delay, lead_time, q_time, (lead, lag))
 
+    # The delays stay those of START: Z depends on the lead less the delay alone.
     return Tuning(channel(vector[:_FIELDS], START.coarse.delay), channel(vector[_FIELDS:], START.fine.delay))
 
 
@@ -182,6 +183,7 @@ def _minimax(start: Array, bounds: Sequence[tuple[float, float]], weights: Array
         deviation = logs(vector)
         return np.concatenate((bound - deviation, bound + deviation, _shortfall(vector, margin)))
 
+    # A bound as one more variable makes the minimax smooth, which sequential quadratic programming needs.
     def largest(scaled: Array) -> float:
         return float(scaled[-1])
 
@@ -239,7 +241,7 @@ def smallest_deviation(
         raise LatheError(f"none of {starts} starts converged with a margin of {margin:g}; allow a smaller margin")
     for place in _ROUNDING_ORDER:
         rounded = float(f"{vector[place] * _UNITS[place]:.{digits}g}") / _UNITS[place]
-        bounds[place] = (rounded, rounded)
+        bounds[place] = (rounded, rounded)  # held from here on
         vector[place] = rounded
         _, vector = _minimax(vector, bounds, rows, margin)
     return _tuning(np.array([float(f"{value:.{digits}g}") for value in vector * _UNITS]))

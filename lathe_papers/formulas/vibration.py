@@ -25,7 +25,7 @@ _GRID = 4097  # frequencies of the integral that a band is read from
 
 
 def flat(frequency: Array) -> Array:
-    """The same power at all frequencies; shape (n,)."""
+    """Equal power at all frequencies, shape (n,)."""
     return np.ones_like(frequency)
 
 
