@@ -127,7 +127,7 @@ class Process:
         kind, run_id, blocks = f"{messages.PACKAGE}/msg/Progress", self.part.table.run_id, self.part.blocks
         step, made = max(1, self.part.table.window // 4), messages.store().types[kind]
         told_at = (*range(step, blocks, step), blocks)
-        return {k: messages.encode(kind, made(run_id, f"/{name}", k, k * self._size)) for k in told_at}
+        return {k: messages.encode(kind, made(run_id, f"/{name}", k, k * self._size, 0)) for k in told_at}
 
     def met(self) -> bool:
         """Whether its neighbours are there."""

@@ -145,7 +145,7 @@ class Process:
     def configure(self) -> None:
         """Be as before the first activation."""
         cell, design = self.cell, self.design
-        self._performs = self.listens = False
+        self._performs = self.listens = self._has_work = False
         self.blocks = 0
         self.values: list[int] = []
         self.orders = {name: BlockOrder(name, cell.run_id) for name, _ in design.inputs}
@@ -208,8 +208,13 @@ class Process:
 
     def take(self, topic: str, message: object) -> None:
         """A message has arrived."""
-        self._inbox.append(partial(self._receive, topic, message))
-        self.wake()
+        if self._waits or self.stopped or self._inbox or self.free_at > self.cell.now:
+            self._inbox.append(partial(self._receive, topic, message))
+            self.wake()
+            return
+        self.free_at = self.cell.now + self.cost
+        self._receive(topic, message)
+        self._step()
 
     def wake(self) -> None:
         """Handle what waits, one after the other, as the process has time."""
@@ -259,6 +264,7 @@ class Process:
         if not self.protocol.ready:
             self._early.append((topic, block))
             return
+        self._has_work = True
         order = self.orders.get(topic) or self._pace
         assert order is not None, "it reads the topic"
         order.admit(self.cell.run_id, block.source)
@@ -289,8 +295,10 @@ class Process:
         if self.protocol.wants_match:
             self.protocol.matched(list(self._unmatched()))
             self._perform_all()
-        self._work()
-        self._perform_all()
+        if self._has_work:
+            self._has_work = False
+            self._work()
+            self._perform_all()
         if self.protocol.failure and not self.protocol.others_go_on and not self.protocol.done:
             self.protocol.left()
         if self.protocol.done:
@@ -309,9 +317,9 @@ class Process:
                 yield self.design.name
 
     def _perform_all(self) -> None:
-        if self._performs:
+        if self._performs or not self.protocol.actions:
             return
-        self._performs = True
+        self._performs = self._has_work = True
         while self.protocol.actions:
             try:
                 self._perform(self.protocol.actions.popleft())
@@ -405,7 +413,7 @@ class Process:
                 order.hold(end * SIZE)
                 self.last[name] = max(end - 1, len(self.taken[name]) - 1)
         forward = [name for name, delay in self.design.inputs if not delay]
-        if forward and all(name in self.held for name in forward) and self.cell.master not in self.orders:
+        if forward and all(name in self.held for name in forward) and self._pace is None:
             self._follow(self.cell.master)
 
     def _follow(self, master: str) -> None:
@@ -621,7 +629,7 @@ class Simulation:
 
 def draw_designs(draw: random.Random) -> tuple[Design, ...]:
     """A cell: a chain of stages with branches and feedback, and a recorder of everything."""
-    count = draw.choice((1, 2, 2, 3, 3, 4, 5, 7, 11))
+    count = draw.choice((1, 2, 2, 3, 3, 3, 4, 4, 5, 7, 11))
     names = ["/spindle", *(f"/stage_{number}" for number in range(count))]
     designs = []
     restarting = draw.randrange(1, count + 1) if draw.random() < 0.5 else 0
