@@ -644,7 +644,7 @@ def draw_designs(draw: random.Random) -> tuple[Design, ...]:
 
 
 class Schedule:
-    """What happens to a cell, drawn by a seed; `Simulation.plan` has it in words."""
+    """Disturbances of a cell, drawn by a seed; `Simulation.plan` has it in words."""
 
     def __init__(self, seed: int) -> None:
         draw = random.Random(f"schedule {seed}")  # noqa: S311 - as above

@@ -19,9 +19,10 @@ from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 from lathe_rc.commands import options, tables
+from lathe_rc.errors import LossyRunError
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)
-_LOSSY = 3  # exit code where something is missing
+_LOSSY = LossyRunError.exit_code  # where something is missing
 _SIMULATED = 10**17  # [ns] that simulated time does not reach: three years; other clocks have passed it in 1973
 
 

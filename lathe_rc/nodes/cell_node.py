@@ -359,7 +359,7 @@ class CellNode(LifecycleNode):
         self.watch.look()
         protocol.look(time.monotonic(), self.watch.silent, self.watch.ended())
         if protocol.wants_match:
-            protocol.matched(list(graph.unmatched(self, protocol, self.exchange)))
+            protocol.matched(list(graph.unmatched(self, self.inlets, self.outlets, protocol, self.exchange)))
         elif protocol.master is None:
             protocol.unmatched = [topic for topic, inlet in self.inlets.items() if not inlet.get_publisher_count()]
         self._perform_actions()
@@ -496,8 +496,8 @@ class CellNode(LifecycleNode):
     def _in_turn(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
         """A callback for signals, which are put off while the node is deactivated, and until it is ready.
 
-        So nothing is lost, and a node that joins late is not told of blocks that it could not hear. Where nothing holds
-        the spindle back, signals are left out while it is deactivated, and counted as any that are missing.
+        So nothing is lost, and no block counts as missing that a node could not hear when it joined. Where nothing
+        holds the spindle back, signals are left out while it is deactivated, and counted as any that are missing.
         """
         most = _MOST_PUT_OFF * signal_depth(self.table)
 

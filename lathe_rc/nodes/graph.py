@@ -5,9 +5,11 @@ import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 
 from lathe_rc import allowed_code, resources
 from lathe_rc.cell.beside import REPLAYED_FILES
@@ -17,9 +19,6 @@ from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, shown
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.protocol import Announcement, MemberProtocol
-
-if TYPE_CHECKING:
-    from lathe_rc.nodes.cell_node import CellNode
 
 _NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # what the graph calls a node whose name has not come
 
@@ -31,19 +30,32 @@ def publishers(node: Node, topic: str) -> list[str]:
     return sorted(_name(end) for end in node.get_publishers_info_by_topic(topic))
 
 
-def unmatched(node: "CellNode", protocol: MemberProtocol, exchange: Exchange) -> Iterator[str]:
+def unmatched(
+    node: Node,
+    inlets: Mapping[str, Subscription],
+    outlets: Mapping[str, Publisher],
+    protocol: MemberProtocol,
+    exchange: Exchange,
+) -> Iterator[str]:
     """Topics that have not met all of their members, each with the missing ones.
 
     The graph knows names, but runs ahead of what DDS has matched; DDS counts matches, but without names.
+
+    Args:
+        node: that has them.
+        inlets: subscription of each topic, by fully qualified name.
+        outlets: publisher of each topic, likewise.
+        protocol: knows the members.
+        exchange: has the readers in this process.
     """
-    for topic, inlet in node.inlets.items():
+    for topic, inlet in inlets.items():
         expected = protocol.expected_writers(topic)
         there = {_name(end) for end in node.get_publishers_info_by_topic(topic)}
         if not expected:
             yield f"{topic}, which no member publishes"
         elif not expected <= there or inlet.get_publisher_count() < len(expected):
             yield f"{topic} from {', '.join(sorted(expected - there or expected))}"
-    for topic, outlet in node.outlets.items():
+    for topic, outlet in outlets.items():
         expected = protocol.expected_readers(topic) - exchange.readers(topic)
         there = {_name(end) for end in node.get_subscriptions_info_by_topic(topic)}
         if not expected <= there or outlet.get_subscription_count() < len(expected):

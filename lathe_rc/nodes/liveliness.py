@@ -17,7 +17,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from lathe_rc_msgs.msg import Member
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
@@ -25,8 +24,7 @@ from rclpy.qos import LivelinessPolicy, QoSProfile
 from std_msgs.msg import Empty
 
 from lathe_rc.messages import ALIVE
-
-SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and that completes nothing
+from lathe_rc.protocol import SILENCE, Announcement
 
 
 @cache
@@ -70,7 +68,7 @@ class Watch:
         self._unheard: set[str] = set()  # by DDS
         self.silent: dict[str, float] = {}
 
-    def follow(self, member: Member) -> None:
+    def follow(self, member: Announcement) -> None:
         """Watch a member from now on; if it announces itself from another process, that one."""
         if (member.pid == os.getpid() and member.host == self._host) or self._pids.get(member.name) == member.pid:
             return

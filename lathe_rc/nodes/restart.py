@@ -8,14 +8,27 @@ more. Nor is it older than two windows: suppliers, which may be a window ahead, 
 
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.inputs import Inputs
+from lathe_rc.nodes.outputs import Outputs
 
-if TYPE_CHECKING:
-    from lathe_rc.nodes.stage_role import StageRole
+
+class Resumable(Protocol):
+    """A stage's role as far as its state is kept, see `lathe_rc.nodes.stage_role.StageRole`."""
+
+    node: CellNode
+    stage: Stage
+    inputs: Inputs
+    outputs: Outputs
+    blocks: int
+    samples: int
+    started: bool
 
 
 class Restart:
@@ -32,7 +45,7 @@ class Restart:
         InputError: in a cell without a window.
     """
 
-    def __init__(self, role: "StageRole", file: str) -> None:
+    def __init__(self, role: Resumable, file: str) -> None:
         self._role, self._file, self._node = role, file, role.node
         self._window = role.node.table.window
         if not self._window:
