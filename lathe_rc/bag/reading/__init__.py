@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading bags of any maker, piece by piece."""
+"""Reading of bags of any maker, in chunks."""
 
 __all__: list[str] = []  # all of it may change: see lathe_rc/__init__.pyi

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled walk over the records of a piece of an MCAP file, for readers and for the index of our own writer."""
+"""Compiled walk over the records of a section of an MCAP file, for the readers and for the index of the writer."""
 
 import struct
 from typing import Any, NamedTuple
@@ -21,12 +21,12 @@ Places = npt.NDArray[np.uint64]
 
 
 class Found(NamedTuple):
-    """The records of a piece.
+    """Records located in a section of a file.
 
     Attributes:
         messages: channel, log time [ns], begin and end of the data of each message, shape (messages, 4).
         others: opcode, begin and end of the content of each other record, shape (others, 3).
-        end: where the last record that is whole ends.
+        end: offset behind the last complete record.
     """
 
     messages: Places
@@ -36,7 +36,7 @@ class Found(NamedTuple):
 
 @kernel
 def _little(data: Bytes, place: int, size: int) -> Any:
-    """An unsigned number of ``size`` bytes; np.uint64."""
+    """Return an unsigned little-endian number of ``size`` bytes; np.uint64."""
     value = np.uint64(0)
     for k in range(size):
         value |= np.uint64(data[place + k]) << np.uint64(8 * k)
@@ -45,8 +45,8 @@ def _little(data: Bytes, place: int, size: int) -> Any:
 
 @kernel
 def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[int, int, int]:  # noqa: FBT001 - a kernel
-    """Fill both tables as far as they go; returns the numbers of messages and of others, and the end."""
-    # All comparisons are of what is left, never of sums with a length: a length near 2**64 would wrap around.
+    """Fill both tables as far as they reach; return the numbers of messages and other records, and the end."""
+    # All comparisons use the remaining length, never a sum with a length: a length near 2**64 would overflow.
     place, count, further, size = 0, 0, 0, data.size
     while place + _HEAD <= size:
         length = _little(data, place + 1, 8)
@@ -76,13 +76,13 @@ def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[i
 
 
 def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
-    """The records of a piece; ``alone``: up to the first that is no message.
+    """Locate the records of a section; ``alone``: only up to the first record that is no message.
 
     Raises:
-        TooMuchError: there are more records beside the messages than a whole file may have.
+        TooMuchError: there are more records other than messages than a whole file may have.
     """
     array = np.frombuffer(data, np.uint8)
-    # What a piece says of itself is not believed: its records are counted before there is memory for them.
+    # The section's own statements are not trusted: its records are counted before memory is allocated for them.
     count, further, _ = _walk(array, np.empty((0, 4), np.uint64), np.empty((0, 3), np.uint64), alone)
     if further > MOST_ANNOUNCED:
         raise TooMuchError(f"more than {MOST_ANNOUNCED} schemas and channels")
@@ -91,10 +91,10 @@ def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
 
 
 def walk_whole(data: bytes) -> Found:
-    """The records of a chunk, or of a part of a file.
+    """Locate the records of a chunk, or of a section of a file, all of which must be complete.
 
     Raises:
-        ValueError: a record is longer than what is left, or a message shorter than its own head.
+        ValueError: a record is longer than the remaining bytes, or a message shorter than its own head.
     """
     found = walk(data)
     if found.end != len(data):

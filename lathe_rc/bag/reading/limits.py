@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of what is read of a bag: above all that real bags have, below what takes the memory or the hours of a reader.
+"""Limits for reading a bag: above anything in real bags, below anything that exhausts memory or takes hours.
 
-A file of some kilobytes may declare terabytes, so what it says of itself is compared with what it holds. With these a
-hostile file costs some hundred megabytes of memory, and time as a bag of its size may; docs/bags.md names the largest.
+A file of a few kilobytes may declare terabytes, so its statements are compared with its actual content. With these
+limits a malicious file costs some hundred megabytes of memory, and no more time than a bag of its size may;
+docs/bags.md lists the largest real bags.
 """
 
 MOST_BYTES = 2**27  #: longest record, chunk or message: above images and point clouds; a reader holds some at once [B]
@@ -26,4 +27,4 @@ MOST_SMALL_MESSAGES = 2**20  #: messages, whatever the size of the files; beyond
 
 
 class TooMuchError(ValueError):
-    """A file would cost more than one of its size may; unlike damage, which ends a chunk, it ends the reading."""
+    """Error for a file that exceeds the limits for its size; unlike damage, it ends the reading."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files, by their index where they have one, else by a walk through them.
+"""Reader of MCAP files, by their index if they have one, otherwise by a walk through the file.
 
-Nothing is believed that a file says of itself: places are looked up where they must be, sizes are compared with the
-file's, records are counted before there is memory for them.
+No statement of a file about itself is trusted: offsets are verified, sizes are compared with the size of the file, and
+records are counted before memory is allocated for them.
 """
 
 import struct
@@ -24,16 +24,16 @@ from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, read_chunk
 from lathe_rc.errors import shown
 
-_INDEX = struct.Struct("<QQQQI")  # of a chunk: first and last time, start, length, bytes of places by channel
+_INDEX = struct.Struct("<QQQQI")  # entry of a chunk: first and last time, start, length, bytes of places by channel
 _PLACE = np.dtype([("channel", "<u2"), ("place", "<u8")])
-_NUMBERS = 2**16  # that a channel may have
-_AT_ONCE = 2**14  # messages of a batch
-_WRONG = (ValueError, struct.error, EndOfFile)  # what broken bytes lead to
+_NUMBERS = 2**16  # numbers available to channels
+_AT_ONCE = 2**14  # messages per batch
+_WRONG = (ValueError, struct.error, EndOfFile)  # exceptions that damaged bytes lead to
 
 
 @dataclass(frozen=True)
 class _Records(Span):
-    """Records of a file from byte ``start`` on: of a chunk, or a part without chunks."""
+    """Records of a file starting at byte ``start``: a chunk, or a section without chunks."""
 
     path: Path
     start: int
@@ -70,10 +70,10 @@ class _Records(Span):
 
 
 def open_mcap(path: Path) -> Storage:
-    """The channels and spans of an MCAP file.
+    """Open an MCAP file and return its channels and spans.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as stream:
         by_index = _Mcap(path)
@@ -89,7 +89,7 @@ def open_mcap(path: Path) -> Storage:
 
 
 class _Mcap:
-    """Fills the description of a file, from its summary or from all of it."""
+    """Builder of the description of a file, from its summary or from a walk through all of it."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._size = path, path.stat().st_size
@@ -102,13 +102,13 @@ class _Mcap:
         self._announcements = self._described = 0
 
     def damage(self, what: object) -> None:
-        """Take note of what cannot be read."""
+        """Note unreadable parts."""
         self.storage.damage.append(f"{self._path.name}: {shown(what)}")
 
     # ---- announcements ------------------------------------------------------------------------------
 
     def _announce(self, opcode: int, content: bytes) -> None:
-        """Take a schema or channel; many writers repeat them in each chunk, all in the summary."""
+        """Add a schema or channel record; many writers repeat them in each chunk, and all of them in the summary."""
         self._announcements += 1
         if self._announcements > MOST_ANNOUNCED:
             raise ValueError(f"more than {MOST_ANNOUNCED} schemas and channels")
@@ -129,7 +129,7 @@ class _Mcap:
             raise ValueError(f"channel {channel.id} is announced as {before[0]!r} and as {now[0]!r}")
 
     def _name_channels(self) -> None:
-        """Give the channels their types, which may be announced behind them."""
+        """Assign the channels their message types, which the file may announce after them."""
         for number, channel in self._channels.items():
             kind = self._schemas.get(channel.schema_id, "") if channel.schema_id else ""
             named = Channel(channel.topic, kind, channel.message_encoding, count=int(self._counts[number]))
@@ -141,10 +141,10 @@ class _Mcap:
     # ---- index --------------------------------------------------------------------------------------
 
     def read_summary(self, stream: BinaryIO) -> bool:
-        """Read the summary; whether it has all that is needed.
+        """Read the summary, and return whether it has all that is needed.
 
         Raises:
-            ValueError: it has what cannot be right; mcap and struct raise others.
+            ValueError: the summary has impossible values; mcap and struct raise other exceptions.
         """
         records = SoundRecords(stream, self._size, lambda why, _lost: self.damage(why))
         if not records.find_summary():
@@ -167,7 +167,7 @@ class _Mcap:
         return True
 
     def _indexed_records(self, records: SoundRecords) -> Statistics | None:
-        """Take the records of the summary."""
+        """Read the records of the summary and return its statistics, if it has any."""
         statistics, chunks = None, []
         for record in records.summary():
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -176,7 +176,7 @@ class _Mcap:
                 statistics = parsed(Statistics, record.content)
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunks.append(self._indexed(record.content, records.summary_start))
-        # Chunks that overlap would be unpacked once for each entry: a small file with work for hours.
+        # Overlapping chunks would be unpacked once for each entry: a small file would cause hours of work.
         free = MAGIC
         for chunk in sorted(chunks, key=lambda chunk: chunk.start):
             if chunk.start < free:
@@ -186,7 +186,7 @@ class _Mcap:
         return statistics
 
     def _indexed(self, content: bytes, end: int) -> _Records:
-        """A chunk by its entry in the index, which must be in the file before the summary."""
+        """Return a chunk by its entry in the index, which must lie in the file before the summary."""
         first_ns, last_ns, start, length, places = _INDEX.unpack_from(content)
         if places > _NUMBERS * _PLACE.itemsize:
             raise ValueError(f"the index has a chunk of {places // _PLACE.itemsize} channels")
@@ -198,10 +198,10 @@ class _Mcap:
         channels = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
         return _Records(first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True)
 
-    # ---- the whole file -----------------------------------------------------------------------------
+    # ---- whole file ----------------------------------------------------------------------------------
 
     def scan(self, stream: BinaryIO) -> None:
-        """Walk through all records; damage behind the end of the data costs no message."""
+        """Walk through all records; damage behind the end of the data section loses no message."""
 
         def told(why: str, _lost: int) -> None:
             if not records.ended:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts of a bag as any version of rosbag2 writes them: names, quality of service, the file metadata.yaml.
+"""Metadata of a bag as any version of rosbag2 writes them: names, quality of service, the file metadata.yaml.
 
-Nothing in them may cost a reader unlimited memory or time. What a quality of service does not say is unknown.
+Memory and time for reading them are bounded. Settings that a quality of service does not state count as unknown.
 """
 
 import errno
@@ -22,17 +22,17 @@ NAME = "metadata.yaml"
 
 Kind = TypeVar("Kind", bound=Enum)
 
-_YAML = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # makes texts alone: no dates, no objects
+_YAML = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # returns strings only: no dates, no objects
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag.
+    """Topic listed in the metadata of a bag.
 
     Attributes:
         type: message type.
-        qos: offered by the publishers.
-        count: messages.
+        qos: profiles offered by the publishers.
+        count: number of messages.
     """
 
     type: str
@@ -45,12 +45,12 @@ class Metadata:
     """Content of the metadata of a bag.
 
     Attributes:
-        files: their names, each once.
-        repeated: some were named more than once.
-        packed: each message is compressed by itself.
-        span: first and last log time [ns]; None: no message.
-        topics: by name.
-        about: texts that the bag says of itself.
+        files: names of the files, without duplicates.
+        repeated: whether some files were listed more than once.
+        packed: whether each message is compressed individually.
+        span: first and last log time [ns]; None without messages.
+        topics: topics by name.
+        about: strings that the recorder added to the metadata.
     """
 
     files: tuple[str, ...]
@@ -65,8 +65,8 @@ def read(folder: Path) -> Metadata:
     """Read the metadata of a folder.
 
     Raises:
-        ValueError: they are not what rosbag2 writes, or too long.
-        OSError: they cannot be read.
+        ValueError: the metadata are not in the format of rosbag2, or too long.
+        OSError: the metadata cannot be read.
     """
     try:
         text = contents(folder / NAME, limits.MOST_METADATA).decode()
@@ -113,10 +113,10 @@ def _topics(listed: list[object]) -> dict[str, Topic]:
 
 
 def _of(given: object, key: str, kind: type) -> Any:
-    """A part of the metadata.
+    """Return an entry of the metadata.
 
     Raises:
-        ValueError: it is not there, or of another kind.
+        ValueError: the entry is missing, or of another type.
     """
     part = given.get(key) if isinstance(given, dict) else None
     if not isinstance(part, kind):
@@ -135,16 +135,16 @@ def _number(text: str) -> int:
 
 @lru_cache(maxsize=64)
 def qos_of_text(text: str) -> tuple[Qos, ...]:
-    """Profiles of a topic's publishers from the text of a bag; most topics of a bag have the same.
+    """Parse the QoS profiles of a topic's publishers from YAML; cached, as most topics share the same.
 
     Raises:
-        ValueError: no YAML, or one that would grow when it is read.
+        ValueError: the string is no YAML, or would grow when it is parsed.
     """
     return qos_of_list(read_yaml(text, "offered_qos_profiles"))
 
 
 def qos_of_list(given: object) -> tuple[Qos, ...]:
-    """Profiles of a topic's publishers: a list of maps, or a map; no others."""
+    """Convert QoS profiles of a topic's publishers from a list of maps or one map; skip anything else."""
     listed = given if isinstance(given, list) else [given]
     return tuple(_profile(each) for each in listed if isinstance(each, dict))
 
@@ -168,26 +168,26 @@ def _profile(given: Mapping[str, object]) -> Qos:
 
 
 def _choice(kind: type[Kind], given: object) -> Kind:
-    """By number, as up to version 8 of the metadata, or by name."""
+    """Return an enum member given by number (metadata up to version 8) or by name."""
     unknown: Any = kind["UNKNOWN"]
     by_number = {str(each.value): each for each in kind}
     return by_number.get(str(given)) or kind.__members__.get(str(given).upper(), unknown)
 
 
 def _natural(given: object) -> int:
-    """0: as if nothing had been said."""
+    """Return a natural number; 0, as if unspecified, for anything else."""
     text = str(given)
     return int(text) if text.isascii() and text.isdigit() and len(text) <= len(str(2**64)) else 0
 
 
-# ---- texts and names -----------------------------------------------------------------------------------------
+# ---- YAML and names ------------------------------------------------------------------------------------------
 
 
 def read_yaml(text: str, what: str) -> Any:
-    """Lists, maps and texts of a YAML text; numbers are texts too.
+    """Parse YAML into lists, maps and strings; numbers remain strings.
 
     Raises:
-        ValueError: see `check_yaml`; or a map's key is a collection.
+        ValueError: see `check_yaml`; or a key of a map is a collection.
     """
     check_yaml(text, what)
     try:
@@ -197,10 +197,10 @@ def read_yaml(text: str, what: str) -> Any:
 
 
 def check_yaml(text: str, what: str) -> None:
-    """Refuse a text that would grow when it is read, or take too long.
+    """Reject YAML that would grow when it is parsed, or take too long.
 
     Raises:
-        ValueError: it has aliases, is nested too deep or too long, or is no YAML.
+        ValueError: the string has aliases, is nested too deeply or too long, or is no YAML.
     """
     depth = 0
     try:
@@ -220,10 +220,10 @@ def check_yaml(text: str, what: str) -> None:
 
 
 def check_name(name: object) -> None:
-    """Refuse the name of a topic or type that could not be shown in a line.
+    """Reject a topic or type name that cannot be shown on one line.
 
     Raises:
-        ValueError: it is no text, too long, or has characters that do not print.
+        ValueError: the name is no string, too long, or has characters that are not printable.
     """
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= limits.LONGEST_NAME:
         raise ValueError(f"name {str(name)[:80]!r}; allowed: up to {limits.LONGEST_NAME} characters that print")

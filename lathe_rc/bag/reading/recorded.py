@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense topics of a bag under the names that a cell has for them, checked as they are read; some may be missing."""
+"""Dense topics of a bag under the topic names of the cell, validated while they are read; some may be missing."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from lathe_rc.messages import Samples, Signals
 
 @dataclass(frozen=True)
 class Spindle:
-    """How the recorded spindle turned.
+    """Range and length of the recorded spindle motion.
 
     Attributes:
-        topic: of the bag.
+        topic: topic of the encoder in the bag.
         samples: length of the record.
-        has_truth: the true angle was recorded; otherwise the measured one has to do.
-        speed: lowest and highest [rad/s].
-        turns: whole turns before sample 0 [rad].
+        has_truth: whether the true angle was recorded; otherwise the measured angle is used.
+        speed: lowest and highest speed [rad/s].
+        turns: complete revolutions before sample 0 [rad].
     """
 
     topic: str
@@ -34,23 +34,23 @@ class Spindle:
 
     @property
     def angle(self) -> str:
-        """Field with the angle of the part."""
+        """Return the name of the field with the angle of the workpiece."""
         return "angle_true" if self.has_truth else "angle"
 
 
 class Recorded:
-    """The parts of a cell that a bag holds.
+    """Recorded topics of a bag, looked up by the relative topics of a cell.
 
     Args:
-        source: the bag.
-        names: topic of the bag by relative topic of the cell, where it is another than that with a slash.
+        source: the opened bag.
+        names: topic of the bag by relative topic of the cell, where the two differ by more than a leading slash.
 
     Attributes:
-        path: of the bag.
-        namespace: of the cell that it was recorded from; empty if it had none.
+        path: path of the bag.
+        namespace: namespace of the recorded cell; empty if it had none.
 
     Raises:
-        InputError: a topic is named that the bag has not.
+        InputError: ``names`` refers to a topic that the bag does not have.
     """
 
     def __init__(self, source: Source, names: Mapping[str, str]) -> None:
@@ -61,13 +61,13 @@ class Recorded:
                 raise InputError(f"--topic {name}={topic}: {self.path} has no such topic; it has {self.holdings()}")
 
     def holdings(self) -> str:
-        """The bag's topics with blocks, in words."""
+        """Return the dense topics of the bag as readable text."""
         found = {t: said for t, said in self._source.topics.items() if said.type in messages.block_types()}
         told = [f"{topic} ({said.type.rpartition('/')[2]})" for topic, said in sorted(found.items()) if said.count]
         return ", ".join(told) or "no topic with blocks of lathe_rc_msgs"
 
     def check_names(self, known: Sequence[str]) -> None:
-        """Refuse names that the cell does not have.
+        """Reject topic names that the cell does not have.
 
         Raises:
             InputError: one of `names` is not among ``known``.
@@ -77,10 +77,10 @@ class Recorded:
                 raise InputError(f"--topic {name}={topic}: the cell has no {name}; allowed: {', '.join(sorted(known))}")
 
     def find(self, name: str, msgtype: str) -> str | None:
-        """The bag's topic for a relative topic of the cell; None if it has none.
+        """Return the bag's topic for a relative topic of the cell; None if the bag does not have it.
 
         Raises:
-            InputError: it is of another type.
+            InputError: the topic has another type.
         """
         topic = self._names.get(name, self.namespace + messages.full(name))
         said = self._source.topics.get(topic)
@@ -91,21 +91,21 @@ class Recorded:
         return topic
 
     def lacks(self, name: str, msgtype: str) -> str:
-        """The message about a missing topic; names those of its type in the bag."""
+        """Return the message about a missing topic, with the bag's topics of the same type."""
         others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
 
     def samples_of(self, topic: str) -> SampleReader:
-        """A topic to be read along with a run."""
+        """Return a reader that reads a topic in step with a run."""
         return SampleReader(self._source, topic)
 
     def step_ns(self, topic: str) -> int:
-        """Sampling step [ns]; 0 if there is no block."""
+        """Return the sampling step of a topic [ns]; 0 if it has no block."""
         return self._source.step_ns(topic)
 
     def pieces(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[int, Signals]]:
-        """First sample and some fields of each block, arrays of shape (n,).
+        """Yield the first sample and the requested fields of each block, arrays of shape (n,).
 
         Raises:
             LatheError: samples are missing or repeated, the step changes, or a number is not finite.
@@ -127,7 +127,7 @@ class Recorded:
             raise LatheError(f"{self.path}: {topic} has no block, though the bag counts some")
 
     def whole(self, topic: str, field: str, most: int | None = None) -> Samples:
-        """A field, or at most its first so many samples, shape (n,).
+        """Return all samples of a field, or at most its first ``most`` samples, shape (n,).
 
         Raises:
             LatheError: see `pieces`.
@@ -140,7 +140,7 @@ class Recorded:
         return np.concatenate(found)[:most]
 
     def length(self, topic: str, field: str) -> int:
-        """Samples of a topic, all looked at.
+        """Return the number of samples of a topic, after validating all of them.
 
         Raises:
             LatheError: see `pieces`.
@@ -148,14 +148,14 @@ class Recorded:
         return sum(signals[field].size for _, signals in self.pieces(topic, [field]))
 
     def spindle(self, name: str) -> Spindle:
-        """The recorded spindle, all of it looked at.
+        """Return range and length of the recorded spindle motion, after validating all samples.
 
         Args:
             name: the encoder's relative topic in the cell.
 
         Raises:
-            InputError: there is no encoder.
-            LatheError: see `pieces`; or the angle goes back or jumps.
+            InputError: the bag has no encoder topic.
+            LatheError: see `pieces`; or the angle goes backwards or jumps.
         """
         topic = self.find(name, messages.ENCODER)
         if topic is None:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The walk over the records of an MCAP file: those that are sound, found again behind each damaged place.
+"""Walk over the valid records of an MCAP file that resynchronizes behind each damaged place.
 
-A record is sound if its checksum holds. Most records have none: then it must be what the mcap library would write of
-its content, to the byte, which a wrong length never is. Messages outside of chunks have neither; a record must follow
-them, and there must be no chunk in the file: an index of one whose kind is damaged would pass for a message.
+A record is valid if its checksum matches. Most records have none: then its bytes must be exactly those that the mcap
+library would write for its content, which a wrong length rules out. Messages outside of chunks have neither; they must
+be followed by a record, and the file must have no chunk: a chunk index with a damaged opcode would pass for a message.
 
-What a reader does with damage is its own affair: reading a bag stops at it, recovery goes on behind it, a check tells
-it. A file with a sound summary is read by that, see `lathe_rc.bag.reading.mcap_storage`.
+The handling of damage is left to the caller: reading a bag stops at it, recovery continues behind it, a check reports
+it. A file with a valid summary is read by its summary, see `lathe_rc.bag.reading.mcap_storage`.
 """
 
 import re
@@ -35,7 +35,7 @@ MAGIC = len(MCAP0_MAGIC)  #: length of what a file begins and ends with [B]
 _INDEX = struct.Struct("<HI")  # channel, length of the pairs of time and place
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 _FOOTER, _DATA_END = 29, 13  # [B]
-_PRIVATE = 0x80  # opcodes from here on are anybody's
+_PRIVATE = 0x80  # opcodes from here on are free for private use
 _PLAIN: dict[int, Any] = {
     Opcode.HEADER: records.Header,
     Opcode.FOOTER: records.Footer,
@@ -50,26 +50,26 @@ _PLAIN: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: records.SummaryOffset,
     Opcode.DATA_END: records.DataEnd,
 }
-# Longest records that hold maps: as objects they take thirty times as much memory. [B]
+# Maximum length of records that hold maps: as objects they take thirty times as much memory. [B]
 _MOST = {Opcode.CHUNK_INDEX: MOST_TEXT, Opcode.STATISTICS: MOST_TEXT, Opcode.CHANNEL: MOST_METADATA}
 # Where a record may begin: any opcode with a length below 4 GiB, or a chunk of whatever length.
 _BEGINS = re.compile(rb"(?=[\x01-\x0f].{4}\0{4}|\x06.{28}\0{4}.{4}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd))", re.DOTALL)
-_LONGEST_BEGIN = 49  # of that [B]
-_WINDOW = 2**20  # of a file that is searched at once [B]
-_PART = 2**22  # of messages outside of chunks that is looked at once, at most [B]
-_PAGE = 2**12  # that is searched; a place where a record may begin takes as long [B]
-_PAGES = 2**18  # that may be searched in vain, and as many more as the file has
+_LONGEST_BEGIN = 49  # maximum length of a match [B]
+_WINDOW = 2**20  # bytes of a file that are searched at once
+_PART = 2**22  # maximum size of messages outside of chunks that are examined at once [B]
+_PAGE = 2**12  # unit of search effort; examining a possible beginning of a record takes as long [B]
+_PAGES = 2**18  # pages that may be searched in vain, in addition to those of the file
 
 
 class Record(NamedTuple):
-    """A sound record, or messages outside of chunks that follow one another.
+    """Valid record, or consecutive messages outside of chunks.
 
     Attributes:
-        place: of its first byte in the file.
-        end: place behind it.
-        opcode: its kind.
-        content: its bytes; of a chunk its records, unpacked; of messages their records, heads included.
-        checked: whether a checksum vouches for the content.
+        place: file offset of its first byte.
+        end: file offset behind its last byte.
+        opcode: kind of the record.
+        content: its bytes; for a chunk its unpacked records; for messages their records, including the heads.
+        checked: whether a checksum confirms the content.
     """
 
     place: int
@@ -80,11 +80,11 @@ class Record(NamedTuple):
 
 
 class _UnsoundError(ValueError):
-    """A record that is not sound.
+    """Error for a record that is not valid.
 
     Attributes:
-        chunk: whether it is a chunk.
-        end: where the next record stands all the same, if that is beyond doubt.
+        chunk: whether the record is a chunk.
+        end: file offset of the next record, if it is certain in spite of the damage.
     """
 
     def __init__(self, why: str, *, chunk: bool = False, end: int | None = None) -> None:
@@ -93,31 +93,31 @@ class _UnsoundError(ValueError):
 
 
 class _Effort:
-    """Work that may still be spent on a file: bytes to unpack, and pages to search for records."""
+    """Remaining work allowed for a file: bytes to unpack, and pages to search for records."""
 
     def __init__(self, size: int) -> None:
         self.budget = Budget(size)
         self.left = _PAGES + 2 * (size // _PAGE)
 
     def spend(self, size: int) -> bool:
-        """Count ``size`` bytes and a little more; whether that was still allowed."""
+        """Count the search of ``size`` bytes plus a fixed cost; return whether the limit allows it."""
         self.left -= 1 + size // _PAGE
         return self.left >= 0
 
 
 class SoundRecords:
-    """The sound records of a file; may be iterated over again and again.
+    """Iterable over the valid records of a file; can be iterated repeatedly.
 
     Args:
-        stream: of the file; at any place.
+        stream: stream of the file, at any position.
         size: of the file [B].
-        told: gets each damage; may be exchanged between two iterations.
-        effort: what may be spent, given for records of a chunk; None: in proportion to the size.
+        told: called with each damage; may be replaced between two iterations.
+        effort: remaining work, passed for the records of a chunk; None: in proportion to the size.
 
     Attributes:
-        summary_start: where the summary begins, once `find_summary` has found it; before that the size.
-        ended: whether the newest iteration has come behind the end of all data.
-        data_wrong, summary_wrong: whether the checksum of all data, or of the summary, does not hold.
+        summary_start: offset of the summary, once `find_summary` has found it; before that the size of the file.
+        ended: whether the newest iteration has passed the end of the data section.
+        data_wrong, summary_wrong: whether the checksum of the data section, or of the summary, does not match.
     """
 
     def __init__(self, stream: BinaryIO, size: int, told: Told, effort: _Effort | None = None) -> None:
@@ -130,7 +130,7 @@ class SoundRecords:
         self.ended = self.data_wrong = self.summary_wrong = False
 
     def inside(self, record: Record) -> Iterator[tuple[bytes, Found]]:
-        """The records of a chunk or of messages, in pieces; or a single one of another kind."""
+        """Yield the bytes and walked records of a chunk or of messages; any other record is yielded alone."""
         if record.opcode == Opcode.CHUNK and not record.checked:
             inner = SoundRecords(BytesIO(record.content), len(record.content), self.told, self._effort)
             yield from ((each.content, _found(each, Opcode.MESSAGE)) for each in inner)
@@ -144,15 +144,15 @@ class SoundRecords:
         if left := len(record.content) - found.end:
             self.told(f"chunk at byte {record.place}: a record is longer than the chunk", left)
         if record.opcode == Opcode.CHUNK:
-            with suppress(ValueError):  # the next chunk tells it
+            with suppress(ValueError):  # the walk over the next chunk reports it
                 self._effort.budget.take(0, len(found.messages) + len(found.others))
 
-    # ---- what stands at the end ---------------------------------------------------------------------
+    # ---- end of the file -----------------------------------------------------------------------------
 
     def find_summary(self) -> bool:
-        """Look for the summary of a file that is complete, and at its checksum; whether there is one to be read."""
+        """Locate the summary of a complete file and verify its checksum; return whether it is readable."""
         place = self._size - MAGIC - _FOOTER
-        with suppress(ValueError):  # the walk tells it
+        with suppress(ValueError):  # the walk reports it
             footer = self._sound(place)
             start, _, crc = struct.unpack("<QQI", footer.content) if footer.opcode == Opcode.FOOTER else (0, 0, 0)
             self._data_end = (start or place) - _DATA_END
@@ -162,11 +162,11 @@ class SoundRecords:
         return self.summary_start < self._size and not self.summary_wrong
 
     def check_sums(self) -> None:
-        """Look at the checksums of data and summary."""
+        """Verify the checksums of the data section and of the summary."""
         self.find_summary()
         try:
             end = self._sound(self._data_end)
-        except ValueError:  # the walk tells it; the summary stands elsewhere, and may be right
+        except ValueError:  # the walk reports it; the summary is elsewhere, and may be valid
             self.summary_start, self.summary_wrong = self._size, False
             return
         if self.summary_wrong:
@@ -183,13 +183,13 @@ class SoundRecords:
         return crc
 
     def summary(self) -> Iterator[Record]:
-        """The sound records of the summary, once `find_summary` has found it."""
+        """Yield the valid records of the summary, once `find_summary` has found it."""
         return self._walk(self.summary_start) if self.summary_start < self._size else iter(())
 
     # ---- the walk -----------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[Record]:
-        """The sound records in the order of the file."""
+        """Yield the valid records in the order of the file."""
         return self._walk(0)
 
     def _walk(self, place: int) -> Iterator[Record]:
@@ -215,8 +215,8 @@ class SoundRecords:
                 record = self._with_following(record)
             self._chunked |= opcode in (Opcode.CHUNK, Opcode.CHUNK_INDEX)
             self.ended = opcode == Opcode.DATA_END or (self.ended and opcode not in (Opcode.CHUNK, Opcode.MESSAGE))
-            # A record may lack bytes at its end and have taken them from the next one: that is looked for within it.
-            # Of several messages the last one begins within the last bytes; the others are followed by one.
+            # A record may have lost bytes at its end and extend into the next one: the search begins within it.
+            # Of several messages the last one begins within the last bytes; each of the others is followed by one.
             before = record.end if record.checked or opcode == Opcode.MESSAGE else place
             yield record
             place = record.end
@@ -228,10 +228,10 @@ class SoundRecords:
         return self._stream.read(length)
 
     def _with_following(self, record: Record) -> Record:
-        """A message with those that follow it: files without chunks have millions."""
+        """Extend a message record by the messages after it, as files without chunks have millions."""
         whole = self._at(record.end, self._window)
         ends = walk(whole, alone=True).messages[:, 3].tolist()
-        # More is read at once where messages follow messages: a file that has one here and there is not read anew each.
+        # The window grows while messages are consecutive: a file with scattered messages is not reread for each.
         self._window = min(2 * self._window, _PART) if 2 * (ends or [0])[-1] > self._window else _PAGE
         if ends and not self._begins(record.end + ends[-1]):
             ends.pop()
@@ -243,10 +243,10 @@ class SoundRecords:
         return record
 
     def _sound(self, place: int, head: bytes | None = None) -> Record:
-        """The record at a place, where ``head`` stands.
+        """Return the record at a file offset, whose first bytes ``head`` contains if given.
 
         Raises:
-            _UnsoundError: it is not sound.
+            _UnsoundError: the record is not valid.
         """
         head = self._at(place, HEAD.size) if head is None else head
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self._size)
@@ -281,7 +281,7 @@ class SoundRecords:
         return Record(place, end, opcode, content, checked)
 
     def _begins(self, place: int) -> bool:
-        """Whether the file ends at a place, or a record may begin."""
+        """Return whether the file ends at an offset, or a record may begin there."""
         head = self._at(place, HEAD.size)
         if place == self._size or head.startswith(MCAP0_MAGIC):
             return True
@@ -289,7 +289,7 @@ class SoundRecords:
         return bool(0 < opcode <= Opcode.DATA_END and place + HEAD.size + length <= self._size)
 
     def _chunk(self, place: int, end: int) -> Record:
-        """A chunk says its length twice: one of them may be wrong."""
+        """Return the chunk at a file offset; of its two stated lengths, one may be wrong."""
         begin = place + HEAD.size
         head = self._at(begin, CHUNK.size + 4 + 8)
         if len(head) < CHUNK.size + 8:
@@ -321,7 +321,7 @@ class SoundRecords:
         raise _UnsoundError(why, chunk=True, end=end if said == end <= self._size else None)
 
     def _search(self, place: int) -> int:
-        """Where the next sound record stands; the size of the file if there is none."""
+        """Return the file offset of the next valid record; the size of the file if there is none."""
         length = _PAGE
         while place < self._size and self._effort.left >= 0:
             window = self._at(place, length + _LONGEST_BEGIN)
@@ -337,7 +337,7 @@ class SoundRecords:
         return self._size
 
     def _is_anchor(self, place: int) -> bool:
-        """Whether a sound record stands there, and another one behind it if no checksum vouches for it."""
+        """Return whether a valid record is at an offset, followed by another one unless a checksum confirms it."""
         try:
             record = self._sound(place)
             if not record.checked and record.end < self._size and self._at(record.end, MAGIC) != MCAP0_MAGIC:
@@ -348,12 +348,12 @@ class SoundRecords:
 
 
 def parsed(kind: type[Parsed], content: bytes) -> Parsed:
-    """A record as an object of the mcap library, which raises whatever broken bytes lead to."""
+    """Parse a record into an object of the mcap library; damaged bytes may raise any exception."""
     return kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined, no-any-return]  # each has it
 
 
 def _found(record: Record, *walked: int) -> Found:
-    """The records in one; of one whose opcode is not among ``walked``, itself."""
+    """Return the records inside a record; if its opcode is not in ``walked``, the record itself."""
     if record.opcode in walked:
         return walk(record.content)
     size = len(record.content)
@@ -361,7 +361,7 @@ def _found(record: Record, *walked: int) -> Found:
 
 
 def _as_written(opcode: int, content: bytes) -> bool:
-    """Whether a record is what the mcap library would write; an attachment may lack its checksum."""
+    """Return whether a record is as the mcap library would write it; an attachment may lack its checksum."""
     if opcode not in _PLAIN:
         return False
     builder = RecordBuilder()
@@ -378,7 +378,7 @@ def _as_written(opcode: int, content: bytes) -> bool:
 
 
 def damage(file: Path) -> list[str]:
-    """Damaged records of an MCAP file, one line each."""
+    """Return the damaged records of an MCAP file, one line each."""
     found: list[str] = []
     with file.open("rb") as stream:
         sound = SoundRecords(stream, file.stat().st_size, lambda why, _: found.append(f"{file.name}: {why}"))

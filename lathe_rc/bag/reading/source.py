@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening bags of any maker: rosbag2 folders of any storage and compression, or a file of one.
+"""Reader of bags of any maker: rosbag2 folders with any storage and compression, or a single file of one.
 
-Nothing in a bag is trusted: its sizes are checked before memory of that size is taken. The limits are in
+No size stated by a bag is trusted: each is checked before memory of that size is allocated. The limits are in
 `lathe_rc.bag.reading.limits`.
 """
 
@@ -46,10 +46,10 @@ class Unread:
     """Topic whose messages are not read.
 
     Attributes:
-        topic: its name.
-        type: message type; empty: none is told.
-        why: it is not read.
-        count: messages.
+        topic: name of the topic.
+        type: message type; empty if the bag states none.
+        why: reason for not reading it.
+        count: number of messages.
     """
 
     topic: str
@@ -58,17 +58,17 @@ class Unread:
     count: int
 
     def __str__(self) -> str:
-        """In words."""
+        """Return topic, type, message count and reason as text."""
         return f"{self.topic} {self.type}".strip() + f", {self.count} messages {self.why}"
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files with the messages of a bag, by name: those of a folder, or the one that is named.
+    """Return the message files of a bag, by name: those of a folder, or the named file itself.
 
-    Of a compressed file and the copy that a player unpacked, the first.
+    If a player left an unpacked copy beside a compressed file, only the compressed file is returned.
 
     Raises:
-        InputError: a file that is read is a link that leads out of the folder.
+        InputError: a message file is a link that leads out of the folder.
     """
     found = [path] if path.is_file() else [*path.glob("*")]
     for file in found:
@@ -79,10 +79,10 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _refuse_link(file: Path, bag: Path) -> None:
-    """Refuse a file that is a link out of its bag.
+    """Reject a file that is a link out of its bag.
 
     Raises:
-        InputError: it is one.
+        InputError: the file is such a link.
     """
     folder = Path(os.path.realpath(bag))  # unlike Path.resolve, it takes links that go round
     if file != bag and not Path(os.path.realpath(file)).is_relative_to(folder):
@@ -90,28 +90,28 @@ def _refuse_link(file: Path, bag: Path) -> None:
 
 
 def name_of(path: Path) -> str:
-    """Name of a bag for files that are made of it, of ``.`` and ``..`` too."""
+    """Return the name of a bag, for the names of derived files; paths ``.`` and ``..`` are resolved."""
     return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails where links go round
 
 
 class Source:
-    """A bag that is read; a context manager.
+    """Bag opened for reading; a context manager.
 
     Args:
-        path: a rosbag2 folder or a file of one.
-        partial: take what can be read of a bag that is damaged.
+        path: a rosbag2 folder, or a single file of one.
+        partial: read whatever is readable of a damaged bag.
 
     Attributes:
-        path: see above.
-        topics: by name.
-        unread: further ones, whose messages are not serialized as ROS 2 does, or have no type.
-        about: texts that the bag says of itself, see docs/bags.md.
-        first_ns, last_ns: smallest and largest log time; 0 and 0 if it is empty.
-        contradictions: where the bag says other of itself than its files hold, one line each; the files count.
-        damage: what cannot be read, one line each; empty unless ``partial``.
+        path: path of the bag.
+        topics: readable topics by name.
+        unread: further topics, whose messages have no type or are not serialized as in ROS 2.
+        about: strings from the metadata of the bag, see docs/bags.md.
+        first_ns, last_ns: smallest and largest log time [ns]; both 0 if the bag is empty.
+        contradictions: differences between the bag's metadata and its files, one line each; the files are used.
+        damage: unreadable parts, one line each; empty unless ``partial``.
 
     Raises:
-        InputError: not a bag, or one that cannot be whole; with ``partial``: one of which nothing can be read.
+        InputError: the path is not a bag, or the bag is incomplete; with ``partial``: nothing of it is readable.
     """
 
     def __init__(self, path: Path, *, partial: bool = False) -> None:
@@ -180,7 +180,7 @@ class Source:
             raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
     def _metadata(self, files: Sequence[Path]) -> Metadata | None:
-        """The metadata of a folder; without them, its files count."""
+        """Return the metadata of a folder, or None if they are missing and the files alone are used."""
         if not (self.path / metadata.NAME).exists():
             if not files:
                 raise ValueError(f"no {metadata.NAME} in that folder, nor a .mcap or .db3 file")
@@ -197,7 +197,7 @@ class Source:
         return told
 
     def _storage(self, path: Path, depth: int = 0) -> Storage:
-        """A file, unpacked first if it is compressed as a whole."""
+        """Open one file of the bag, unpacking it first if it is compressed as a whole."""
         if not path.is_file():
             raise ValueError("no file" if path.exists() else "there is no such file")  # a pipe would keep us waiting
         with path.open("rb") as stream:
@@ -216,11 +216,11 @@ class Source:
         return self._storage(plain, 1)
 
     def _folder(self) -> Path:
-        """A new folder that goes with the bag."""
+        """Create a temporary folder that is removed when the bag is closed."""
         return Path(self._temporary.enter_context(tempfile.TemporaryDirectory(prefix="lathe-bag-")))
 
     def _gather(self) -> None:
-        """The topics of all files."""
+        """Collect the topics of all files."""
         unread: dict[tuple[str, str, str], int] = {}
         for channel in chain.from_iterable(storage.channels.values() for storage in self._storages):
             known = self.topics.get(channel.topic)
@@ -235,7 +235,7 @@ class Source:
         self.unread = [Unread(*key, count) for key, count in unread.items()]
 
     def _compare(self, told: Metadata) -> None:
-        """Take what the files do not say from the metadata, and note where these contradict them."""
+        """Add the metadata that the files lack, and note where metadata and files contradict each other."""
         wrong: list[tuple[str, int]] = []
         if told.span and self._storages:
             held = zip(("first", "last"), told.span, (self.first_ns, self.last_ns), strict=True)
@@ -254,21 +254,21 @@ class Source:
         self.contradictions += [f"{metadata.NAME} says {said}; the files: {found}" for said, found in wrong]
 
     def __enter__(self) -> "Source":
-        """Itself."""
+        """Return the bag itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the bag and remove its temporary files."""
         self._temporary.close()
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
-        """The blocks of a dense topic, from a log time [ns] on.
+        """Yield the blocks of a dense topic, starting at a log time [ns].
 
         Raises:
             InputError: see `messages`.
-            LatheError: a block is broken.
+            LatheError: a block cannot be decoded.
         """
         decoder = Decoder(self.topics[topic].type)
         for _, _, data in self.messages({topic}, start_ns=start_ns):
@@ -278,32 +278,32 @@ class Source:
                 raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
 
     def step_ns(self, topic: str) -> int:
-        """Sampling step of a dense topic [ns], as its first block says; 0 if it has none.
+        """Return the sampling step of a dense topic from its first block [ns]; 0 if it has no block.
 
         Raises:
             InputError: see `messages`.
-            LatheError: the block is broken.
+            LatheError: the block cannot be decoded.
         """
         return next((block.step_ns for block in self.blocks(topic)), 0)
 
     def messages(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """Topic, log time [ns] and bytes of each message, in the order of log times; see `batches`."""
+        """Yield topic, log time [ns] and bytes of each message, in the order of log times; see `batches`."""
         return chain.from_iterable(self.batches(topics, start_ns=start_ns, stop_ns=stop_ns))
 
     def batches(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Batch]:
-        """Messages in the order of log times, as many at a time as come handy.
+        """Yield the messages in the order of log times, in batches of a convenient size.
 
         Args:
-            topics: those wanted; None: all.
-            start_ns: log times from this on [ns].
-            stop_ns: log times before this [ns].
+            topics: topics to read; None: all.
+            start_ns: smallest log time to read [ns].
+            stop_ns: log time at which reading stops, exclusive [ns].
 
         Raises:
-            InputError: the bag is broken where the next message should be.
+            InputError: the bag is damaged at the position of the next message.
         """
         names = set(self.topics) if topics is None else topics & set(self.topics)
         start, stop = start_ns or 0, _NEVER if stop_ns is None else stop_ns
@@ -332,7 +332,7 @@ class Source:
             raise InputError(f"{self.path}: broken ({_reason(error)}){hint}") from None
 
     def _unpacked(self, batch: Batch, budget: Budget) -> Iterator[Batch]:
-        """Messages that are compressed one by one, none of them to more than it says."""
+        """Unpack messages that are compressed individually, each to at most its stated size."""
         for topic, log_ns, data in batch:
             whole = unpack("zstd", data, unpacked_size(data[:18]))
             budget.take(len(whole))
@@ -344,7 +344,7 @@ def _reason(error: Exception) -> str:
 
 
 def _overlapping(reads: Sequence[Read]) -> Iterator[list[Read]]:
-    """Groups of spans that follow each other in time; those of a group overlap."""
+    """Group the spans that overlap in log time; consecutive groups do not overlap."""
     group: list[Read] = []
     end = 0
     for read in sorted(reads, key=lambda read: read[0].first_ns):
@@ -358,7 +358,7 @@ def _overlapping(reads: Sequence[Read]) -> Iterator[list[Read]]:
 
 
 def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Iterator[Batch]:
-    """The messages of spans that overlap, by log time."""
+    """Merge the messages of overlapping spans by log time."""
     if len(group) == 1:
         ((span, wanted),) = group
         yield from span.read(wanted, start, stop, budget)
@@ -382,7 +382,7 @@ def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Ite
 
 
 def _readable(read: Read) -> bool:
-    """Whether there is a message in a span."""
+    """Return whether a span has at least one readable message."""
     span, wanted = read
     try:
         return any(span.read(wanted, 0, _NEVER, Budget(span.size)))

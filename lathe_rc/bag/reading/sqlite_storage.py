@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SQLite files as rosbag2 writes them, read without a change to them or to anything beside them."""
+"""Reader of SQLite files as rosbag2 writes them, without changes to them or to the files beside them."""
 
 import contextlib
 import json
@@ -18,28 +18,28 @@ from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget
 from lathe_rc.errors import InputError, shown
 
-_LAST = 2**63 - 1  # number that SQLite knows
+_LAST = 2**63 - 1  # largest integer of SQLite
 _LOG_HEAD, _FRAME_HEAD = 32, 24  # of a write-ahead log [B]; both have the same two random numbers while a frame counts
 _JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # at the end of a rollback journal that names another
-_WRONG = (ValueError, sqlite3.Error, OverflowError)  # what broken bytes lead to
+_WRONG = (ValueError, sqlite3.Error, OverflowError)  # exceptions that damaged bytes lead to
 
 
 def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
-    """A database with the messages that only its logs have: itself, or a copy in ``folder`` if there are any.
+    """Return a database that includes the messages of its logs: itself, or a copy in ``folder`` if it has logs.
 
-    A recorder that was killed leaves a write-ahead log or a rollback journal, which the next writer works into the
-    database; here that is the copy.
+    A killed recorder leaves a write-ahead log or a rollback journal, which the next writer applies to the database;
+    here it is applied to the copy.
 
     Returns:
-        The database, and the bytes of the write-ahead log that give nothing: broken, or of no whole transaction.
+        The database, and the number of unusable bytes of the write-ahead log: damaged, or of no complete transaction.
 
     Raises:
         InputError: a log is a link.
         ValueError: a journal names another file.
-        OSError: the copy cannot be made.
-        sqlite3.Error: the database is broken.
+        OSError: the copy cannot be created.
+        sqlite3.Error: the database is damaged.
     """
-    beside = Path(os.path.realpath(path))  # where SQLite has them
+    beside = Path(os.path.realpath(path))  # the folder in which SQLite expects the logs
     found = [beside.with_name(f"{beside.name}-{kind}") for kind in ("wal", "journal")]
     logs = [log for log in found if log.is_file() and log.stat().st_size]
     for log in logs:
@@ -67,7 +67,7 @@ def _names_another(journal: Path) -> bool:
 
 
 def _left(log: Path, frames: int) -> int:
-    """Bytes of a write-ahead log behind its good frames; older ones, which it overwrites, do not count."""
+    """Return the bytes of a write-ahead log behind its valid frames, not counting frames of an earlier log."""
     end = log.stat().st_size
     if frames <= 0:
         return end
@@ -81,14 +81,14 @@ def _left(log: Path, frames: int) -> int:
 
 
 def connect(path: Path) -> sqlite3.Connection:
-    """Open a database for reading alone."""
+    """Open a database read-only."""
     # Immutable: no locks, and neither -wal nor -shm files beside a bag that may be on a read-only disk.
     return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
 
 
 @dataclass(frozen=True)
 class _Table(Span):
-    """The messages of a database."""
+    """Message table of a database."""
 
     path: Path
 
@@ -100,7 +100,7 @@ class _Table(Span):
             for number, log_ns, data in base.execute(
                 query, (MOST_BYTES, json.dumps(list(topics)), max(start_ns, 0), min(stop_ns - 1, _LAST))
             ):
-                # An index that is broken may give other rows than were asked for.
+                # A damaged index may return rows other than those requested.
                 sound = number in topics and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes)
                 if not sound:
                     raise ValueError(f"message of topic {str(number)[:20]} at {str(log_ns)[:20]} ns, or too long")
@@ -132,7 +132,7 @@ def open_sqlite(path: Path, folder: Path) -> Storage:
 
 
 def left_over(size: int) -> str:
-    """In words: bytes of a write-ahead log that give nothing."""
+    """Describe a number of unusable bytes of a write-ahead log."""
     return f"{size} B of its write-ahead log are broken, or were not written to the end"
 
 
@@ -146,7 +146,7 @@ def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
 
 
 def select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
-    """Rows of a table as texts, but for a number in the first column; bags of older ROS lack columns and tables."""
+    """Return the rows of a table as strings, with a number in the first column; old bags lack columns and tables."""
     there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
     if columns[0] not in there:
         return []
@@ -156,7 +156,7 @@ def select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> li
 
 
 def _count(base: sqlite3.Connection, storage: Storage) -> tuple[int, int]:
-    """Count the messages of each topic; returns the first and the last log time."""
+    """Count the messages of each topic; return the first and the last log time [ns]."""
     query = "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
     try:
         counts = base.execute(query).fetchmany(2 * MOST_TOPICS)
@@ -176,7 +176,7 @@ def _count(base: sqlite3.Connection, storage: Storage) -> tuple[int, int]:
 
 
 def _count_rows(base: sqlite3.Connection) -> list[tuple[int, int, int, int]]:
-    """The counts up to where the database is broken."""
+    """Count the messages by topic, up to the first damaged page of the database."""
     times: dict[int, list[int]] = {}
     with contextlib.suppress(sqlite3.DatabaseError):
         for number, log_ns in base.execute("SELECT topic_id, timestamp FROM messages"):
@@ -187,11 +187,11 @@ def _count_rows(base: sqlite3.Connection) -> list[tuple[int, int, int, int]]:
 
 
 def check_tables(base: sqlite3.Connection) -> None:
-    """Refuse a SQLite file whose answers are more than what it holds: views, triggers, columns that are computed.
+    """Reject a SQLite file with computed content: views, triggers, generated columns.
 
     Raises:
-        ValueError: it has some, or a message that is too long.
-        sqlite3.Error: it is none.
+        ValueError: the file has such content, or a message that is too long.
+        sqlite3.Error: the file is not a SQLite database.
     """
     made = base.execute("SELECT name, type, coalesce(sql, '') FROM sqlite_master").fetchmany(MOST_TOPICS)
     for name, kind, sql in made:
@@ -203,7 +203,7 @@ def check_tables(base: sqlite3.Connection) -> None:
             raise ValueError(f"{str(kind)[:20]} {str(name)[:80]!r} in the database; rosbag2 makes plain tables only")
     if any(name == "messages" for name, _, _ in made):
         longest = None
-        with contextlib.suppress(sqlite3.DatabaseError):  # broken somewhere: what can be read of it is looked at later
+        with contextlib.suppress(sqlite3.DatabaseError):  # damaged somewhere: its readable parts are examined later
             (longest,) = base.execute("SELECT max(length(data)) FROM messages").fetchone()
         if isinstance(longest, int) and longest > MOST_BYTES:
             raise ValueError(f"a message of {longest} B; allowed: up to {MOST_BYTES}")

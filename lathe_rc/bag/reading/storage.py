@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Channels of the files of bags, and spans of messages that are read when their time comes."""
+"""Channels of bag files, and spans of messages that are read on demand."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,11 +19,11 @@ CDR = "cdr"  #: the serialization of ROS 2, the only one that is read
 
 @dataclass(frozen=True)
 class Batch:
-    """Messages in the same bytes.
+    """Messages located in a common byte string.
 
     Attributes:
-        whole: the bytes.
-        topics: by channel.
+        whole: the byte string.
+        topics: topic name by channel.
         places: channel, log time [ns], begin and end of each message, shape (messages, 4).
     """
 
@@ -32,31 +32,31 @@ class Batch:
     places: Places
 
     def __len__(self) -> int:
-        """Number of messages."""
+        """Return the number of messages."""
         return len(self.places)
 
     def __iter__(self) -> Iterator[Message]:
-        """Topic, log time [ns] and bytes of each."""
+        """Yield topic, log time [ns] and bytes of each message."""
         for channel, log_ns, begin, end in self.places.tolist():
             yield self.topics[channel], log_ns, self.whole[begin:end]
 
     @classmethod
     def of(cls, message: Message) -> "Batch":
-        """A batch of one."""
+        """Return a batch of one message."""
         topic, log_ns, data = message
         return cls(data, {0: topic}, np.array([[0, log_ns, 0, len(data)]], np.uint64))
 
 
 @dataclass
 class Channel:
-    """A topic as a file announces it.
+    """Topic as announced in a file.
 
     Attributes:
-        topic: its name.
-        type: message type; empty: none is told.
+        topic: name of the topic.
+        type: message type; empty if the file states none.
         encoding: serialization of its messages.
-        qos: offered by the publishers, as far as it is told.
-        count: messages.
+        qos: profiles offered by the publishers, as far as the file states them.
+        count: number of messages.
     """
 
     topic: str
@@ -67,7 +67,7 @@ class Channel:
 
     @property
     def unread(self) -> str:
-        """Why its messages are not read; empty if they are."""
+        """Return the reason why the messages are not read; empty if they are read."""
         if self.encoding != CDR:
             return f"serialized as {self.encoding[:64]!r}, not {CDR!r}"
         return "" if self.type else "without a message type"
@@ -75,12 +75,12 @@ class Channel:
 
 @dataclass(frozen=True)
 class Span:
-    """Messages that are read together: a chunk, a part of a file without chunks, a database.
+    """Messages that are read together: a chunk, a section of a file without chunks, a database.
 
     Attributes:
-        first_ns, last_ns: smallest and largest log time.
-        size: in memory [B]; 0: its messages come one by one.
-        channels: that it may have messages of; empty: any.
+        first_ns, last_ns: smallest and largest log time [ns].
+        size: size in memory [B]; 0: the messages are read one by one.
+        channels: channels that may have messages in it; empty: any.
     """
 
     first_ns: int
@@ -89,30 +89,30 @@ class Span:
     channels: frozenset[int]
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """Messages by log time.
+        """Yield the messages by log time.
 
         Args:
-            topics: by the channels that are wanted.
-            start_ns: log times from this on [ns].
-            stop_ns: log times before this [ns].
-            budget: what is read is counted by it.
+            topics: topic name by requested channel.
+            start_ns: smallest log time to read [ns].
+            stop_ns: log time at which reading stops, exclusive [ns].
+            budget: budget to which the bytes and messages read are charged.
 
         Raises:
-            ValueError: it is broken; OSError and SQLite's errors alike.
+            ValueError: the span is damaged; OSError and sqlite3.Error likewise.
         """
         raise NotImplementedError
 
 
 @dataclass
 class Storage:
-    """Content of a file of a bag.
+    """Content of one file of a bag.
 
     Attributes:
-        channels: by number.
-        spans: in the order of the file.
-        first_ns, last_ns: smallest and largest log time of its messages, if it has any.
-        damage: what cannot be read of it, one line each; where its summary is right, damage may show up later.
-        remarks: what it says wrong of itself, though all messages can be read.
+        channels: channels by number.
+        spans: spans in the order of the file.
+        first_ns, last_ns: smallest and largest log time of its messages, if it has any [ns].
+        damage: unreadable parts, one line each; with a valid summary, damage may be detected later.
+        remarks: wrong statements of the file about itself that make no message unreadable.
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -124,10 +124,10 @@ class Storage:
     _offered: int = 0  # characters of quality of service
 
     def announce(self, number: int, channel: Channel, offered: str) -> None:
-        """Take a channel and its quality of service.
+        """Add a channel with its quality of service.
 
         Raises:
-            ValueError: a name that cannot be shown, or there are too many.
+            ValueError: a name is not printable, or there are too many channels.
         """
         check_name(channel.topic)
         if channel.type:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags piece by piece: their signals go to sinks as from an offline run, in as little memory."""
+"""Streaming of a bag in chunks: its signals go to sinks as from an offline run, with as little memory."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -20,22 +20,22 @@ from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Signals
 
-_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are read at once, and their size
-_AHEAD = 64  # pieces that one topic may be ahead of another
+_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are decoded together, and their total size
+_AHEAD = 64  # chunks that one topic may be ahead of another
 _MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
 
 
 @dataclass(frozen=True)
 class BagHeader:
-    """The header of a bag of the cell, once it has been read.
+    """Header of a bag of the cell, available once the bag has been read.
 
     Attributes:
         types: message type by fully qualified signal topic.
-        samples: index after the last of every dense topic: their number, but in a snapshot.
-        left: samples that some topics have beyond that: the recording was interrupted; 0 if it was not.
+        samples: index after the last sample that every dense topic has; equals their number, except in a snapshot.
+        left: further samples of some topics, left by an interrupted recording; otherwise 0.
         step_ns: sampling step [ns]; 0 if the bag has no dense topic.
         run_id: identity of the run.
-        about: texts that the bag says of itself.
+        about: strings from the metadata of the bag.
     """
 
     types: Mapping[str, str]
@@ -47,13 +47,13 @@ class BagHeader:
 
 
 def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
-    """Refuse a block that does not follow the one before, which ends ahead of sample ``end``.
+    """Reject a block that does not continue the previous one, which ends before sample ``end``.
 
     Args:
-        topic: of the block.
-        block: the block.
-        end: index of its first sample if none is missing.
-        step_ns: sampling step so far [ns]; 0: any.
+        topic: topic of the block.
+        block: the decoded block.
+        end: expected index of its first sample.
+        step_ns: sampling step so far [ns]; 0: any step.
 
     Raises:
         LatheError: samples are missing or repeated, or the step changes.
@@ -65,7 +65,7 @@ def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
 
 
 class _Dense:
-    """Blocks of a topic that have not been handed on, from sample ``first`` on."""
+    """Blocks of a topic that have not been handed on yet, starting at sample ``first``."""
 
     def __init__(self, topic: str, msgtype: str, first: int = 0) -> None:
         self.topic, self.type = topic, msgtype
@@ -77,7 +77,7 @@ class _Dense:
         self._decoder = Decoder(msgtype)
 
     def add(self, data: bytes) -> bool:
-        """Take a message; tells whether it is worth asking for what can be handed on: messages are read some at once.
+        """Add a message and return whether samples may be ready; several messages are decoded together.
 
         Raises:
             LatheError: see `read`.
@@ -90,21 +90,21 @@ class _Dense:
         return True
 
     def read(self) -> None:
-        """Read the messages that have been taken.
+        """Decode the messages added so far.
 
         Raises:
             LatheError: see `read_all`.
         """
-        # The decoder joins blocks of one piece of memory: together they take a fraction of the time of each alone.
+        # The decoder joins blocks of one memory area: decoded together they take a fraction of the time of each alone.
         messages, self._messages, self._bytes = self._messages, [], 0
         ends = np.cumsum([0, *map(len, messages)])
         self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
 
     def read_all(self, whole: bytes, places: Places) -> None:
-        """Read messages that stand somewhere in ``whole``; begin and end of each, shape (messages, 2).
+        """Decode messages located in ``whole`` by begin and end of each, shape (messages, 2).
 
         Raises:
-            LatheError: samples are missing or repeated, or a block is broken.
+            LatheError: samples are missing or repeated, or a block cannot be decoded.
         """
         try:
             for block in self._decoder.decode_all(whole, places):
@@ -119,7 +119,7 @@ class _Dense:
         self.blocks.append(block)
 
     def take(self, samples: int) -> Signals:
-        """The next samples, as arrays of their own."""
+        """Return the next samples as newly allocated arrays."""
         signals = messages.allocate(self.type, samples)
         self.take_into(signals)
         return signals
@@ -140,17 +140,17 @@ class _Dense:
 
 
 class Feeder:
-    """Turns messages of signal topics into pieces; for a bag, or for what is heard live.
+    """Assembler of chunks from the messages of signal topics, for recorded bags and live topics.
 
     Args:
-        types: message type by fully qualified topic; others than signal topics are left out.
-        sinks: get the pieces.
-        piece: samples in a piece.
-        first: where all begin.
+        types: message type by fully qualified topic; topics other than signal topics are ignored.
+        sinks: sinks that get the chunks.
+        piece: samples per chunk.
+        first: index of the first sample of all topics.
 
     Attributes:
-        types: of the signal topics.
-        first: the first sample that has not been handed on.
+        types: message type by fully qualified signal topic.
+        first: index of the first sample that has not been handed on.
     """
 
     def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0) -> None:
@@ -164,24 +164,24 @@ class Feeder:
 
     @property
     def step_ns(self) -> int:
-        """Sampling step [ns]; 0 before the first block."""
+        """Return the sampling step [ns]; 0 before the first block."""
         return next((dense.newest.step_ns for dense in self._dense.values() if dense.newest), 0)
 
     @property
     def run_id(self) -> str:
-        """Identity of the run."""
+        """Return the identity of the run."""
         return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
 
     def add(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Take a message.
+        """Add a message, and hand on the chunks it completes.
 
         Raises:
-            LatheError: samples are missing, or a topic stands still while others go on.
+            LatheError: samples are missing, or a topic stalls while others continue.
         """
         dense = self._dense.get(topic)
         if dense is None:
             if not self._dense:
-                return  # nothing that they could be handed on with
+                return  # without blocks there is no chunk to hand them on with
             if len(self._sparse[topic]) >= _MOST_WAITING:
                 raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
             try:
@@ -216,10 +216,10 @@ class Feeder:
         self.first += samples
 
     def finish(self) -> int:
-        """Hand on the rest.
+        """Hand the remaining samples to the sinks.
 
         Returns:
-            Samples that some topics have more than others: 0 if the recording is complete.
+            Number of samples that some topics have beyond the others; 0 if the recording is complete.
         """
         if not self._dense:
             return 0
@@ -234,11 +234,11 @@ class Feeder:
 
 
 class SampleReader:
-    """A dense topic of a bag, read as it is needed.
+    """Reader of a dense topic of a bag, on demand.
 
     Args:
-        source: the bag; open as long as it is read.
-        topic: fully qualified.
+        source: the bag; must stay open while the topic is read.
+        topic: fully qualified topic.
     """
 
     def __init__(self, source: Source, topic: str) -> None:
@@ -246,7 +246,7 @@ class SampleReader:
         self._batches = source.batches({topic})
 
     def take(self, samples: int) -> Signals:
-        """The next samples, arrays of shape (samples,); see `take_into`."""
+        """Return the next samples as arrays of shape (samples,); see `take_into`."""
         signals = messages.allocate(self._dense.type, samples)
         self.take_into(signals)
         return signals
@@ -255,7 +255,7 @@ class SampleReader:
         """Fill arrays of shape (samples,) with the next samples.
 
         Raises:
-            LatheError: there are not so many, or some are missing.
+            LatheError: fewer samples are left, or some are missing.
         """
         samples = next(iter(signals.values())).size
         while self._dense.end - self._dense.first < samples:
@@ -267,15 +267,15 @@ class SampleReader:
 
 
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
-    """Read a bag of the cell and hand its signals to sinks, in pieces.
+    """Read a bag of the cell and pass its signals to sinks, in chunks.
 
     Args:
-        path: the bag.
-        sinks: get every sample once, in order; topics are fully qualified.
-        piece: samples in a piece; the last may be shorter.
+        path: path of the bag.
+        sinks: sinks that get every sample once, in order; topics are fully qualified.
+        piece: samples per chunk; the last chunk may be shorter.
 
     Raises:
-        InputError: not a bag.
+        InputError: the path is not a bag.
         LatheError: samples are missing or repeated.
     """
     with Source(path) as source:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The speed of a recorded spindle as a tachogram that a speed law can follow."""
+"""Conversion of a recorded spindle speed into a tachogram for a speed law."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ _RPM = 30.0 / np.pi  # for 1 rad/s
 
 @dataclass(frozen=True)
 class Made:
-    """The files that have been written.
+    """Description of a written tachogram file.
 
     Attributes:
-        points: rows of the file.
-        samples: of the recording.
-        largest: greatest distance of the file's lines from a recorded speed [1/min].
-        field: of the encoder that the speed was taken from.
-        standstill: time at which the speed is 0, in all [s].
-        stands_from: first of these times after sample 0 [s]; None: the spindle turns throughout.
+        points: number of rows of the file.
+        samples: number of samples of the recording.
+        largest: largest deviation of the file's line segments from the recorded speed [1/min].
+        field: field of the encoder from which the speed was taken.
+        standstill: total time at speed 0 [s].
+        stands_from: time of the first standstill after sample 0 [s]; None: the spindle turns throughout.
     """
 
     points: int
@@ -39,17 +39,17 @@ class Made:
 
 
 def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
-    """Write the speed of a recorded spindle to a CSV file with as few rows as lines between them allow.
+    """Write the speed of a recorded spindle to a CSV file, with as few rows as linear interpolation allows.
 
     Args:
-        bag: the recording.
-        output: the file; an existing one is replaced.
-        tolerance: greatest distance of the lines from a recorded speed [1/min].
-        topic: of the encoder; empty: the only one.
+        bag: path of the recording.
+        output: path of the CSV file; an existing file is replaced.
+        tolerance: largest deviation of the line segments from the recorded speed [1/min].
+        topic: topic of the encoder; empty: the only encoder of the bag.
 
     Raises:
-        InputError: not a bag, no encoder or several, or a place that cannot be written to.
-        LatheError: samples are missing or not finite, or the spindle does not turn one way.
+        InputError: the path is no bag, the bag has no encoder or several, or the output is not writable.
+        LatheError: samples are missing or not finite, or the spindle reverses its direction.
     """
     with Source(bag) as source:
         recorded = Recorded(source, {"encoder": _chosen(source, topic)})
@@ -83,7 +83,7 @@ def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
 
 
 def _chosen(source: Source, topic: str) -> str:
-    """The encoder's topic."""
+    """Return the topic of the encoder."""
     found = sorted(t for t, said in source.topics.items() if said.type == messages.ENCODER and said.count)
     if topic and topic not in found:
         raise InputError(f"--topic {topic}: {source.path} has no such encoder; allowed: {', '.join(found) or 'none'}")

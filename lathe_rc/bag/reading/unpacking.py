@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unpacking chunks, messages and whole files of a bag, never to more than they say or than is allowed."""
+"""Decompression of chunks, messages and files of a bag, limited to their stated size and the allowed size."""
 
 import struct
 from collections.abc import Iterator
@@ -12,16 +12,16 @@ from isal.isal_zlib import crc32
 from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES, TooMuchError
 from lathe_rc.errors import shown
 
-_OVERHEAD = 2**16  # of compression, beyond 1/128 of what does not shrink [B]
-_PIECE = 2**20  # of a file that is unpacked [B]
+_OVERHEAD = 2**16  # of compression, beyond 1/128 of incompressible data [B]
+_PIECE = 2**20  # of a file that is unpacked at a time [B]
 CHUNK = struct.Struct("<QQQII")  #: first and last time, size, CRC, length of the compression's name
 
 
 class Budget:
-    """Bytes and messages that files may still give, see `limits`.
+    """Budget of bytes and messages that files may still yield, see `limits`.
 
     Args:
-        size: of the files [B].
+        size: size of the files [B].
     """
 
     def __init__(self, size: int) -> None:
@@ -29,10 +29,10 @@ class Budget:
         self._messages = MOST_SMALL_MESSAGES + size
 
     def take(self, size: int, messages: int = 0) -> None:
-        """Count bytes, and messages in them.
+        """Charge bytes, and the messages in them, to the budget.
 
         Raises:
-            TooMuchError: they are more than files of this size have.
+            TooMuchError: the bytes or messages exceed the limit for files of this size.
         """
         self._bytes -= size
         self._messages -= messages
@@ -42,10 +42,10 @@ class Budget:
 
 
 def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
-    """The records of a chunk; never more than it says.
+    """Return the unpacked records of a chunk, never more than its stated size.
 
     Raises:
-        ValueError: it does not unpack to ``size`` bytes, or not at all.
+        ValueError: the data do not unpack to ``size`` bytes, or are damaged.
     """
     if not 0 <= size <= MOST_BYTES:
         raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
@@ -69,7 +69,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
 
 
 def unpacked_size(data: bytes) -> int:
-    """Size that a zstd frame says it has [B], from its first 18 bytes; -1 if it says nothing or is none."""
+    """Return the size stated by a zstd frame [B], from its first 18 bytes; -1 if it states none or is no frame."""
     try:
         return int(zstandard.frame_content_size(data))
     except zstandard.ZstdError:
@@ -77,16 +77,16 @@ def unpacked_size(data: bytes) -> int:
 
 
 def is_packed(head: bytes) -> bool:
-    """Whether a file that begins like this is compressed as a whole, or what comes first is skipped by zstd."""
+    """Return whether a file with this head is compressed as a whole, or begins with a skippable zstd frame."""
     return head.startswith(b"\x28\xb5\x2f\xfd") or (head[1:4] == b"\x2a\x4d\x18" and head[0] >> 4 == 5)
 
 
 def unpack_file(path: Path) -> Iterator[bytes]:
-    """The content of a file that is compressed as a whole, piece by piece.
+    """Yield the content of a file that is compressed as a whole, in chunks.
 
     Raises:
-        ValueError: it is longer than allowed.
-        ZstdError: it is broken.
+        ValueError: the content is longer than allowed.
+        ZstdError: the file is damaged.
     """
     budget = Budget(path.stat().st_size)
     with path.open("rb") as stream:
@@ -97,10 +97,10 @@ def unpack_file(path: Path) -> Iterator[bytes]:
 
 
 def read_chunk(content: bytes, place: int) -> bytes:
-    """The records of a chunk that stands at byte ``place``.
+    """Return the unpacked records of the chunk at byte ``place``.
 
     Raises:
-        ValueError: it is broken.
+        ValueError: the chunk is damaged.
     """
     try:
         # The checksum is that of the unpacked records; 0 stands for none.

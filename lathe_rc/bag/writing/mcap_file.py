@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files, chunk by chunk.
+"""Writer of MCAP files, chunk by chunk.
 
-The records are those of the mcap library; its own writer takes 14 µs for a message, as much as a stage of the cell
-needs for a block: offline runs of piston and full_cell, recorded by it, had 0.3 of the pace. Here a message costs a
-header and two appends, a row of blocks one append; the index of a chunk is made when it is full, by the compiled walk
-that readers use. The library's writer also keeps an object for each chunk of a long run, and does not flush.
+The records are those of the mcap library, but its own writer takes 14 µs per message, as long as a stage of the cell
+takes per block: offline runs of piston and full_cell, recorded by it, ran at 0.3 of the speed. Here a message costs a
+header and two appends, and a row of blocks one append; the index of a chunk is built when the chunk is full, by the
+compiled walk that the readers use. The library's writer also keeps one object per chunk of a long run, and has no
+flush.
 
-Schemas and channels stand again at the beginning of chunks 2, 3, 5, 9, 17 and so on: a damaged chunk takes no other
-with it, also in a file that was cut off before its summary.
+Schemas and channels are repeated at the beginning of chunks 2, 3, 5, 9, 17 and so on: a damaged chunk makes no other
+chunk unreadable, not even in a file that was cut off before its summary.
 """
 
 import io
@@ -31,26 +32,26 @@ _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log ti
 TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
 _FOOTER = struct.Struct("<BQQQ")
-_ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # kept of the disk for index and metadata [B]
-_LEVEL = -5  # of zstd: a fifth of the time of its default, for files 7 % larger (docs/bags.md)
+_ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # reserved on the disk for index and metadata [B]
+_LEVEL = -5  # of zstd: 20 % of the time of its default level, for files 7 % larger (docs/bags.md)
 
 
 class _Record(Protocol):
-    """A record of the mcap library."""
+    """Record of the mcap library that can be serialized."""
 
     def write(self, stream: RecordBuilder, /) -> None:
-        """Append it."""
+        """Append the record to a stream."""
 
 
 def message_head(channel: int, log_ns: int, length: int, publish_ns: int | None = None, sequence: int = 0) -> bytes:
-    """The bytes of a file ahead of the ``length`` bytes of a message; by default published at its log time."""
+    """Return the bytes before a message's ``length`` data bytes; publish time defaults to the log time."""
     published = log_ns if publish_ns is None else publish_ns
     size = length + _MESSAGE.size - HEAD.size
     return _MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence, log_ns, published)
 
 
 def _record(opcode: int, *parts: bytes) -> bytes:
-    """A record of these contents."""
+    """Return a serialized record with these contents."""
     return b"".join([HEAD.pack(opcode, sum(map(len, parts))), *parts])
 
 
@@ -62,31 +63,31 @@ def _encoded(*each: _Record) -> bytes:
 
 
 def schema_content(name: str, encoding: str, text: bytes) -> bytes:
-    """The content of a schema record, with number 0."""
+    """Return the content of a schema record, with schema number 0."""
     return _encoded(records.Schema(id=0, data=text, encoding=encoding, name=name))[HEAD.size :]
 
 
 def channel_content(topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """The content of a channel record, with number 0."""
+    """Return the content of a channel record, with channel number 0."""
     channel = records.Channel(id=0, topic=topic, message_encoding=encoding, metadata=dict(metadata), schema_id=0)
     return _encoded(channel)[HEAD.size :]
 
 
 class McapFile:
-    """A file that is being written.
+    """MCAP file opened for writing.
 
     Args:
-        path: of the file; must not exist.
+        path: path of the file; must not exist.
         chunk_size: bytes of messages after which a chunk is written.
-        compress: with zstd.
-        profile: of the file.
+        compress: compress the chunks with zstd.
+        profile: profile of the file.
 
     Attributes:
-        counts: messages by channel, of the chunks that have been written.
-        first_ns, last_ns: smallest and largest log time so far; None before the first message.
+        counts: messages by channel in the chunks written so far.
+        first_ns, last_ns: smallest and largest log time so far [ns]; None before the first message.
 
     Raises:
-        OSError: the file cannot be made; later from any method: the disk does not take it.
+        OSError: the file cannot be created; from any later method: writing to the disk fails.
     """
 
     def __init__(self, path: Path, *, chunk_size: int, compress: bool, profile: str = "ros2") -> None:
@@ -103,7 +104,7 @@ class McapFile:
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        self._chunk = io.BytesIO()  # the messages of the chunk, and behind them what earlier ones have left
+        self._chunk = io.BytesIO()  # the messages of the chunk, followed by leftover bytes of earlier chunks
         self._begin_chunk()
         self._offset = self._crc = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
@@ -112,14 +113,14 @@ class McapFile:
         self._put(MCAP0_MAGIC + _encoded(records.Header(profile, "lathe_rc")))
 
     def _begin_chunk(self) -> None:
-        self._chunk.seek(0)  # its memory is used again
+        self._chunk.seek(0)  # its memory is reused
         self._size, self._filled = 0, False
         before = self._chunks
-        if before and before & (before - 1) == 0:  # see the top
+        if before and before & (before - 1) == 0:  # see the module docstring
             self._size += self._chunk.write(b"".join([*self._schemas, *self._channels]))
 
     def _put(self, *parts: bytes | memoryview) -> None:
-        """Write at the end; what does not fit leaves no trace."""
+        """Append bytes to the file; a failed write is truncated again, so that no partial record remains."""
         try:
             for part in parts:
                 rest = memoryview(part)
@@ -134,7 +135,7 @@ class McapFile:
             self._crc = crc32(part, self._crc)
 
     def _keep_room(self) -> None:
-        """Hold as much of the disk as completing the file will take: then a full disk cannot make it unreadable."""
+        """Reserve the disk space for completing the file, so that a full disk cannot make the file unreadable."""
         needed = _ROOM + _ROOM_PER_CHUNK * (self._chunks + 1) + 4 * self._described
         if needed > self._kept:
             needed += _ROOM
@@ -144,33 +145,33 @@ class McapFile:
             self._kept = needed
 
     def free_room(self) -> None:
-        """Let completing the file begin."""
+        """Release the disk space reserved for completing the file."""
         self._reserve.unlink(missing_ok=True)
 
     def add_schema(self, name: str, text: str) -> int:
-        """Describe a message type; returns its number."""
+        """Add the schema of a message type and return its number."""
         return self.copy_schema(schema_content(name, "ros2msg", text.encode()))
 
     def add_channel(self, topic: str, schema: int, encoding: str, metadata: Mapping[str, str]) -> int:
-        """Announce a topic; returns its number."""
+        """Add the channel of a topic and return its number."""
         return self.copy_channel(channel_content(topic, encoding, metadata), schema)
 
     def copy_schema(self, content: bytes) -> int:
-        """Describe a message type as a record of another file does; returns its number here."""
+        """Add a schema with the record content of another file and return its number in this file."""
         number = len(self._schemas) + 1
         self._schemas.append(_record(Opcode.SCHEMA, struct.pack("<H", number), content[2:]))
         self._append(self._schemas[-1])
         return number
 
     def copy_channel(self, content: bytes, schema: int) -> int:
-        """Announce a topic as a record of another file does.
+        """Add a channel with the record content of another file.
 
         Args:
-            content: of the record.
-            schema: its number here; 0: none.
+            content: content of the channel record.
+            schema: number of its schema in this file; 0: no schema.
 
         Returns:
-            The channel's number here.
+            Number of the channel in this file.
         """
         number = len(self._channels) + 1
         self._channels.append(_record(Opcode.CHANNEL, struct.pack("<HH", number, schema), content[4:]))
@@ -185,7 +186,7 @@ class McapFile:
     def add_message(
         self, channel: int, log_ns: int, data: bytes | memoryview, *, publish_ns: int | None = None, sequence: int = 0
     ) -> None:
-        """Append a message; without ``publish_ns`` it was published at its log time."""
+        """Append a message; ``publish_ns`` defaults to the log time."""
         self._size += self._chunk.write(message_head(channel, log_ns, len(data), publish_ns, sequence))
         self._size += self._chunk.write(data)
         self._filled = True
@@ -193,10 +194,10 @@ class McapFile:
             self.flush()
 
     def add_rows(self, size: int, data: bytes | memoryview) -> None:
-        """Append rows of ``size`` bytes, each some whole message records."""
+        """Append rows of ``size`` bytes, each consisting of complete message records."""
         rest = memoryview(data)
         while rest:
-            # As many whole rows as bring the chunk beyond its size, at least one.
+            # As many complete rows as bring the chunk beyond its size, at least one.
             fill = (max(self._chunk_size - self._size, 0) // size + 1) * size
             self._size += self._chunk.write(rest[:fill])
             self._filled, rest = True, rest[fill:]
@@ -204,12 +205,12 @@ class McapFile:
                 self.flush()
 
     def flush(self) -> None:
-        """Hand every message so far to the operating system, as a chunk; if it does not take it, they are lost."""
+        """Hand all messages so far to the operating system, as a chunk; they are lost if the write fails."""
         if not self._filled:
             return
         try:
             if self._refused:
-                raise self._refused  # what follows a gap is not recorded either
+                raise self._refused  # nothing is recorded after a gap
             self._write_chunk()
         except OSError as error:
             self._refused = error
@@ -258,12 +259,12 @@ class McapFile:
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
-        """Append texts that describe the file; ``last``: in the room that has been kept for them."""
+        """Append strings as a metadata record; ``last``: use the disk space reserved for completing the file."""
         content = _encoded(records.Metadata(name=name, metadata=dict(values)))[HEAD.size :]
         self.copy_record(Opcode.METADATA, content, last=last)
 
     def copy_record(self, opcode: int, content: bytes, *, last: bool = False) -> None:
-        """Append an attachment or metadata as a record of another file has it; ``last``: see `add_metadata`."""
+        """Append an attachment or metadata record copied from another file; ``last``: see `add_metadata`."""
         self.flush()
         record, stream = _record(opcode, content), ReadDataStream(io.BytesIO(content))
         if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long for its escapes
@@ -290,7 +291,7 @@ class McapFile:
             self.abort()
 
     def abort(self) -> None:
-        """Close the file as it is."""
+        """Close the file without writing a summary."""
         self.free_room()
         self._stream.close()
 

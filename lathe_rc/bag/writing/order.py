@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the signal messages in a bag: by log time, then topic, then index, whatever the order of arrival."""
+"""Bag order of signal messages: by log time, then topic, then index, independent of the order of arrival."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -15,7 +15,7 @@ _BUFFER = 2**20  # size of a buffer, unless one row takes more [B]
 
 
 class _Single(NamedTuple):
-    """A message at a chosen sample, or a block without its row; sorts as bags are sorted."""
+    """Message at a single sample, or a block outside its row; sorts in bag order."""
 
     log_ns: int
     topic: str
@@ -24,25 +24,26 @@ class _Single(NamedTuple):
 
 
 class Merger:
-    """Merge of all signal topics in the order of a bag.
+    """Merger of all signal topics into bag order.
 
-    A row of blocks leaves when every dense topic has brought its block and every source the sparse messages up to its
-    end, which the block counts: then nothing with an earlier time can still come. Later ones do not count: a source
-    sends on several topics, and DDS keeps the order of each, not that between them.
+    A row of blocks is written once every dense topic has delivered its block and every source the sparse messages up to
+    the end of the row, whose number the block contains: then no message with an earlier time can follow. The arrival of
+    later messages is no criterion: a source sends on several topics, and DDS preserves the order within a topic, not
+    between topics.
 
     Args:
-        writer: the bag, or what makes bags; its topics must have been added.
+        writer: output, one or more bags; its topics must have been added.
         dense: message type and source by fully qualified dense topic.
         sparse: source by fully qualified sparse topic.
         run_id: identity of the run.
         step_ns: sampling step [ns].
-        samples: of a block; the last may be shorter.
+        samples: samples per block; the last block may be shorter.
 
     Attributes:
-        rows: written so far.
-        samples: written so far, of each dense topic.
-        log_ns: time of the last of them.
-        complete: the last block of every topic has been written.
+        rows: number of rows written so far.
+        samples: number of samples written so far, per dense topic.
+        log_ns: time of the last written sample [ns].
+        complete: whether the last block of every topic has been written.
     """
 
     def __init__(
@@ -58,10 +59,10 @@ class Merger:
         self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
         self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
         self._places = {each.topic: place for place, each in enumerate(self._topics)}
-        self._ends = [0] * len(self._topics)  # rows that each topic has brought
-        self._late = len(self._topics)  # topics that have not brought the next row
+        self._ends = [0] * len(self._topics)  # rows that each topic has delivered
+        self._late = len(self._topics)  # topics that have not delivered the next row
         self._final: int | None = None  # the last row
-        self._finals = 0  # topics that have brought it
+        self._finals = 0  # topics that have delivered it
         self._plan = Plan(self._topics, run_id, step_ns, samples)
         self._buffer_rows = max(_BUFFER // self._plan.rows.size, 1)  # rows
         self._buffers: dict[int, RowBuffer] = {}  # by number
@@ -78,18 +79,18 @@ class Merger:
         self.log_ns = START_NS
         self.complete = False
 
-    # ---- what comes in ------------------------------------------------------------------------------
+    # ---- input ---------------------------------------------------------------------------------------
 
     def add_block(self, topic: str, block: Block, data: bytes | None = None) -> bool:
-        """Take a block; returns whether every topic has one now, so that it is worth asking `release`.
+        """Add a block and return whether every topic has one for the next row, so that `release` may write it.
 
         Args:
-            topic: fully qualified.
-            block: the block.
-            data: its message, if there is one.
+            topic: fully qualified topic.
+            block: the decoded block.
+            data: its serialized message, if there is one.
 
         Raises:
-            LatheError: another run, or topics are cut into different blocks.
+            LatheError: the block belongs to another run, or the topics are cut into different blocks.
         """
         place = self._places[topic]
         if block.run_id != self._run_id:
@@ -103,14 +104,14 @@ class Merger:
         return self._brought(place, row + 1)
 
     def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> bool:
-        """Take consecutive blocks whose sparse messages have all been added; returns as `add_block` does.
+        """Add consecutive blocks whose sparse messages have all been added; the result is that of `add_block`.
 
         Args:
-            topic: fully qualified.
+            topic: fully qualified topic.
             first: index of the first sample.
-            signals: arrays of shape (n,) by field.
-            companions: what each block says of them, shape (blocks,).
-            last: the run ends with them.
+            signals: arrays of shape (n,) by field name.
+            companions: number of sparse messages stated by each block, shape (blocks,).
+            last: whether the run ends with these blocks.
 
         Raises:
             LatheError: see `add_block`.
@@ -132,8 +133,8 @@ class Merger:
         return not self._late
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Take a sparse message."""
-        # A restarted node publishes its newest messages once more; those that wait here are taken once.
+        """Add a sparse message."""
+        # A restarted node publishes its newest messages again; duplicates of waiting messages are dropped.
         if self._repeats[topic, log_ns, data]:
             self._repeats[topic, log_ns, data] -= 1
             return
@@ -141,24 +142,24 @@ class Merger:
         self._waiting.append(_Single(log_ns, topic, self._sequence[topic], data))
 
     def restarted(self, source: str) -> None:
-        """Another process goes on in the place of a source: what waits of its sparse messages comes once more."""
+        """Register the restart of a source, whose waiting sparse messages will arrive a second time."""
         self._repeats |= Counter(
             (each.topic, each.log_ns, each.data) for each in self._waiting if self._sparse[each.topic] == source
         )
 
     def forget(self, sources: Collection[str]) -> None:
-        """Wait for no more sparse messages of sources that are lost."""
+        """Stop waiting for sparse messages of lost sources."""
         self._lost.update(sources)
         self._needs = [need for need in self._needs if need[1] not in sources]
 
     def _lacks(self, row: int, source: str, messages: int) -> bool:
-        """Whether some of the sparse messages of a source up to the end of a row have not come."""
+        """Return whether sparse messages of a source up to the end of a row are still missing."""
         end_ns = START_NS + (row + 1) * self._length * self._step_ns
         came = sum(each.log_ns < end_ns and self._sparse[each.topic] == source for each in self._waiting)
         return self._written[source] + came < messages
 
     def _check(self, place: int, first: int, samples: int, *, last: bool) -> int:
-        """The row of the next block of a topic."""
+        """Return the row of the next block of a topic, after checking that the block fits it."""
         row = self._ends[place]
         short = samples != self._length and not (last and (self._tail is None or self._tail.plan.samples == samples))
         if first != row * self._length or short or (self._final is not None and row > self._final):
@@ -180,15 +181,15 @@ class Merger:
         self._finals += 1
 
     def _brought(self, place: int, end: int) -> bool:
-        # Only a topic that had nothing for the next row changes whether that row is complete; so callers need not look
-        # at all topics for each block.
+        # Only a topic without a block for the next row changes whether that row is complete; so callers need not check
+        # all topics for each block.
         if self._ends[place] == self.rows:
             self._late -= 1
         self._ends[place] = end
         return not self._late
 
     def _find(self, row: int, samples: int) -> tuple[RowBuffer, int]:
-        """Return the buffer of a row, and the place of the row in it."""
+        """Return the buffer of a row, and the index of the row in it."""
         if samples != self._length:
             if self._tail is None:
                 self._tail = RowBuffer(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
@@ -202,17 +203,17 @@ class Merger:
             buffer.begin(number * self._buffer_rows * self._length)
         return buffer, within
 
-    # ---- what goes out ------------------------------------------------------------------------------
+    # ---- output --------------------------------------------------------------------------------------
 
     def _at(self, row: int) -> tuple[RowBuffer, int]:
-        """Like `_find`, for a row that has come."""
+        """Return the buffer and index of a row whose blocks have been received."""
         return self._find(row, self._length if row != self._final or self._tail is None else self._tail.plan.samples)
 
     def release(self) -> None:
-        """Write what is complete.
+        """Write all complete rows.
 
         Raises:
-            LatheError: not all topics end with the same block; the disk does not take it.
+            LatheError: the topics do not all end with the same block, or writing to the disk fails.
         """
         ready = min(self._ends)
         if self._needs:
@@ -225,9 +226,9 @@ class Merger:
         self._late = sum(end == ready for end in self._ends)
 
     def _together(self, ready: int) -> int:
-        """Return the end of the rows that one write takes: rows of one buffer without a sparse message between them."""
+        """Return the end of the rows for one write: rows of one buffer without a sparse message between them."""
         end = min(ready, (self.rows // self._buffer_rows + 1) * self._buffer_rows)
-        # The short last row has a buffer of its own, for its bytes are laid out otherwise.
+        # The short last row has a buffer of its own, because its byte layout differs.
         if self._tail is not None and self.rows != self._final and end > (self._final or 0):
             end -= 1
         if self._waiting:
@@ -236,7 +237,7 @@ class Merger:
         return max(end, self.rows + 1)
 
     def _write(self, buffer: RowBuffer, within: int, end: int) -> None:
-        """Write rows up to ``end``, all of one buffer, and ahead of them the sparse messages of the first."""
+        """Write rows of one buffer up to row ``end``, after the sparse messages due before the first row."""
         first = self.rows
         first_ns = START_NS + (first * self._length + buffer.plan.samples - 1) * self._step_ns
         due = sorted(single for single in self._waiting if single.log_ns <= first_ns) if self._waiting else []
@@ -244,7 +245,7 @@ class Merger:
             self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
             self._written.update(self._sparse[single.topic] for single in due)
         if due and due[-1].log_ns == first_ns:
-            # Among messages of one time the topic decides: this row has to be taken apart.
+            # Among messages of equal time the topic decides, so this row has to be split into its messages.
             due += [_Single(first_ns, each.topic, 0, buffer.message(k, within)) for k, each in enumerate(self._topics)]
             first += 1
         for single in sorted(due):
@@ -256,15 +257,15 @@ class Merger:
         self.rows, self.samples = end, (end - 1) * self._length + buffer.plan.samples
         self.log_ns = START_NS + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final
-        # A used buffer has its template and step already; a new one costs a copy of the template for each row.
+        # A used buffer already has its template and step; a new one costs a copy of the template for each row.
         if end % self._buffer_rows == 0 and buffer is not self._tail:
             self._free.append(self._buffers.pop(end // self._buffer_rows - 1))
 
     def write_rest(self) -> None:
-        """Write everything that is left, sorted: what an interrupted run has of its last blocks.
+        """Write all remaining messages in bag order, such as the last blocks of an interrupted run.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         left, self._waiting = self._waiting, []
         for place, end in enumerate(self._ends):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which messages of any topics were published, whatever order they arrived in, and their log times.
+"""Publication order and log times of messages of any topics, independent of their order of arrival.
 
-DDS stamps a message with the wall time at which it was published and numbers the messages of each publisher. On one
-machine the stamps of all publishers come from one clock: sorted by them, messages stand in the order of publication,
-and the message on /clock that stands before one tells its simulated time.
+DDS stamps each message with the wall time of its publication and numbers the messages of each publisher. On one machine
+the stamps of all publishers come from one clock: sorted by stamp, messages are in the order of publication, and the
+preceding message on /clock gives the simulated time of a message.
 """
 
 import heapq
@@ -16,12 +16,12 @@ MOST_EARLY = 2**28  #: messages that may wait for the first one on /clock [B]
 
 
 class Recorded(NamedTuple):
-    """A message as it stands in the bag.
+    """Message with the log time it gets in the bag.
 
     Attributes:
-        topic: fully qualified.
+        topic: fully qualified topic.
         log_ns: log time [ns].
-        data: its bytes.
+        data: serialized message.
     """
 
     topic: str
@@ -30,16 +30,16 @@ class Recorded(NamedTuple):
 
 
 class Continuity:
-    """Counts the messages of a topic that are missing.
+    """Counter of the missing messages of a topic.
 
-    A message has a number, from 1 on for each publisher, and does not say which of them sent it.
+    Messages are numbered from 1 for each publisher, but do not identify their publisher.
 
     Args:
-        whole: it is heard from the first message on; otherwise from wherever it stands.
+        whole: whether reception starts with the first message; otherwise it may start with any message.
 
     Attributes:
-        missing: messages so far.
-        first: number of the first message that was heard; 0 before it.
+        missing: number of missing messages so far.
+        first: number of the first message received; 0 before it.
     """
 
     def __init__(self, *, whole: bool) -> None:
@@ -47,11 +47,11 @@ class Continuity:
         self.missing = self.first = 0
 
     def take(self, sequence: int, publishers: Callable[[], int]) -> None:
-        """Take the number of the next message; those of one publisher rise.
+        """Count the next message by its sequence number; the numbers of one publisher increase.
 
         Args:
-            sequence: the number.
-            publishers: how many there are now; asked when it is a number that nobody was expected to send.
+            sequence: sequence number of the message.
+            publishers: returns the current number of publishers; called only for an unexpected sequence number.
         """
         expected = self._expected
         self.first = self.first or sequence
@@ -67,28 +67,28 @@ class Continuity:
 
 
 class _Held(NamedTuple):
-    """A message that waits; sorts as messages were published. With equal stamps, /clock comes first."""
+    """Message waiting for its turn; sorts by publication, with /clock first among equal stamps."""
 
     source_ns: int
     topic: str  # empty: /clock
     sequence: int
     data: bytes
-    time_ns: int  # that /clock tells
+    time_ns: int  # simulated time given by /clock
 
 
 class PublicationOrder:
-    """Holds messages until nothing published before them can still come, and gives them back in order.
+    """Buffer that holds messages until no earlier publication can still arrive, and returns them in order.
 
     Args:
-        hold_ns: how much later than a message one that was published before it may come [ns].
-        sim_time: log times are those of /clock; otherwise the wall time of publication.
-        began_ns: wall time at which the recording began [ns]; what is older was latched.
+        hold_ns: largest delay by which a message may arrive after a later published one [ns].
+        sim_time: log times are those of /clock; otherwise the wall times of publication.
+        began_ns: wall time of the start of the recording [ns]; older messages were latched.
 
     Attributes:
-        newest_ns: latest time of publication so far [ns]; 0 before the first message.
-        late: messages that came too late to stand where they belong; they stand behind what had been given back.
-        left_out: messages without a time: published between the beginning and the first one heard of a /clock that
-            was running already.
+        newest_ns: latest publication time so far [ns]; 0 before the first message.
+        late: number of messages that arrived too late for their place in the order; they follow those already returned.
+        left_out: number of messages without a simulated time: published after the start of the recording and before the
+            first received message of a /clock that was already running.
     """
 
     def __init__(self, *, hold_ns: int, sim_time: bool, began_ns: int) -> None:
@@ -101,11 +101,11 @@ class PublicationOrder:
         self.newest_ns = self.late = self.left_out = 0
 
     def add(self, topic: str, source_ns: int, sequence: int, data: bytes) -> None:
-        """Take a message, published at ``source_ns`` as number ``sequence`` of its publisher."""
+        """Add a message that its publisher sent at ``source_ns`` with number ``sequence``."""
         self._hold(_Held(source_ns, topic, sequence, data, 0))
 
     def add_clock(self, source_ns: int, sequence: int, time_ns: int) -> None:
-        """Take a message of /clock, which tells ``time_ns``."""
+        """Add a message of /clock with the simulated time ``time_ns``."""
         self._hold(_Held(source_ns, "", sequence, b"", time_ns))
 
     def _hold(self, held: _Held) -> None:
@@ -113,19 +113,19 @@ class PublicationOrder:
         heapq.heappush(self._heap, held)
 
     def release(self, seen_ns: int) -> Iterator[Recorded]:
-        """The messages that are ready, in order.
+        """Yield the messages that are ready, in publication order.
 
         Args:
-            seen_ns: all messages that had arrived before one of this time of publication have been taken [ns].
+            seen_ns: publication time up to which all earlier arrivals have been added [ns].
 
         Raises:
-            LatheError: /clock goes back, or far too much waits for it.
+            LatheError: /clock goes backwards, or too many messages wait for it.
         """
         while self._heap and self._heap[0].source_ns < seen_ns - self._hold_ns:
             yield from self._give(heapq.heappop(self._heap))
 
     def rest(self) -> Iterator[Recorded]:
-        """The remaining messages, in order, when none published before can still come.
+        """Yield the remaining messages in order, once no earlier publication can still arrive.
 
         Raises:
             LatheError: see `release`.
@@ -133,10 +133,10 @@ class PublicationOrder:
         return self.release(self.newest_ns + self._hold_ns + 1)
 
     def finish(self) -> None:
-        """Nothing comes any more, and the rest has been given back.
+        """Check at the end of the recording, after `rest`, that no message is still waiting for /clock.
 
         Raises:
-            LatheError: messages wait, and /clock has told nothing.
+            LatheError: messages are waiting, and no message on /clock was received.
         """
         if self._waiting:
             raise LatheError(f"/clock told no time: {len(self._waiting)} messages are not recorded")
@@ -144,7 +144,7 @@ class PublicationOrder:
     def _give(self, held: _Held) -> Iterator[Recorded]:
         if held.source_ns < self._given_ns:
             self.late += 1
-            if not held.topic:  # time on /clock has gone on already
+            if not held.topic:  # time on /clock has already advanced
                 return
         self._given_ns = max(self._given_ns, held.source_ns)
         if not self._sim_time:

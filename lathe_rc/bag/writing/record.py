@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording an offline run: the messages that a cell of ROS nodes would have sent, in the same order."""
+"""Recording of an offline run with the same messages, in the same order, as a cell of ROS nodes sends."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,10 +21,10 @@ from lathe_rc.messages import Signals
 
 
 def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:
-    """The outputs of a recorder: the bag of the whole run unless only snapshots are wanted, and these if there are any.
+    """Create the output of a recorder: the bag of the whole run (unless disabled), the snapshots, or both.
 
     Raises:
-        InputError: the folder exists or cannot be made.
+        InputError: the folder exists or cannot be created.
     """
     if snapshots is not None and table.mode == "snapshot":
         return snapshots
@@ -33,15 +33,15 @@ def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -
 
 
 def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) -> Output:
-    """A bag for an offline run of a scenario, as its recorder would write it.
+    """Create the bag of an offline run of a scenario, with the settings of its recorder.
 
     Args:
-        path: its folder.
-        scenario: what runs.
-        snapshots: of `begin_snapshots`; None: whatever the scenario says, the whole run is recorded.
+        path: folder of the bag.
+        scenario: scenario of the run.
+        snapshots: result of `begin_snapshots`; None: the whole run is recorded, whatever the scenario sets.
 
     Raises:
-        InputError: the folder exists or cannot be made.
+        InputError: the folder exists or cannot be created.
     """
     output = bag_of(path, scenario.recorder[1], snapshots)
     output.tell(provenance.tell(scenario, []))
@@ -49,7 +49,7 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
 
 
 def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | None:
-    """The snapshots that a scenario's recorder makes beside the bag in ``path``, if it makes any.
+    """Create the snapshots that a scenario's recorder writes beside the bag in ``path``; None without snapshots.
 
     Raises:
         InputError: see `Snapshots` and its `prepare`.
@@ -63,18 +63,18 @@ def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | N
 
 
 def _dense(cell: Cell) -> dict[str, tuple[str, str]]:
-    """Message type and source by fully qualified dense topic."""
+    """Return message type and source by fully qualified dense topic."""
     return {f"/{topic}": (source.type, f"/{source.node}") for topic, source in cell.dense.items()}
 
 
 class OfflineRecorder:
-    """Cuts the chunks of the engine into blocks and writes them; a sink of the engine.
+    """Recorder of an offline run that cuts the engine's chunks into blocks; a sink of the engine.
 
     Args:
-        cell: the cell that runs.
+        cell: the running cell.
         samples: length of the run.
-        writer: the bag.
-        snapshots: what is in the bag's place or beside it, if there is.
+        writer: writer of the bag.
+        snapshots: snapshots written instead of or beside the bag, if any.
     """
 
     def __init__(self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None) -> None:
@@ -97,7 +97,7 @@ class OfflineRecorder:
         )
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Cut a piece into blocks and write them."""
+        """Cut a chunk into blocks and write them."""
         ends = first + np.minimum(np.arange(self._block, samples + self._block, self._block), samples)
         before = {name: framer.companions for name, framer in self._framers.items()}
         sent: dict[str, list[int]] = {}  # samples of the sparse messages of each node
@@ -115,10 +115,10 @@ class OfflineRecorder:
         self._merger.release()
 
     def close(self) -> None:
-        """End the recording, also of a run that does not come to its end.
+        """End the recording, also that of an interrupted run.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         try:
             if self._snapshots is not None and not self._merger.complete:

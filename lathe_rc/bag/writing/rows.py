@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a bag: the blocks with the same samples, of all dense topics, one after the other.
+"""Rows of a bag: the blocks of all dense topics over the same samples, one after the other.
 
-All rows are the same bytes but for a few numbers and the samples. So they are laid out once, and what a block costs
-is to copy its samples to their place.
+All rows have the same bytes except for a few numbers and the samples. So the layout is computed once, and writing a
+block only copies its samples into place.
 """
 
 from typing import Any, NamedTuple
@@ -18,11 +18,11 @@ _BILLION = 1_000_000_000
 
 
 class RowPlan(NamedTuple):
-    """Rows of messages that come again and again in the same order and with the same lengths.
+    """Size and period of rows, in which the same messages recur in the same order and with the same lengths.
 
     Attributes:
-        size: of a row [B].
-        period_ns: log time between rows.
+        size: size of a row [B].
+        period_ns: log time between rows [ns].
     """
 
     size: int
@@ -30,13 +30,13 @@ class RowPlan(NamedTuple):
 
 
 class Dense(NamedTuple):
-    """A topic of blocks.
+    """Dense topic of a row.
 
     Attributes:
-        topic: fully qualified.
+        topic: fully qualified topic.
         type: message type.
-        source: fully qualified name of the node that makes them.
-        channel: its number in the file.
+        source: fully qualified name of the publishing node.
+        channel: channel number in the file.
     """
 
     topic: str
@@ -46,20 +46,20 @@ class Dense(NamedTuple):
 
 
 class Plan:
-    """Where everything stands in rows of one length of block.
+    """Byte layout of rows with one block length.
 
     Args:
-        topics: the dense topics, in their order.
+        topics: the dense topics, in the order of the row.
         run_id: identity of the run.
         step_ns: sampling step [ns].
-        samples: length of the blocks.
+        samples: samples per block.
 
     Attributes:
-        step_ns, samples: see above.
-        layouts: of the messages.
-        places: where they begin.
-        template: a row with all its numbers and samples 0, shape (bytes,).
-        rows: what an `Output` has to know of it.
+        step_ns, samples: as passed in.
+        layouts: layouts of the messages.
+        places: byte offsets of the messages in a row.
+        template: a row with all numbers and samples 0, shape (bytes,).
+        rows: size and period of the rows for an `Output`.
     """
 
     def __init__(self, topics: list[Dense], run_id: str, step_ns: int, samples: int) -> None:
@@ -76,15 +76,15 @@ class Plan:
 
 
 class RowBuffer:
-    """Consecutive rows in memory.
+    """Buffer of consecutive rows in memory.
 
     Args:
-        plan: where everything stands.
-        rows: how many.
+        plan: byte layout of a row.
+        rows: number of rows.
 
     Attributes:
-        plan: see above.
-        bytes: the rows, shape (rows, bytes).
+        plan: as passed in.
+        bytes: bytes of the rows, shape (rows, bytes).
     """
 
     def __init__(self, plan: Plan, rows: int) -> None:
@@ -93,7 +93,7 @@ class RowBuffer:
         self.bytes[:] = plan.template
         layouts = list(zip(plan.layouts, plan.places, strict=True))
         messages = [self._view(layout.dtype, place) for layout, place in layouts]
-        # A record array makes a view anew each time that it is asked for a field; these are asked all the time.
+        # A record array creates a new view for each access to a field; these fields are accessed constantly.
         self._numbers = [{name: message[name] for name in NUMBERS} for message in messages]
         self._samples = [
             {name: message[name] for name in layout.fields}
@@ -109,9 +109,9 @@ class RowBuffer:
         return view
 
     def _whole(self, layout: Layout, place: int) -> Samples | None:
-        """All samples of a message as one array, shape (rows, fields, samples), if they are of one type."""
+        """Return all samples of a message as a view, shape (rows, fields, samples); None unless all are float64."""
         places = [start for dtype, start in layout.fields.values() if dtype == np.float64]
-        # Between the arrays of a message stand their lengths: a view with strides skips them.
+        # The message has array lengths between its arrays: a view with strides skips them.
         gaps = set(np.diff(places).tolist()) or {0}
         if len(places) != len(layout.fields) or len(gaps) > 1:
             return None
@@ -120,7 +120,7 @@ class RowBuffer:
         return whole
 
     def begin(self, first: int) -> None:
-        """Let the first row begin at sample ``first``."""
+        """Set times and sample indices of all rows, the first of which begins at sample ``first``."""
         firsts = first + np.arange(len(self.bytes)) * self.plan.samples
         times = START_NS + (firsts + self.plan.samples - 1) * self.plan.step_ns
         for place in self._times:
@@ -131,7 +131,7 @@ class RowBuffer:
             numbers["last"][:] = False
 
     def put(self, place: int, row: int, block: Block, data: bytes | None) -> None:
-        """Set one block, that of the topic number ``place``; copy its message if there is one."""
+        """Set the block of topic number ``place`` in one row; copy its serialized message if there is one."""
         if data is not None:
             start = self.plan.places[place]
             self.bytes[row, start : start + len(data)] = np.frombuffer(data, np.uint8)
@@ -148,7 +148,7 @@ class RowBuffer:
             numbers["last"][row] = True
 
     def put_many(self, place: int, row: int, signals: Signals, companions: Samples, *, last: bool) -> None:
-        """Set consecutive blocks of a topic, arrays of shape (blocks * samples,) by field, from a row on."""
+        """Set consecutive blocks of a topic starting at a row; arrays have shape (blocks * samples,), by field name."""
         stop = row + companions.size
         for name, samples in self._samples[place].items():
             samples[row:stop] = signals[name].reshape(companions.size, self.plan.samples)
@@ -157,6 +157,6 @@ class RowBuffer:
         numbers["last"][stop - 1] = last
 
     def message(self, place: int, row: int) -> bytes:
-        """The message of a topic."""
+        """Return the serialized message of a topic in one row."""
         start = self.plan.places[place]
         return self.bytes[row, start : start + len(self.plan.layouts[place].template)].tobytes()

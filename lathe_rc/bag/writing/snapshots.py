@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last seconds of a run in memory, and a snapshot of them at every trigger.
+"""Buffer of the last seconds of a run in memory, and a snapshot bag of them at every trigger.
 
-All times are samples, and a snapshot consists of whole rows of blocks. So what it holds depends on its triggers alone,
-and its messages are those that a recording of the whole run has there.
+All times are sample indices, and a snapshot consists of complete rows of blocks. So its content depends on its triggers
+alone, and its messages equal those of a recording of the whole run over the same samples.
 """
 
 import math
@@ -23,14 +23,14 @@ from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import START_NS
 from lathe_rc.names import instead
 
-_CATCH_UP = 4  # messages or rows that go to the disk for each that comes, until a snapshot has caught up
+_CATCH_UP = 4  # buffered messages or rows written to disk per incoming one, until a snapshot has caught up
 _SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
-_IN_FLIGHT = 16  # rows more that may be in memory: they come some at once
-_HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # what may be a trigger
+_IN_FLIGHT = 16  # further rows that may be in memory: rows arrive several at a time
+_HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # message types that may contain a trigger
 
 
 class _Item(NamedTuple):
-    """A message of a topic, or a row."""
+    """Buffered item: a message of a topic, or a row of blocks."""
 
     log_ns: int
     key: str | RowPlan
@@ -38,22 +38,22 @@ class _Item(NamedTuple):
 
 
 class Snapshots:
-    """Keeps what came last, and writes a bag of it at every trigger; an `Output` of messages in the order of a bag.
+    """Buffer of the latest messages that writes a bag of them at every trigger; an `Output` that expects bag order.
 
-    A trigger whose time before overlaps or touches the newest snapshot extends that one: no sample is written twice,
-    and one bag at most is open. It is closed when no trigger can extend it any more.
+    A trigger whose pre-trigger time overlaps or touches the newest snapshot extends that snapshot: no sample is written
+    twice, and at most one bag is open. A snapshot is closed as soon as no trigger can extend it any more.
 
     Args:
-        folder: of the bags; must not exist.
-        table: of the recorder.
-        name: of the recorder.
-        namespace: of the cell, ends with a slash; left out of the names of nodes.
-        told: gets each snapshot when it has been begun, and when it has been closed.
+        folder: folder of the snapshot bags; must not exist.
+        table: parameters of the recorder.
+        name: name of the recorder.
+        namespace: namespace of the cell, ends with a slash; removed from the names of nodes.
+        told: called with each snapshot when it is opened, and again when it is closed.
 
     Attributes:
-        folder: see above.
-        bags: closed so far.
-        held: memory that the messages take which are kept [B].
+        folder: folder of the snapshot bags.
+        bags: number of bags closed so far.
+        held: memory of the buffered messages [B].
 
     Raises:
         InputError: the folder exists.
@@ -74,9 +74,9 @@ class Snapshots:
         self._margin_ns = (self._pre + _SPARE_ROWS * table.block_size) * table.step_ns
         self._about: dict[str, str] = {}
         self._topics: dict[str, tuple[str, Qos]] = {}
-        self._latched: dict[str, bytes | memoryview] = {}  # newest message that is not kept any more, by topic
-        self._kept: deque[_Item] = deque()  # an open snapshot has them, or does not need them
-        self._waiting: deque[_Item] = deque()  # an open snapshot has not come to them yet
+        self._latched: dict[str, bytes | memoryview] = {}  # newest latched message that has left the buffer, by topic
+        self._kept: deque[_Item] = deque()  # already written to an open snapshot, or not needed by it
+        self._waiting: deque[_Item] = deque()  # not yet written to an open snapshot
         self._open: tuple[Snapshot, BagWriter] | None = None
         self._newest_ns = self._flushed_ns = START_NS - table.step_ns
         self._interrupted = False
@@ -86,18 +86,18 @@ class Snapshots:
     # ---- before the start ---------------------------------------------------------------------------
 
     def prepare(self, dense: Mapping[str, tuple[str, str]], nodes: Collection[str]) -> int:
-        """See whether snapshots of a cell can be made, and make their folder.
+        """Check that snapshots of a cell are possible, and create their folder.
 
         Args:
             dense: message type and source by fully qualified dense topic.
-            nodes: names that triggers may name.
+            nodes: node names that triggers may refer to.
 
         Returns:
-            Memory that the time before a trigger takes [B].
+            Memory needed for the time before a trigger [B].
 
         Raises:
-            InputError: it is more than the table allows; a trigger is of a node that there is not; the folder cannot be
-                made.
+            InputError: the memory exceeds the limit of the table; a trigger names an unknown node; the folder cannot be
+                created.
         """
         self._check_triggers(nodes)
         needed = self._needed(dense)
@@ -130,41 +130,41 @@ class Snapshots:
                 known = instead(node, sorted(nodes))
                 raise InputError(f"{self._name}.triggers = {pattern!r}: no node {node!r} in the cell; {known}")
 
-    # ---- what comes in ------------------------------------------------------------------------------
+    # ---- input ---------------------------------------------------------------------------------------
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store texts, which every bag gets."""
+        """Store strings for the metadata of every snapshot bag."""
         self._about.update(about)
         if self._open is not None:
             self._open[1].tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """Announce a topic, which every bag gets."""
+        """Announce a topic to every snapshot bag."""
         self._topics[topic] = msgtype, qos
         if self._open is not None:
             self._open[1].add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
-        """Return the number of a topic; a file counts its channels from 1."""
+        """Return the channel number of a topic; channels of a file count from 1."""
         return list(self._topics).index(topic) + 1
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Take a message; an event or an alarm may be a trigger.
+        """Buffer a message; an event or an alarm may trigger a snapshot.
 
         Raises:
-            LatheError: the disk does not take it, or too much is kept.
+            LatheError: writing to the disk fails, or the buffer exceeds its limit.
         """
         self._take(_Item(log_ns, topic, data))
         if self._table.triggers and self._topics[topic][0] in _HEARD:
             self._hear(topic, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """Take rows of blocks.
+        """Buffer rows of blocks.
 
         Raises:
-            LatheError: the disk does not take it, or too much is kept.
+            LatheError: writing to the disk fails, or the buffer exceeds its limit.
         """
-        # One copy for all rows: the caller uses its memory again, and the rows are kept for some seconds.
+        # One copy for all rows: the caller reuses its memory, and the rows stay in the buffer for some seconds.
         whole = memoryview(bytes(data))
         for row, start in enumerate(range(0, len(data), plan.size)):
             self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
@@ -187,7 +187,7 @@ class Snapshots:
         if self._open is None:
             self._kept.append(item)
         else:
-            # Some items for each that comes: the seconds before a trigger at once would delay the cell.
+            # A few items per incoming one: writing all the seconds before a trigger at once would delay the cell.
             self._waiting.append(item)
             self._catch_up(_CATCH_UP)
             if self._newest_ns > self._stamp(self._open[0].last) + self._margin_ns:
@@ -200,7 +200,7 @@ class Snapshots:
             )
 
     def _forget(self) -> None:
-        """Let go what no trigger can ask for any more."""
+        """Drop buffered items that are too old for any further trigger."""
         oldest_ns = self._newest_ns - self._margin_ns
         while self._kept and self._kept[0].log_ns < oldest_ns:
             item = self._kept.popleft()
@@ -215,18 +215,18 @@ class Snapshots:
 
     @property
     def next_sample(self) -> int:
-        """The sample after the newest that came."""
+        """Return the index of the sample after the newest one received."""
         return (self._newest_ns - START_NS) // self._table.step_ns + 1
 
     def trigger(self, cause: str, sample: int | None = None) -> Snapshot:
-        """Let there be a snapshot around a sample.
+        """Start a snapshot around a sample, or extend the open one.
 
         Args:
-            cause: for people.
-            sample: None: the next.
+            cause: human-readable cause of the trigger.
+            sample: index of the sample; None: the next sample.
 
         Raises:
-            LatheError: the bag cannot be made.
+            LatheError: the bag cannot be created.
         """
         at, block = self.next_sample if sample is None else sample, self._table.block_size
         first = max(at - self._pre, 0) // block * block
@@ -257,10 +257,10 @@ class Snapshots:
             bag.write(topic, self._stamp(snapshot.first), data)
         self._told(snapshot)
 
-    # ---- what goes out ------------------------------------------------------------------------------
+    # ---- output --------------------------------------------------------------------------------------
 
     def _write(self, item: _Item, snapshot: Snapshot, bag: BagWriter) -> None:
-        """Write what belongs into a snapshot; the latched message from before its first sample as if it came then."""
+        """Write an item if it belongs to a snapshot; an earlier latched message gets the time of its first sample."""
         first_ns = self._stamp(snapshot.first)
         if isinstance(item.key, RowPlan):
             if item.log_ns >= first_ns:
@@ -269,7 +269,7 @@ class Snapshots:
             bag.write(item.key, max(item.log_ns, first_ns), item.data)
 
     def _catch_up(self, count: int) -> None:
-        """Write at most ``count`` items that wait."""
+        """Write at most ``count`` of the items that the open snapshot still lacks."""
         assert self._open is not None, "its callers have looked"
         snapshot, bag = self._open
         last_ns = self._stamp(snapshot.last)
@@ -280,7 +280,7 @@ class Snapshots:
             count -= 1
 
     def _end(self) -> None:
-        """Close the open snapshot with what there is of it."""
+        """Close the open snapshot with the samples available."""
         assert self._open is not None, "its callers have looked"
         (snapshot, bag), self._open = self._open, None
         waiting, self._waiting = self._waiting, deque()
@@ -298,10 +298,10 @@ class Snapshots:
         self._told(snapshot)
 
     def flush(self) -> None:
-        """Hand messages to the operating system; if none has come since the last time, also those that wait.
+        """Hand messages to the operating system; if none is new since the last flush, write the buffered ones too.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         if self._open is not None:
             if self._newest_ns == self._flushed_ns:
@@ -310,20 +310,20 @@ class Snapshots:
         self._flushed_ns = self._newest_ns
 
     def interrupt(self, cause: str) -> None:
-        """The run does not come to its end: that is a trigger, if any signal has come; what follows is not complete.
+        """Record an aborted run: a trigger, if any signal has been received; its snapshot counts as incomplete.
 
         Raises:
-            LatheError: the bag cannot be made.
+            LatheError: the bag cannot be created.
         """
         if self.next_sample:
             self.trigger(cause)
             self._interrupted = True
 
     def close(self) -> None:
-        """Close the open snapshot; the folder goes if there was none.
+        """Close the open snapshot, and remove the folder if it is empty.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         if self._open is not None:
             self._end()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing rosbag2 directories: an MCAP file, and its metadata as rosbags writes them.
+"""Writer of rosbag2 folders: an MCAP file, and its metadata in the layout of the rosbags package.
 
-The storage of rosbags' own writer has neither a chunk size nor a flush, which are what a crash promise needs;
-`lathe_rc.bag.writing.mcap_file` has. Its YAML takes 0.2 s for a bag, during which a cell that is being recorded would
-wait; libyaml takes some ms.
+The storage of rosbags' own writer offers neither a chunk size nor a flush, and both are needed to limit the loss in a
+crash; `lathe_rc.bag.writing.mcap_file` offers them. The YAML writer of rosbags takes 0.2 s per bag and would delay the
+recorded cell for that long; libyaml takes a few ms.
 """
 
 import shutil
@@ -32,10 +32,10 @@ _NEVER = 2**63 - 1  # start of a bag without a message, as rosbags writes it [ns
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
-    """Writes texts in quotes: no reader, of whatever version of YAML, takes one for a number."""
+    """YAML dumper that quotes all strings, so that no reader of any YAML version parses one as a number."""
 
     def ignore_aliases(self, data: object) -> bool:
-        """Write equal parts out each time, as rosbags does."""
+        """Disable YAML aliases: write equal subtrees out each time, as rosbags does."""
         return True
 
 
@@ -47,13 +47,13 @@ def _yaml(tree: Any) -> str:
 
 
 class ListedTopic(NamedTuple):
-    """A topic as metadata list it; some channels of a file may be one.
+    """Topic as listed in the metadata of a bag; several channels of a file may share one.
 
     Attributes:
-        name: fully qualified.
-        type: of its messages; may be empty.
-        encoding: of its messages.
-        qos: that its publishers offer.
+        name: fully qualified topic.
+        type: message type; may be empty.
+        encoding: serialization of the messages.
+        qos: profiles offered by the publishers.
     """
 
     name: str
@@ -63,39 +63,39 @@ class ListedTopic(NamedTuple):
 
 
 class Output(Protocol):
-    """A sink for the messages of a run: a bag, or a writer of several bags."""
+    """Sink for the messages of a run: one bag, or a writer of several bags."""
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store texts; see `BagWriter`."""
+        """Store strings in the metadata of the bag; see `BagWriter`."""
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """Announce a topic; see `BagWriter`."""
+        """Announce a topic before its first message; see `BagWriter`."""
 
     def channel(self, topic: str) -> int:
-        """The number of a topic in the file."""
+        """Return the channel number of a topic in the file."""
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Append a message; see `BagWriter`."""
+        """Append a message to an announced topic; see `BagWriter`."""
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """Append rows of blocks; see `BagWriter`."""
+        """Append rows of blocks of all dense topics; see `BagWriter`."""
 
     def flush(self) -> None:
-        """Hand what has been written so far to the operating system; see `BagWriter`."""
+        """Hand all messages written so far to the operating system; see `BagWriter`."""
 
     def close(self) -> None:
-        """Finish; see `BagWriter`."""
+        """Complete the output and close it; see `BagWriter`."""
 
 
 @cache
 def definition(msgtype: str) -> tuple[str, str]:
-    """Text and hash of a message type that this package knows."""
+    """Return the definition text and the hash of a message type that this package knows."""
     store = messages.store()
     return store.generate_msgdef(msgtype, ros_version=2)[0], store.hash_rihs01(msgtype)
 
 
 def offered_qos(depth: int, durability: Durability) -> Qos:
-    """Reliable, keep last, as every lathe node publishes."""
+    """Return the quality of service that every lathe node offers: reliable, keep last."""
     return Qos(
         QosHistory.KEEP_LAST,
         depth,
@@ -110,10 +110,10 @@ def offered_qos(depth: int, durability: Durability) -> Qos:
 
 
 def refuse_existing(path: Path) -> None:
-    """Refuse a place where a bag cannot be begun.
+    """Reject a path at which no bag can be created.
 
     Raises:
-        InputError: something is there already, or the folder that it would be in is not there.
+        InputError: the path exists already, or its parent folder does not exist.
     """
     if path.exists():
         raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
@@ -122,17 +122,17 @@ def refuse_existing(path: Path) -> None:
 
 
 class BagWriter:
-    """A bag being written.
+    """Writer of one bag.
 
     Args:
-        path: its folder; must not exist.
-        compression: of the chunks.
-        chunk_size: bytes after which a chunk is written out: what a crash may lose.
-        about: texts that the bag says of itself, see `tell`.
-        profile: of the MCAP file.
+        path: folder of the bag; must not exist.
+        compression: compression of the chunks.
+        chunk_size: size after which a chunk is written out, and so the largest loss in a crash [B].
+        about: strings for the metadata of the bag, see `tell`.
+        profile: profile of the MCAP file.
 
     Raises:
-        InputError: the folder exists, or cannot be made where it is to be.
+        InputError: the folder exists, or cannot be created.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class BagWriter:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
         self._about: dict[str, str] = {}
         self._topics: dict[ListedTopic, tuple[str, list[int]]] = {}  # hash of the type, and channels
-        self._channels: dict[str, int] = {}  # of what is written by topic
+        self._channels: dict[str, int] = {}  # channels of the written topics, by topic
         self._schemas: dict[str | bytes | None, int] = {}
         try:
             self.tell(about)
@@ -166,7 +166,7 @@ class BagWriter:
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """Turn errors of the disk into one line."""
+        """Convert I/O errors of the disk into a one-line `LatheError`."""
         try:
             yield
         except OSError as error:
@@ -174,10 +174,10 @@ class BagWriter:
             raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store texts: in the file at once, where they survive a crash, and in metadata.yaml at the end.
+        """Store strings in the metadata of the bag: at once in the file (crash-safe), at the end in metadata.yaml.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         self._about.update(about)
         if about:
@@ -190,7 +190,7 @@ class BagWriter:
         self.copy_topic(topic, msgtype, [qos], definition=text, digest=digest)
 
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
-        """Announce a topic of a type that this package need not know, with the text and the hash of its definition."""
+        """Announce a topic of a type that this package may not know, with the text and hash of its definition."""
         if msgtype not in self._schemas:
             self._schemas[msgtype] = self._file.add_schema(msgtype, definition)
         said = {"offered_qos_profiles": _yaml(dump_qos_v9(list(qos))).strip(), "topic_type_hash": digest}
@@ -199,15 +199,15 @@ class BagWriter:
         self._list(ListedTopic(topic, msgtype, "cdr", tuple(qos)), digest, number)
 
     def copy_channel(self, topic: ListedTopic, digest: str, records: Records) -> int:
-        """Announce a topic as another bag does, understood or not.
+        """Announce a topic with the schema and channel records of another bag, whether or not they can be decoded.
 
         Args:
-            topic: how it is listed.
-            digest: of the type; may be empty.
-            records: contents of the records of its schema, None if it has none, and of its channel.
+            topic: entry of the topic in the metadata.
+            digest: hash of the message type; may be empty.
+            records: content of the schema record (None without a schema) and of the channel record.
 
         Returns:
-            Its number for `copy`.
+            Channel number to pass to `copy`.
         """
         schema, channel = records
         if schema not in self._schemas:
@@ -220,63 +220,63 @@ class BagWriter:
         self._topics.setdefault(topic, (digest, []))[1].append(channel)
 
     def copy(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Append a message to a channel that has been copied.
+        """Append a message to a channel announced by `copy_channel`.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         with self._on_disk():
             self._file.add_message(channel, log_ns, data, publish_ns=publish_ns, sequence=sequence)
 
     def copy_record(self, opcode: int, content: bytes) -> None:
-        """Append an attachment or metadata as another file has it.
+        """Append an attachment or metadata record copied from another file.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         with self._on_disk():
             self._file.copy_record(opcode, content)
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
-        """Append a message to a topic that has been announced.
+        """Append a message to an announced topic.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         with self._on_disk():
             self._file.add_message(self._channels[topic], log_ns, data)
 
     def channel(self, topic: str) -> int:
-        """The number of a topic in the file."""
+        """Return the channel number of a topic in the file."""
         return self._channels[topic]
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """Append rows of blocks, the first with log time ``first_ns``; see `lathe_rc.bag.writing.rows`.
+        """Append rows of blocks, the first at log time ``first_ns``; see `lathe_rc.bag.writing.rows`.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         with self._on_disk():
             self._file.add_rows(plan.size, data)
 
     def flush(self) -> None:
-        """Hand what has been written so far to the operating system.
+        """Hand all messages written so far to the operating system.
 
         Raises:
-            LatheError: the disk does not take it.
+            LatheError: writing to the disk fails.
         """
         with self._on_disk():
             self._file.flush()
 
     def abort(self) -> None:
-        """Close the file as it is."""
+        """Close the file without completing it."""
         self._file.abort()
 
     def close(self) -> None:
-        """Finish the file and its metadata.
+        """Complete the file and its metadata, and close it.
 
         Raises:
-            LatheError: the disk did not take the last messages; the bag is complete but for them, or says so.
+            LatheError: the last messages could not be written; without them the bag is complete, unless reported.
         """
         try:
             self.flush()
@@ -284,7 +284,7 @@ class BagWriter:
             self._complete()
 
     def _complete(self) -> None:
-        """Write index and metadata, for which the file has kept room."""
+        """Write index and metadata into the disk space reserved for them."""
         tree = self._metadata()
         try:
             self._file.free_room()
@@ -299,7 +299,7 @@ class BagWriter:
             ) from None
 
     def _metadata(self) -> dict[str, Any]:
-        """The metadata of version 9; they count the messages that the file has."""
+        """Return the bag metadata (version 9) with the message counts of the file."""
         counts = {topic: sum(map(self._file.counts.__getitem__, each)) for topic, (_, each) in self._topics.items()}
         first = _NEVER if self._file.first_ns is None else self._file.first_ns
         span = {
@@ -335,48 +335,48 @@ class BagWriter:
 
 
 class Both:
-    """Two outputs with the same topics; an `Output`.
+    """Pair of outputs with the same topics, which both get every message; an `Output`.
 
     Args:
-        first, second: the outputs.
+        first, second: the two outputs.
     """
 
     def __init__(self, first: Output, second: Output) -> None:
         self._first, self._second = first, second
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store texts in both."""
+        """Store strings in the metadata of both outputs."""
         self._first.tell(about)
         self._second.tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
-        """Announce a topic to both."""
+        """Announce a topic to both outputs."""
         self._first.add_topic(topic, msgtype, qos)
         self._second.add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
-        """Return the number of a topic, the same in both."""
+        """Return the channel number of a topic, which is the same in both outputs."""
         number = self._first.channel(topic)
         assert number == self._second.channel(topic), "topics are announced to both in the same order"
         return number
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Append a message to both."""
+        """Append a message to both outputs."""
         self._first.write(topic, log_ns, data)
         self._second.write(topic, log_ns, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
-        """Append rows of blocks to both."""
+        """Append rows of blocks to both outputs."""
         self._first.write_rows(plan, first_ns, data)
         self._second.write_rows(plan, first_ns, data)
 
     def flush(self) -> None:
-        """Flush both."""
+        """Flush both outputs."""
         self._first.flush()
         self._second.flush()
 
     def close(self) -> None:
-        """Close both, the second also if the first fails."""
+        """Close both outputs, the second even if closing the first fails."""
         try:
             self._first.close()
         finally:
