@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check of a bag: every sample once, finite, and with the bits of the recorded run."""
+"""Check of a bag: every sample present once, all values finite, bit-identical to the recorded run."""
 
 import json
 from collections.abc import Mapping
@@ -27,18 +27,18 @@ _MOST_DIGESTS = 2**20  # size of that file [B]
 
 @dataclass
 class Findings:
-    """The findings of a check.
+    """Findings of the check of a bag.
 
     Attributes:
-        wrong: what should not be there: numbers that are none, other digests than recorded.
-        lost: what should be there: gaps, topics that end early.
-        digests: of each signal topic, as `lathe_rc.cell.recording` makes them; empty if something is lost.
-        compared: topics whose digest was recorded and is the same.
-        foreign: code and files that the bag names and does not hold.
-        messages: all of them.
-        samples: of the dense topics that are all of one length.
-        first: where a snapshot begins; 0 of a whole run.
-        unread: topics that were not looked at, as they are not of ROS 2.
+        wrong: errors in the content: numbers that are not finite, digests other than recorded.
+        lost: missing content: gaps, topics that end early.
+        digests: digest of each signal topic, computed as in `lathe_rc.cell.recording`; empty if samples are lost.
+        compared: topics whose recorded digest is identical.
+        foreign: third-party code and files that the bag refers to but does not contain.
+        messages: number of all messages.
+        samples: number of samples of the dense topics, which all have the same length.
+        first: first sample of a snapshot; 0 for a whole run.
+        unread: topics that were not checked, because they are not ROS 2 topics.
     """
 
     wrong: list[str] = field(default_factory=list)
@@ -53,12 +53,12 @@ class Findings:
 
     @property
     def exit_code(self) -> int:
-        """0: clean; 3: something is lost; 1: something is wrong."""
+        """Return 0 for a clean bag, 3 if samples are lost, 1 if the content has errors."""
         return 1 if self.wrong else 3 if self.lost else 0
 
 
 class _Sparse:
-    """Check of a topic whose messages are no blocks."""
+    """Check of a sparse topic, whose messages are not blocks."""
 
     def __init__(self, topic: str, msgtype: str, findings: Findings) -> None:
         self._topic, self._type, self._findings = topic, msgtype, findings
@@ -67,7 +67,7 @@ class _Sparse:
 
     def add(self, log_ns: int, data: bytes) -> None:
         if self._told >= _MOST_FINDINGS:
-            return  # the digests are not asked for any more
+            return  # no more digests are requested
         try:
             self.part.append(log_ns, messages.values_of(self._type, data))
         except ValueError as error:
@@ -76,7 +76,7 @@ class _Sparse:
 
 
 class _Dense:
-    """Check of a topic of blocks."""
+    """Check of a dense topic, whose messages are blocks."""
 
     def __init__(self, topic: str, msgtype: str, findings: Findings, digester: Digester) -> None:
         self._topic, self._findings, self._digester = topic, findings, digester
@@ -128,10 +128,10 @@ class _Dense:
 
 
 def check(path: Path) -> Findings:
-    """Look at every message of a bag.
+    """Check every message of a bag.
 
     Raises:
-        InputError: not a bag, or one that is cut off or broken: then only `lathe_rc.bag.repairing.recover` reads it.
+        InputError: the path is not a bag, or the bag is damaged and needs `lathe_rc.bag.repairing.recover`.
     """
     findings, digester = Findings(), Digester()
     with Source(path) as source:
@@ -172,7 +172,7 @@ def check(path: Path) -> Findings:
 
 
 def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> None:
-    """Every dense topic ends with the same sample, and unless the bag has but a part of the run says that it does."""
+    """Check that all dense topics end with the same sample, and in a whole run with a block marked as the last."""
     end = max((looked.end for looked in dense.values()), default=findings.first)
     for topic, looked in dense.items():
         if looked.end < end:
@@ -183,10 +183,10 @@ def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> Non
 
 
 def recorded(path: Path) -> dict[str, str]:
-    """The digests that were left in a bag's folder when it was made; empty if there are none.
+    """Return the digests stored in a bag's folder by its recorder; empty if there are none.
 
     Raises:
-        InputError: the file is not what it should be.
+        InputError: the file has an unexpected format.
     """
     file = path / DIGESTS
     if not path.is_dir() or not file.exists():
@@ -210,10 +210,10 @@ def _compare(path: Path, findings: Findings) -> None:
 
 
 def write_digests(path: Path, digest: Mapping[str, str]) -> None:
-    """Leave the digests of a run in its bag's folder.
+    """Store the digests of a run in its bag's folder.
 
     Raises:
-        LatheError: the disk does not take them.
+        LatheError: writing to the disk fails.
     """
     try:
         with replacing(path / DIGESTS) as file:

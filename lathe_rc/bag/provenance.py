@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario, files and versions of a bag's run, kept in the bag, so that it can be read months later."""
+"""Provenance of a bag's run: scenario, files and versions, stored in the bag to reproduce the run later."""
 
 import base64
 import contextlib
@@ -31,19 +31,19 @@ FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parame
 ORIGINS = "lathe_rc.origins"  #: where classes of others come from, if there are any
 HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
 RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
-_MOST_FILE = 2**19  # longest such file that is kept [B]
+_MOST_FILE = 2**19  # longest such file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
-_HASH = 12  # characters that are shown of one
+_HASH = 12  # displayed characters of a hash
 _MOST_ORIGINS = 256
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
 
 def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
-    """The texts that go into a bag's metadata.
+    """Return the provenance of a run as strings for a bag's metadata.
 
     Args:
-        scenario: with the parameters that the nodes really have.
-        host_topics: recorded beside the signals.
+        scenario: scenario with the actual parameters of the nodes.
+        host_topics: topics recorded beside the signals.
     """
     nodes: dict[str, NodeParameters] = {}
     files: dict[str, str] = {}
@@ -52,7 +52,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
             continue
         nodes[name] = table
         for row in type(table).rows().values():
-            # A file that there is not yet, or that is longer, is none of these.
+            # A file that does not exist yet, or that is longer, is left out.
             with contextlib.suppress(OSError):
                 if row.is_path:
                     kept = contents(Path(str(getattr(table, row.name))), _MOST_FILE)
@@ -91,13 +91,13 @@ def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a third-party class when a bag was made.
+    """Provenance of a third-party class when a bag was made.
 
     Attributes:
-        name: of the class, as ``package.module:Class``.
-        distribution, version: of the package; empty: it was not installed as one.
-        source: hash of its source.
-        used: parameters that name it, as NODE.PARAM.
+        name: name of the class, as ``package.module:Class``.
+        distribution, version: distribution package and its version; empty if not installed as one.
+        source: hash of the source code.
+        used: parameters that refer to the class, as NODE.PARAM.
     """
 
     name: str
@@ -108,12 +108,12 @@ class Origin:
 
     @property
     def package(self) -> str:
-        """Distribution and version; empty if it was not installed as one."""
+        """Return distribution and version; empty if the class was not installed with a distribution package."""
         return f"{self.distribution} {self.version}".strip()
 
 
 def origins(about: Mapping[str, str]) -> list[Origin]:
-    """Return the origins of the third-party classes of a bag; empty if there are none or their text is broken."""
+    """Return the origins of the third-party classes of a bag; empty if there are none or the entry is damaged."""
     found: list[Origin] = []
     try:
         for name, said in list(json.loads(about.get(ORIGINS, "{}")).items())[:_MOST_ORIGINS]:
@@ -127,10 +127,10 @@ def origins(about: Mapping[str, str]) -> list[Origin]:
 
 
 def _check_installed(about: Mapping[str, str]) -> None:
-    """Refuse a bag whose third-party classes are not installed; nothing is imported.
+    """Reject a bag whose third-party classes are not installed, without importing anything.
 
     Raises:
-        InputError: names one, and what to install.
+        InputError: a class is not installed; the message states what to install.
     """
     for origin in origins(about):
         package = origin.name.partition(":")[0].partition(".")[0]
@@ -143,7 +143,7 @@ def _check_installed(about: Mapping[str, str]) -> None:
 
 
 def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
-    """Return the changes of third-party classes since a bag was made, a line for each class."""
+    """Return the changes of third-party classes since a bag was made, one line per class."""
     made, here = {origin.name: origin for origin in origins(about)}, _origins(scenario.nodes)
     found = []
     for name, now in here.items():
@@ -161,7 +161,7 @@ def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
 
 
 def named_files(about: Mapping[str, str]) -> dict[str, str]:
-    """The files, by NODE.PARAM, that a bag's scenario names and the bag does not hold.
+    """Return the files, by NODE.PARAM, that a bag's scenario refers to and the bag does not contain.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
@@ -175,11 +175,11 @@ def named_files(about: Mapping[str, str]) -> dict[str, str]:
 
 
 def foreign(about: Mapping[str, str]) -> list[str]:
-    """Code that a bag's scenario names, and files that the bag does not hold; a line each, nothing is imported."""
+    """Return the third-party code and missing files of a bag's scenario, one line each; nothing is imported."""
     try:
         files = named_files(about)
     except InputError as error:
-        return [str(error)]  # such a bag can be read, but not simulated again
+        return [str(error)]  # such a bag can be read, but not re-simulated
     code = [
         f"{node}.{key} names code, {shown(each)}"
         for node, values in values_of(about).items()
@@ -192,7 +192,7 @@ def foreign(about: Mapping[str, str]) -> list[str]:
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
-    """Samples from which on the newest value of a topic stands for those of a lost node; empty if no node was lost."""
+    """Return, by topic of a lost node, the sample from which its last value was repeated; empty without lost nodes."""
     try:
         told = json.loads(about.get(HELD, "{}"))
         return {str(topic)[:256]: int(first) for topic, first in list(told.items())[:256]}
@@ -201,7 +201,7 @@ def held(about: Mapping[str, str]) -> dict[str, int]:
 
 
 def namespace(about: Mapping[str, str]) -> str:
-    """Namespace of the cell, as it stands before its topics; empty if it has none, or the bag does not tell."""
+    """Return the namespace of the cell as a topic prefix; empty if it has none or the bag does not state it."""
     try:
         topics = [str(topic)[:256] for topic in json.loads(about.get(HOST_TOPICS, "[]"))[:256]]
     except (ValueError, TypeError, RecursionError, KeyError):
@@ -210,7 +210,7 @@ def namespace(about: Mapping[str, str]) -> str:
 
 
 def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
-    """Values by node and parameter as the scenario of a bag says, none of them checked; empty if the bag has none.
+    """Return the unvalidated values of a bag's scenario by node and parameter; empty without a scenario.
 
     Raises:
         InputError: the bag's scenario is no parameter file.
@@ -219,7 +219,7 @@ def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
 
 
 def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
-    """Tolerance [m] by relative topic of each tool that has one, by what `values_of` found."""
+    """Return the tolerance [m] of each tool that has one, by relative topic, from the result of `values_of`."""
     found: dict[str, float] = {}
     for node, values in nodes.items():
         allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
@@ -240,13 +240,13 @@ def _versions() -> dict[str, str]:
 
 
 def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
-    """The scenario that a bag was made with.
+    """Return the scenario that a bag was made with.
 
-    Its files are written to ``folder``, which must last as long as it. The scenario of a bag is data: it names no
-    others, and no code that is not allowed (`lathe_rc.allowed_code`).
+    Its files are written to ``folder``, which must exist as long as the scenario is in use. The scenario of a bag is
+    data: it may not refer to other files, nor to code that is not allowed (`lathe_rc.allowed_code`).
 
     Raises:
-        InputError: the bag has none, or one that is not allowed, or that this version does not accept.
+        InputError: the bag has no scenario, or one that is not allowed or not accepted by this version.
     """
     if SCENARIO not in about:
         raise InputError("the bag holds no scenario; it was not made by lathe_rc, or its recorder never saw the cell")
@@ -270,7 +270,7 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
 
 
 def nose_radius(about: Mapping[str, str]) -> float:
-    """Radius of the tool's nose that the scenario of a bag names [m]; 0 where it names none."""
+    """Return the tool nose radius in the scenario of a bag [m]; 0 if the scenario has none."""
     for text in re.findall(r"\bnose_radius: ([\d.e+-]{1,30})(?![^\s,}])", about.get(SCENARIO, "")):
         with contextlib.suppress(ValueError):
             if 0.0 < float(text) < math.inf:

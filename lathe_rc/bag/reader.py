@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of the cell as recordings in memory."""
+"""Bags of the cell as in-memory recordings."""
 
 import os
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from lathe_rc.messages import START_NS, Samples, Signals
 
 
 class _Collector:
-    """Pieces of all signal topics in memory; a sink."""
+    """Sink that collects all signal topics in memory."""
 
     def __init__(self) -> None:
         self.dense: dict[str, dict[str, list[Samples]]] = {}
         self.sparse: dict[str, list[Sparse]] = {}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Append a piece."""
+        """Append a chunk to the collected signals."""
         for topic, signals in dense.items():
             fields = self.dense.setdefault(topic, {name: [] for name in signals})
             for name, array in signals.items():
@@ -32,7 +32,7 @@ class _Collector:
 
 
 def read_bag(path: str | os.PathLike[str]) -> Recording:
-    """Read all signal topics of a bag into memory; `lathe_rc.bag.reading.stream` reads longer ones in pieces.
+    """Read all signal topics of a bag into memory; `lathe_rc.bag.reading.stream` reads longer bags in chunks.
 
     Example:
         >>> import lathe_rc
@@ -45,7 +45,7 @@ def read_bag(path: str | os.PathLike[str]) -> Recording:
         >>> figure.savefig("piston.png")
 
     Raises:
-        InputError: not a bag.
+        InputError: the path is not a bag.
         LatheError: a block is missing or repeated.
     """
     collected = _Collector()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Snapshots: bags of a part of a run, and their text about that part."""
+"""Snapshots: bags of a section of a run, and the metadata that describes the section."""
 
 import json
 from collections.abc import Mapping
@@ -10,22 +10,22 @@ from lathe_rc.errors import InputError
 
 SNAPSHOT = "lathe_rc.snapshot"  #: text of a bag that says which part of the run it has, and why
 
-_MOST_TRIGGERS = 1000  # of a snapshot, that are told one by one
+_MOST_TRIGGERS = 1000  # of a snapshot, that are listed individually
 
 
 @dataclass
 class Snapshot:
-    """A bag of a part of the run.
+    """Bag of a section of the run around one or more triggers.
 
     Attributes:
-        path: of the bag.
+        path: path of the bag.
         first: its first sample.
-        last: its last sample, if the run goes on until then.
-        wanted: the sample that the last trigger asks for.
-        triggers: sample and cause of each, at most `_MOST_TRIGGERS`.
-        further: triggers beyond those.
-        samples: its length; 0 until it is closed.
-        whole: the run went on until `wanted`; False until it is closed.
+        last: its last sample, if the run continues until then.
+        wanted: last sample requested by any trigger.
+        triggers: sample and cause of each trigger, at most `_MOST_TRIGGERS`.
+        further: number of triggers beyond those listed.
+        samples: number of samples; 0 until the snapshot is closed.
+        whole: whether the run continued until `wanted`; False until the snapshot is closed.
     """
 
     path: Path
@@ -38,7 +38,7 @@ class Snapshot:
     whole: bool = False
 
     def add(self, sample: int, cause: str, wanted: int, last: int) -> None:
-        """Take a trigger."""
+        """Add a trigger, which may extend the snapshot."""
         if len(self.triggers) < _MOST_TRIGGERS:
             self.triggers.append((sample, cause))
         else:
@@ -46,19 +46,19 @@ class Snapshot:
         self.wanted, self.last = max(wanted, self.wanted), max(last, self.last)
 
     def about(self) -> dict[str, str]:
-        """The metadata of its bag."""
+        """Return the snapshot's entry in the metadata of its bag."""
         told = {"first_sample": self.first, "samples": self.samples, "whole": self.whole, "triggers": self.triggers}
         return {SNAPSHOT: json.dumps(told | ({"further_triggers": self.further} if self.further else {}))}
 
 
 def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
-    """First sample and number of samples of a snapshot; no samples if it was never closed. None for a whole run.
+    """Return first sample and number of samples of a snapshot (0 if it was never closed); None for a whole run.
 
     Args:
-        about: what the bag says of itself.
+        about: strings from the metadata of the bag.
 
     Raises:
-        InputError: what it says of the snapshot is not what a recorder writes.
+        InputError: the snapshot entry is not in the format of the recorder.
     """
     text = about.get(SNAPSHOT)
     if text is None:
@@ -76,13 +76,13 @@ def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
 
 
 def first_sample(about: Mapping[str, str]) -> int:
-    """The first sample of a bag: 0, or where a snapshot begins.
+    """Return the first sample of a bag: 0, or the beginning of a snapshot.
 
     Args:
-        about: what the bag says of itself.
+        about: strings from the metadata of the bag.
 
     Raises:
-        InputError: what it says of the snapshot is not what a recorder writes.
+        InputError: the snapshot entry is not in the format of the recorder.
     """
     span = span_of(about)
     return span[0] if span else 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exporting the signal topics of a bag, in memory that does not grow with its length."""
+"""Export of the signal topics of a bag, in memory that is independent of its length."""
 
 import os
 import re
@@ -21,21 +21,21 @@ from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.names import instead
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
-_LONGEST_TOPIC = 255  # characters; a file name has no more
+_LONGEST_TOPIC = 255  # characters; the limit of a file name
 _MOST_TOPICS = 256  # each is an open file
-_ROWS = 65536  # of a table that are collected before they are written
+_ROWS = 65536  # rows of a table that are collected before they are written
 
 
 @dataclass(frozen=True)
 class Exported:
-    """The written rows by topic."""
+    """Result of an export: its path, and the number of rows by topic."""
 
     place: Path
     rows: Mapping[str, int]
 
 
 class _Table:
-    """A topic's rows, collected until there are enough to be written."""
+    """Row buffer of a topic's table, written out in batches."""
 
     def __init__(self, table: Sequence[Column], writer: Rows) -> None:
         self.columns, self.rows = table, 0
@@ -44,7 +44,7 @@ class _Table:
         self._pending = 0
 
     def add(self, rows: Mapping[str, Samples]) -> None:
-        """Append; the arrays are copied if they have to wait, as they are the sender's."""
+        """Append rows; arrays that have to wait are copied, because the sender reuses them."""
         count = rows["sample"].size
         self.rows += count
         self._pending += count
@@ -61,18 +61,18 @@ class _Table:
         self._waiting, self._pending = [], 0
 
     def close(self) -> None:
-        """Write the rest."""
+        """Write the remaining rows and close the table."""
         self._flush()
         self._writer.close()
 
 
 class Exporter:
-    """Writes the tables of some topics; a sink, see `lathe_rc.cell.engine.Sink`.
+    """Exporter of the tables of selected topics; a sink, see `lathe_rc.cell.engine.Sink`.
 
     Args:
-        types: message type by fully qualified topic, of those wanted.
+        types: message type by fully qualified topic to export.
         step_ns: sampling step [ns].
-        target: where to.
+        target: output format.
     """
 
     def __init__(self, types: Mapping[str, str], step_ns: int, target: Format) -> None:
@@ -80,7 +80,7 @@ class Exporter:
         self._tables = {t: _Table(columns(kind), target.table(t, columns(kind))) for t, kind in types.items()}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Append the rows of a piece."""
+        """Append the rows of a chunk."""
         for topic, signals in dense.items():
             if table := self._tables.get(full(topic)):
                 table.add(dense_rows(first, signals, self._step_ns))
@@ -90,10 +90,10 @@ class Exporter:
                 table.add(sparse_rows(table.columns, found, self._step_ns))
 
     def close(self) -> Mapping[str, int]:
-        """Complete the files.
+        """Complete the files and return the number of rows.
 
         Returns:
-            Rows by topic.
+            Number of rows by topic.
         """
         for table in self._tables.values():
             table.close()
@@ -102,7 +102,7 @@ class Exporter:
 
 
 def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
-    """Message types of the topics to export, by name."""
+    """Return the message types of the topics to export, by name."""
     found = sorted(source.topics.items())
     types = {topic: said.type for topic, said in found if said.type in messages.signal_types()}
     if not types:
@@ -123,7 +123,7 @@ def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
 
 
 def _step_ns(source: Source) -> int:
-    """Sampling step of the run [ns]; 0 without a block."""
+    """Return the sampling step of the run [ns]; 0 if the bag has no block."""
     dense = [topic for topic, found in source.topics.items() if found.type in messages.block_types()]
     return next((step_ns for topic in dense if (step_ns := source.step_ns(topic))), 0)
 
@@ -136,17 +136,17 @@ def _refuse_existing(place: Path) -> None:
 def export_bag(
     bag: str | os.PathLike[str], place: str | os.PathLike[str], kind: str, topics: Sequence[str] = ()
 ) -> Exported:
-    """Write signal topics of a bag to other files; all or nothing.
+    """Export signal topics of a bag to other files, atomically.
 
     Args:
-        bag: the bag.
-        place: folder to make, for ``npz`` the file.
+        bag: path of the bag.
+        place: folder to create, for ``npz`` the file.
         kind: ``csv``, ``parquet`` or ``npz``.
-        topics: those wanted, with or without the leading slash; none: all.
+        topics: topics to export, with or without the leading slash; none: all.
 
     Raises:
-        InputError: the place exists, a topic does not, or the bag is none.
-        LatheError: the bag is not whole, or the disk does not take the files.
+        InputError: the output exists, a topic does not exist, or the path is not a bag.
+        LatheError: the bag is incomplete, or writing to the disk fails.
 
     Example:
         >>> import lathe_rc
@@ -168,7 +168,7 @@ def export_bag(
             exporter = Exporter(types, step_ns, target)
             feed(bag, [exporter])
             rows = exporter.close()
-            _refuse_existing(place)  # made by others meanwhile: a rename would replace it
+            _refuse_existing(place)  # created by another process meanwhile: a rename would replace it
             result.rename(place)
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None

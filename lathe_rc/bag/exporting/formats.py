@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that tables are exported to, piece by piece."""
+"""File formats for exported tables, written in chunks."""
 
 import json
 import shutil
@@ -18,24 +18,24 @@ from lathe_rc.cell.frames import arrow_schema
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples
 
-_MOST_TEXT = 4096  # characters of a text in an NPZ file, where every element is as wide as the widest
+_MOST_TEXT = 4096  # characters of a string in an NPZ file, where every element is as wide as the widest
 
 
 class Rows(Protocol):
-    """A table that is being written."""
+    """Table opened for writing."""
 
     def write(self, rows: Mapping[str, Samples], /) -> None:
-        """Append; by column name, shape (rows,)."""
+        """Append rows, given as arrays of shape (rows,) by column name."""
 
     def close(self) -> None:
-        """Finish it."""
+        """Finish the table."""
 
 
 class Format(ABC):
-    """One of the ways to export; all tables of a bag go to the same place.
+    """Base class of the export formats; all tables of a bag go to the same file or folder.
 
     Args:
-        place: file or folder to make; must not exist.
+        place: file or folder to create; must not exist.
     """
 
     folder = True  #: whether the place is a folder with a file for each topic
@@ -45,20 +45,20 @@ class Format(ABC):
 
     @abstractmethod
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """Begin the table of a topic."""
+        """Create the table of a topic."""
 
     def finish(self) -> None:  # noqa: B027 - most share nothing
-        """All tables are closed: complete what they share."""
+        """Complete the data shared by the tables, after all tables are closed."""
 
 
 class _ArrowRows:
-    """A table written by a writer of pyarrow."""
+    """Table written by a pyarrow writer."""
 
     def __init__(self, writer: Any, schema: Any) -> None:
         self._writer, self._schema = writer, schema
 
     def write(self, rows: Mapping[str, Samples]) -> None:
-        """Append rows."""
+        """Append rows to the table."""
         arrays = [pa.array(array, field.type) for array, field in zip(rows.values(), self._schema, strict=True)]
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
 
@@ -68,15 +68,15 @@ class _ArrowRows:
 
 
 def file_name(topic: str) -> str:
-    """A topic as part of a file name; topics of ROS have no dots."""
+    """Return a topic as part of a file name; ROS topics have no dots."""
     return topic.strip("/").replace("/", ".")
 
 
 class Csv(Format):
-    """A file a topic, with units in the header; numbers have the digits that give the same bits again."""
+    """CSV format: one file per topic, units in the header, numbers with enough digits for bit-identical values."""
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """Begin the table of a topic."""
+        """Create the table of a topic."""
         schema = arrow_schema(columns, lambda column: column.label)
         path = self.place / f"{file_name(topic)}.csv"
         options = csv.WriteOptions(quoting_style="needed")
@@ -84,17 +84,17 @@ class Csv(Format):
 
 
 class Parquet(Format):
-    """A file a topic, with units in the metadata of the fields."""
+    """Parquet format: one file per topic, with units in the metadata of the fields."""
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """Begin the table of a topic."""
+        """Create the table of a topic."""
         schema = arrow_schema(columns, lambda column: column.name)
         path = self.place / f"{file_name(topic)}.parquet"
         return _ArrowRows(parquet.ParquetWriter(path, schema, compression="zstd"), schema)
 
 
 class _Spool:
-    """A column on the disk until all its rows are known: a member of an archive has its length in front."""
+    """Temporary file of a column until all rows are known, as an archive member is preceded by its length."""
 
     def __init__(self, path: Path, column: Column) -> None:
         self._path, self._column = path, column
@@ -102,7 +102,7 @@ class _Spool:
         path.touch(exist_ok=False)
 
     def add(self, values: Samples) -> None:
-        """Append; the file is open no longer than that, since a bag has more columns than a process may have files."""
+        """Append values; the file is open only meanwhile, since a bag may have more columns than open files allowed."""
         self._rows += values.size
         with self._path.open("ab") as file:
             if self._column.dtype != TEXT:
@@ -118,7 +118,7 @@ class _Spool:
                 file.write(json.dumps(text).encode() + b"\n")
 
     def copy_to(self, member: BinaryIO) -> None:
-        """Write the column as a .npy file and remove the spool."""
+        """Write the column as a .npy file and remove the temporary file."""
         text = self._column.dtype == TEXT
         dtype = np.dtype(f"<U{self._width}") if text else self._column.dtype.newbyteorder("<")
         np.lib.format.write_array_header_1_0(
@@ -133,22 +133,22 @@ class _Spool:
 
 
 class _NpzRows:
-    """The columns of a topic, on their way to the archive."""
+    """Table of a topic whose columns are collected in temporary files for the archive."""
 
     def __init__(self, spools: Mapping[str, _Spool]) -> None:
         self._spools = spools
 
     def write(self, rows: Mapping[str, Samples]) -> None:
-        """Append rows."""
+        """Append rows to the temporary files."""
         for name, values in rows.items():
             self._spools[name].add(values)
 
     def close(self) -> None:
-        """Finish the table."""
+        """Finish the table; nothing is left to do."""
 
 
 class Npz(Format):
-    """One NumPy archive, an array a column: ``tool/error``; ``units`` has pairs of name and unit."""
+    """NumPy archive with one array per column, such as ``tool/error``; ``units`` has pairs of name and unit."""
 
     folder = False
 
@@ -158,7 +158,7 @@ class Npz(Format):
         self._units: list[tuple[str, str]] = []
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
-        """Begin the table of a topic."""
+        """Create the table of a topic."""
         spools = {}
         for column in columns:
             name = f"{topic.strip('/')}/{column.name}"
@@ -168,9 +168,9 @@ class Npz(Format):
         return _NpzRows(spools)
 
     def finish(self) -> None:
-        """Write the archive from the columns."""
+        """Write the archive from the temporary files of the columns."""
         with zipfile.ZipFile(self.place, "x") as archive:
-            # A ZipInfo of its own has no date: the same bag gives the same file.
+            # The ZipInfo object is created without a date, so that the same bag gives an identical file.
             with archive.open(zipfile.ZipInfo("units.npy"), "w") as member:
                 np.lib.format.write_array(member, np.array(self._units).reshape(-1, 2), allow_pickle=False)
             for name, spool in self._spools.items():

@@ -3,7 +3,7 @@
 
 A file of a few kilobytes may declare terabytes, so its statements are compared with its actual content. With these
 limits a malicious file costs some hundred megabytes of memory, and no more time than a bag of its size may;
-docs/bags.md lists the largest real bags.
+docs/bags.md lists the main limits.
 """
 
 MOST_BYTES = 2**27  #: longest record, chunk or message: above images and point clouds; a reader holds some at once [B]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making a complete bag of one that was cut off or is broken in places."""
+"""Recovery of a complete bag from one that is truncated or damaged in places."""
 
 import shutil
 from pathlib import Path
@@ -13,18 +13,18 @@ _CHUNK = 2**20  # [B]
 
 
 def recover(path: Path, target: Path) -> Salvage:
-    """Copy what is whole of a bag to a new one, understood or not.
+    """Copy the intact content of a bag to a new one, whether or not it can be decoded.
 
     Args:
-        path: folder or file.
+        path: folder or file of the damaged bag.
         target: folder of the new bag; must not exist. It is removed again if the recovery fails.
 
     Returns:
-        What was saved, and what was wrong.
+        The recovered content and the damage found.
 
     Raises:
-        InputError: nothing to read from, or the target exists.
-        LatheError: the disk does not take it, or cannot be read.
+        InputError: there is nothing to read, or the target exists.
+        LatheError: writing to the disk or reading from it fails.
     """
     refuse_existing(target)
     try:
@@ -42,7 +42,7 @@ def recover(path: Path, target: Path) -> Salvage:
 
 
 def _copy(salvage: Salvage, writer: BagWriter) -> None:
-    """Copy everything."""
+    """Copy all readable messages and records to the new bag."""
     channels: dict[Topic, int] = {}
 
     def announce(topic: Topic) -> int:
@@ -54,7 +54,7 @@ def _copy(salvage: Salvage, writer: BagWriter) -> None:
         number = channels.get(topic)
         writer.copy(announce(topic) if number is None else number, sequence, log_ns, publish_ns, data)
         salvage.saved += 1
-    for topic in [each for each in salvage.topics if each not in channels]:  # without a message
+    for topic in [each for each in salvage.topics if each not in channels]:  # without messages
         announce(topic)
     missing = f", {salvage.missing} messages missing" if salvage.missing else ""
     writer.tell(
@@ -64,13 +64,13 @@ def _copy(salvage: Salvage, writer: BagWriter) -> None:
 
 
 def mend(path: Path) -> Salvage | None:
-    """Complete a bag in place: index and metadata for every message that reached the disk.
+    """Complete a bag in place: add index and metadata for every message that reached the disk.
 
     Args:
         path: folder of the bag.
 
     Returns:
-        None if there was nothing to mend.
+        The recovered content and the damage found; None if there was nothing to repair.
     """
     if not any(path.glob("*.mcap")) or (path / "metadata.yaml").exists():
         return None
@@ -78,7 +78,7 @@ def mend(path: Path) -> Salvage | None:
     shutil.rmtree(workshop, ignore_errors=True)
     workshop.mkdir()
     try:
-        new = workshop / path.name  # the file inside takes the folder's name
+        new = workshop / path.name  # the MCAP file is named after its folder
         found = recover(path, new)
         old = path.with_name(f"{path.name}.cut")
         path.rename(old)

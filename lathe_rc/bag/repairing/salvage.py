@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every sound message of a bag that is cut off or broken in places.
+"""Reader of every valid message of a bag that is truncated or damaged in places.
 
-Bytes are copied without decoding: schemas, channels and messages keep every byte but for their numbers.
+Bytes are copied without decoding: schemas, channels and messages keep every byte except their numbers.
 """
 
 import sqlite3
@@ -36,23 +36,23 @@ ROS2 = "ros2"  #: profile of the files of rosbag2
 
 _MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the bytes of a message
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
-_PAGE = 4096  # bytes of a database that are said to be lost where SQLite does not say
+_PAGE = 4096  # bytes of a database that are reported as lost where SQLite gives no number
 _MOST_ID_BITS = 62  # of a row
-_MOST_DAMAGE = 1000  # places that are told
-_SCHEMALESS = "__schemaless__"  # type of messages without a schema, as rosbags calls it
+_MOST_DAMAGE = 1000  # reported places
+_SCHEMALESS = "__schemaless__"  # type of messages without a schema, as in rosbags
 
 
 class Topic(NamedTuple):
-    """A channel of a bag; the bytes are those of its records, numbers at their beginning included.
+    """Channel of a bag; its byte fields are those of the records, including the numbers at their beginning.
 
     Attributes:
-        name: of the topic.
-        type: of its messages; may be empty.
-        encoding: of its messages.
-        qos: as far as it is understood.
-        digest: of the type; may be empty.
-        schema: None if it has none.
-        channel: the record.
+        name: name of the topic.
+        type: message type; may be empty.
+        encoding: serialization of the messages.
+        qos: profiles of the publishers, as far as they can be parsed.
+        digest: hash of the message type; may be empty.
+        schema: content of the schema record; None without a schema.
+        channel: content of the channel record.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Topic(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message; times in ns."""
+    """Recovered message with its topic; times in ns."""
 
     topic: Topic
     sequence: int
@@ -75,7 +75,7 @@ class Message(NamedTuple):
 
 
 class _Definition(NamedTuple):
-    """A schema or channel record, and whether a checksum vouches for it."""
+    """Schema or channel record, and whether a checksum confirms it."""
 
     content: bytes
     checked: bool
@@ -83,25 +83,25 @@ class _Definition(NamedTuple):
 
 @dataclass
 class Salvage:
-    """The readable rest of a bag; iterate over it to get each whole message.
+    """Readable content of a damaged bag; iterate over it to get each intact message.
 
     Args:
-        path: a rosbag2 folder or a file of one.
+        path: a rosbag2 folder, or a single file of one.
 
     Attributes:
-        copied: gets attachments, and metadata that this package does not write, as opcode and content.
-        topics: all that can be copied.
-        profile: of the files.
-        about: texts that the bag says of itself.
-        damage: what was wrong and where, one line each.
-        lost_bytes: bytes of the files that gave nothing.
-        saved: messages, as `recover` counts them.
-        skipped: messages of topics that cannot be copied.
-        missing: messages that the bag counts beyond those that are there.
+        copied: called with opcode and content of attachments, and of metadata from other software.
+        topics: all topics that can be copied.
+        profile: profile of the MCAP files.
+        about: strings from the metadata of the bag.
+        damage: kind and place of each damage, one line each.
+        lost_bytes: bytes of the files that yielded no message.
+        saved: number of recovered messages, set by `recover`.
+        skipped: number of messages of topics that cannot be copied.
+        missing: number of messages that the bag counts beyond those found.
         lossy: whether messages are missing, or may be wrong.
 
     Raises:
-        InputError: there is no file of a bag.
+        InputError: the path has no bag file.
     """
 
     path: Path
@@ -114,9 +114,9 @@ class Salvage:
     skipped: int = 0
     missing: int = 0
     lossy: bool = False
-    _described: int = 0  # characters of texts and definitions
-    _counted: int | None = None  # messages by the file that is read
-    _ended: bool = True  # whether that file goes to its end
+    _described: int = 0  # characters of strings and definitions
+    _counted: int | None = None  # messages stated by the file being read
+    _ended: bool = True  # whether that file is complete
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
@@ -126,7 +126,7 @@ class Salvage:
         self.profile = self._profile(self._files[0])
 
     def _read_metadata(self) -> metadata.Metadata | None:
-        """The metadata of a folder, if they can be read."""
+        """Return the metadata of a folder, or None if they are unreadable."""
         if not (self.path / metadata.NAME).exists():
             return None
         try:
@@ -138,7 +138,7 @@ class Salvage:
         return told
 
     def _profile(self, file: Path) -> str:
-        """The profile of an MCAP file."""
+        """Return the profile of an MCAP file."""
         if file.suffix != ".mcap":
             return ROS2
         with file.open("rb") as stream:
@@ -149,7 +149,7 @@ class Salvage:
         return str(parsed(Header, first.content).profile)
 
     def __iter__(self) -> Iterator[Message]:
-        """The whole messages in the order of the files."""
+        """Yield the intact messages in the order of the files."""
         packed = self._metadata is not None and self._metadata.packed
         read, complete = 0, True
         for file in self._files:
@@ -175,7 +175,7 @@ class Salvage:
             self.missing = max(self.missing, counted - read)
 
     def _unpacked(self, file: Path, message: Message) -> Iterator[Message]:
-        """A message that is compressed by itself, as it was before."""
+        """Yield an individually compressed message in its uncompressed form."""
         try:
             yield message._replace(data=unpack("zstd", message.data, unpacked_size(message.data[:18])))
         except ValueError as error:
@@ -192,7 +192,7 @@ class Salvage:
             yield from self._file(unpacked)
 
     def _unpack(self, file: Path, unpacked: Path) -> None:
-        """Unpack a file that is compressed as a whole, as far as it goes."""
+        """Unpack a file that is compressed as a whole, up to the first damage."""
         with unpacked.open("wb") as out:
             try:
                 out.writelines(unpack_file(file))
@@ -210,25 +210,25 @@ class Salvage:
         self.lost_bytes += size
 
     def count(self, length: int) -> None:
-        """Count what is kept beside the messages.
+        """Count characters of the content kept beside the messages.
 
         Raises:
-            ValueError: it is too much.
+            ValueError: the total exceeds the limit.
         """
         if self._described + length > MOST_METADATA:
             raise ValueError(f"more than {MOST_METADATA} characters of texts and definitions")
         self._described += length
 
     def _describe(self, about: Mapping[str, str]) -> None:
-        """Take texts that the bag says of itself."""
+        """Add strings from the metadata of the bag."""
         self.count(sum(map(len, [*about, *about.values()])))
         self.about |= about
 
     def add(self, topic: Topic, offered: str) -> Topic:
-        """Announce a topic; its quality of service is copied also where it is not understood.
+        """Announce a topic; its quality of service is copied even if it cannot be parsed.
 
         Raises:
-            ValueError: it cannot be copied.
+            ValueError: the topic cannot be copied.
         """
         check_name(topic.name)
         try:
@@ -273,13 +273,13 @@ class Salvage:
                 self.lossy = True
 
     def _other(self, opcode: int, content: bytes, lost: int, told: Told) -> None:
-        """Keep what is neither a message nor describes one."""
+        """Keep a record that is neither a message, nor a schema or channel."""
         try:
             if opcode == Opcode.METADATA:
                 metadata = parsed(Metadata, content)
                 if metadata.name == "lathe_rc":
                     self._describe(metadata.metadata)
-                elif metadata.name != "rosbag2":  # the new bag has its own
+                elif metadata.name != "rosbag2":  # the new bag gets its own
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
@@ -301,7 +301,7 @@ class Salvage:
                 if left:
                     self._lose(file, left_over(left), left)
                 base = stack.enter_context(closing(connect(database)))
-                with suppress(sqlite3.DatabaseError):  # of a broken page; the others are read below
+                with suppress(sqlite3.DatabaseError):  # of a damaged page; the others are read below
                     check_tables(base)
                 topics = self._sqlite_topics(file, base)
                 for number, log_ns, data in _readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
@@ -317,7 +317,7 @@ class Salvage:
             self._lose(file, str(error), file.stat().st_size)
 
     def _sqlite_topics(self, file: Path, base: sqlite3.Connection) -> dict[Any, Topic]:
-        """Topics by number."""
+        """Return the topics of a SQLite file by number."""
         definitions = select(base, "message_definitions", ("topic_type", "encoding", "encoded_message_definition"))
         defined = {kind: (encoding, text) for kind, encoding, text in definitions}
         names = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
@@ -337,18 +337,18 @@ class Salvage:
 
 
 class _Definitions:
-    """Schemas and channels of an MCAP file, wherever they stand in it."""
+    """Schemas and channels of an MCAP file, wherever they are in it."""
 
     def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
         self._salvage, self._sound = salvage, sound
         self._known: dict[tuple[int, int], _Definition] = {}
         self.topics: dict[int, Topic] = {}  #: by number of the channel, that have come
-        self._lost: Counter[str] = Counter()  # messages by why they are not copied
+        self._lost: Counter[str] = Counter()  # messages by the reason for not copying them
         self._why: dict[int, str] = {}
         self._searched = False
 
     def add(self, opcode: int, content: bytes, *, checked: bool) -> None:
-        """Take a record, if it is one of a schema or channel; the last one counts that a checksum vouches for."""
+        """Add a schema or channel record; among contradicting ones, the last with a checksum counts."""
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
             return
         key = opcode, int.from_bytes(content[:2], "little")
@@ -364,7 +364,7 @@ class _Definitions:
             self.topics.clear()
 
     def _find(self, opcode: int, number: int) -> bytes | None:
-        """The content of a record that may stand further behind, if everything ahead of it is damaged."""
+        """Return the content of a record, searching the rest of the file once if it has not been read yet."""
         key = opcode, number
         if key not in self._known and not self._searched:
             self._searched = True
@@ -378,7 +378,7 @@ class _Definitions:
         return self._known[key].content if key in self._known else None
 
     def topic_of(self, number: int) -> Topic | None:
-        """The topic of a message's channel; None if it cannot be copied."""
+        """Return the topic of a message's channel; None if it cannot be copied."""
         if number not in self._why:
             try:
                 content = self._find(Opcode.CHANNEL, number)
@@ -387,7 +387,7 @@ class _Definitions:
                 topic = self.topics[number] = self._made(content)
             except MemoryError:
                 raise
-            except Exception as error:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
+            except Exception as error:  # mcap raises any exception for damaged bytes
                 self._why[number] = shown(error)
             else:
                 return topic
@@ -410,7 +410,7 @@ class _Definitions:
         return self._salvage.add(topic, channel.metadata.get("offered_qos_profiles", ""))
 
     def finish(self) -> None:
-        """Announce what has no message, and tell what is not copied."""
+        """Announce the channels without messages, and report the messages that are not copied."""
         for opcode, number in list(self._known):
             new = opcode == Opcode.CHANNEL and number not in self.topics and number not in self._why
             if new and self.topic_of(number) is None:
@@ -421,7 +421,7 @@ class _Definitions:
 
 
 def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, Any, Any]]:
-    """Topic, time and bytes of the messages on all pages that are whole; no bytes if there are too many."""
+    """Yield topic, time and bytes of the messages on all intact pages; no bytes if a message is too long."""
     query = (
         f"SELECT id, topic_id, timestamp, CASE WHEN length(data) <= {MOST_BYTES} THEN data END"  # noqa: S608 - a constant
         " FROM messages WHERE id >= ? ORDER BY id"
@@ -444,7 +444,7 @@ def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, 
             told(f"from message {first} on: {error}", _PAGE)
         else:
             return
-        # Rows behind a broken page are searched by doubling, then by bisection: row numbers have gaps of any length.
+        # Rows behind a damaged page are searched by doubling, then by bisection: row numbers have gaps of any length.
         step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
         if step is None:
             return

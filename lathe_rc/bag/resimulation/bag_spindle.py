@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell whose spindle is the one of a bag, and the recorded tool position beside the re-simulated one."""
+"""Cell driven by the recorded spindle of a bag, and comparison of the recorded with the re-simulated tool position."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -28,11 +28,11 @@ _TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
 
 
 class Memory(NamedTuple):
-    """Memory of the step: samples that have been read.
+    """Memory of the time-master step: recorded samples read ahead.
 
     Attributes:
-        span: index of the first, and of the one after the last.
-        angle, speed, angle_true, speed_true, index_pulse: of them, from element 0 on.
+        span: index of the first sample, and the index after the last.
+        angle, speed, angle_true, speed_true, index_pulse: recorded samples, starting at element 0.
     """
 
     span: npt.NDArray[np.int64]
@@ -45,7 +45,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Copy the recorded samples of a block."""
+    """Copy the recorded samples of a block to the outputs."""
     angle, speed, angle_true, speed_true, index_pulse = outputs
     at, n = first - memory.span[0], angle.size
     put(angle, memory.angle[at : at + n])
@@ -57,7 +57,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class _RecordedSpindle(TimeMaster):
-    """The spindle as it was recorded."""
+    """Time master that replays the recorded spindle."""
 
     step = staticmethod(step)
 
@@ -66,14 +66,14 @@ class _RecordedSpindle(TimeMaster):
         self._made, self.law = made, made.law
         self._reader, self.samples, self._said = reader, samples, said
         self.place_triggers()
-        self.declare(outputs=made.outputs, tells=made.tells)  # its events stand in the recording
+        self.declare(outputs=made.outputs, tells=made.tells)  # its events are in the recording
         self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
         self._span = np.zeros(2, np.int64)
 
     def speed_range(self) -> tuple[float, float]:
-        """Of the law, which the bag's scenario has; without one, as recorded [rad/s].
+        """Return the speed range of the scenario's law, or without one the recorded range [rad/s].
 
-        The checks cannot count on a spindle that stands still: they take the lowest speed of the scenario then.
+        If the recorded spindle stands still, the lowest speed is the scenario's, as the checks need a moving spindle.
         """
         made = self._made.speed_range()
         if self._said is None:
@@ -86,21 +86,21 @@ class _RecordedSpindle(TimeMaster):
         return self._made.largest_acceleration()
 
     def sample_at(self, angle: float) -> int:
-        """Return the sample at an angle by the scenario's law."""
+        """Return the sample at a given angle according to the scenario's law."""
         return self._made.sample_at(angle)
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step."""
+        """Return the memory of the step."""
         return Memory(self._span, *self._ready.values())
 
     def prepare(self, first: int, samples: int) -> None:
-        """Read the samples of the next block ahead of its computation.
+        """Read the samples of the next block before it is computed.
 
         Raises:
-            LatheError: the recording has not so many samples, or some are missing.
+            LatheError: the recording has fewer samples, or some are missing.
         """
-        # Samples that were read ahead move to the front: the kernel sees one array without a wrap-around.
+        # Samples that were read ahead move to the front: the kernel sees one contiguous array.
         begin, end = self._span.tolist()
         if first + samples <= end:
             return
@@ -122,13 +122,13 @@ class _RecordedSpindle(TimeMaster):
         self._scheduled.append((index, action))
 
     def act(self, action: str, index: int) -> None:
-        """Faults of the encoder are in the recording already."""
+        """Ignore the action: faults of the encoder are already in the recording."""
 
 
 def _positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
-    """Topics and fields of a bag whose sum is the tool's position; empty if not all of them are there.
+    """Return topics and fields of a bag whose sum is the tool's position; empty if any of them is missing.
 
-    The tool's own topic, or the measured positions of the drives that move it.
+    These are the tool's own topic, or the measured positions of the drives that move it.
     """
     own = recorded.find(remapped(tool.shared, tool.outputs[0].topic), messages.TOOL)
     if own is not None:
@@ -139,19 +139,19 @@ def _positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
 
 
 class Comparison:
-    """Form error of the recorded tool position, and how far the re-simulated one is off, by revolution; a sink.
+    """Form error of the recorded tool position and its difference from the re-simulation, by revolution; a sink.
 
-    The recorded one is that of the re-simulation with the recorded position in place of the simulated: same desired
-    form, same cross slide, same deflection.
+    The recorded form error is that of the re-simulation with the recorded position in place of the simulated one: same
+    desired form, same cross slide, same deflection.
 
     Args:
-        recorded: the bag.
-        cell: that runs.
-        tool: its tool.
-        topics: see `_positions`.
+        recorded: recorded topics of the bag.
+        cell: the running cell.
+        tool: tool of the cell.
+        topics: result of `_positions`.
 
     Attributes:
-        topics: see above.
+        topics: as passed in.
     """
 
     def __init__(self, recorded: Recorded, cell: Cell, tool: Tool, topics: list[tuple[str, str]]) -> None:
@@ -162,18 +162,18 @@ class Comparison:
         self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Add the errors of a piece."""
+        """Add the errors of a chunk."""
         tool, encoder = dense[self._tool], dense[self._encoder]
         between: Samples = tool["displacement"] - sum(reader.take(samples)[field] for reader, field in self._readers)
         for sink, error in ((self._recorded, tool["error"] + between), (self._between, between)):
             sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
 
     def recorded_rms(self) -> Samples:
-        """Form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
+        """Return the form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
         return self._recorded.rms()
 
     def between_rms(self) -> Samples:
-        """Difference of the two positions by revolution, RMS [m], shape (revolutions,)."""
+        """Return the difference of the two positions by revolution, RMS [m], shape (revolutions,)."""
         return self._between.rms()
 
 
@@ -183,20 +183,20 @@ Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of
 def wire(
     chosen: Scenario, original: Scenario | None, recorded: Recorded, source: Source
 ) -> tuple[Cell, Comparison | None, Events]:
-    """A cell with the recorded spindle in it, checked.
+    """Build and check a cell with the recorded spindle.
 
     Args:
-        chosen: the scenario that shall run.
-        original: that of the bag; None: ``chosen`` takes the place of one.
-        recorded: what the bag holds.
-        source: the bag.
+        chosen: scenario to run.
+        original: scenario of the bag; None: ``chosen`` takes its place.
+        recorded: recorded topics of the bag.
+        source: the opened bag.
 
     Returns:
-        The cell; what compares its tool's position with the recorded one, if the bag has that and not its error; and
-        the bag's events, as they took effect. A scenario that is not the bag's keeps its own events.
+        The cell; the comparison of its tool position with the recorded one, if the bag has that position but not its
+        error; and the bag's events, as they took effect. A scenario that is not the bag's keeps its own events.
 
     Raises:
-        InputError: no encoder, another step than the scenario's, or what the checks before a start refuse.
+        InputError: the bag has no encoder or a step other than the scenario's, or the checks before a start fail.
         LatheError: samples that are needed are missing or not finite.
     """
     nodes = dict(chosen.nodes)
@@ -212,7 +212,7 @@ def wire(
     topic = spindle.topic if spindle else recorded.find(name, messages.ENCODER) or messages.full(name)
     samples = spindle.samples if spindle else _samples(source, topic)
     if original is not None and any(kind == "displacement" for _, kind in topics):
-        topics = []  # its error was recorded, too
+        topics = []  # the bag has the recorded error, too
     samples = min([samples, *(recorded.length(of, kind) for of, kind in topics)])
     for of in (topic, *(of for of, _ in topics)):
         step_ns = recorded.step_ns(of)
@@ -228,11 +228,11 @@ def wire(
 
 
 def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
-    """The signals of a bag without a scenario, the missing ones, and the options that supply them; one line.
+    """Describe in one line which signals a bag without a scenario has, which are missing, and which options help.
 
     Args:
-        recorded: what it has.
-        identified: the drive has been identified.
+        recorded: recorded topics of the bag.
+        identified: whether the drive has been identified.
     """
     encoder = recorded.find("encoder", messages.ENCODER)
     missing = ["drives, controllers and the form of the part (--scenario FILE)"]
@@ -249,20 +249,20 @@ def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
 
 
 def _samples(source: Source, topic: str) -> int:
-    """Samples of a dense topic: its last block says."""
+    """Return the number of samples of a dense topic, from its last block."""
     if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
         raise InputError(f"{source.path}: no encoder on {topic}; a re-simulation needs the recorded spindle")
     step_ns = source.step_ns(topic)
     if not step_ns:
         raise InputError(f"{source.path}: {topic} has no block")
-    # Log times may be those of another clock: then all blocks are looked at.
+    # Log times may be those of another clock: then all blocks are read.
     late = source.last_ns - 2 * messages.MAX_BLOCK * step_ns
     (last,) = deque(source.blocks(topic, start_ns=late), 1) or deque(source.blocks(topic), 1)
     return last.first_index + last.samples
 
 
 def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
-    """Sample and action of the events of each node, as they took effect."""
+    """Return sample and action of each node's events, as they took effect."""
     topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
     found: dict[str, list[tuple[int, str]]] = {}
     for topic, _, data in source.messages(topics):

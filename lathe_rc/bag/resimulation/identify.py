@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of drives and the form of the part, identified from the signals of a bag."""
+"""Identification of drive models and workpiece form from the signals of a bag."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -26,14 +26,14 @@ _FORM_POINTS = 720
 
 @dataclass(frozen=True)
 class Identified:
-    """A drive, identified.
+    """Identified model of a drive.
 
     Attributes:
-        node: whose parameters they are.
-        command: topic of the bag.
-        position: topic and field of the bag.
-        fit: its model.
-        before: the scenario's values of the same parameters; None without a scenario.
+        node: name of the drive node.
+        command: command topic in the bag.
+        position: topic and field of the position in the bag.
+        fit: identified model.
+        before: values of the same parameters in the scenario; None without a scenario.
     """
 
     node: str
@@ -44,10 +44,10 @@ class Identified:
 
 
 def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
-    """Identify the electrodynamic drives of a scenario, or without one that of the default topics.
+    """Identify the electrodynamic drives of a scenario, or without a scenario the drive on the default topics.
 
     Raises:
-        InputError: there is none, the bag lacks its command or position, or they say too little.
+        InputError: there is no such drive, the bag lacks its command or position, or the signals do not suffice.
         LatheError: samples are missing or not finite.
     """
     kind = ElectrodynamicActuator.kind
@@ -100,10 +100,10 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
 
 
 def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario:
-    """The scenario with the identified parameters in place of its own.
+    """Return the scenario with the identified parameters in place of its own.
 
     Raises:
-        InputError: a value that the drive's table refuses.
+        InputError: a value is not valid for the drive's table.
     """
     nodes = dict(scenario.nodes)
     for drive in found:
@@ -113,12 +113,12 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
 
 
 def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Identified]) -> None:
-    """Write a parameter file: the whole scenario, or without one what was identified.
+    """Write a parameter file: the whole scenario, or without a scenario the identified parameters.
 
-    Files that the scenario names are copied beside it, since those of a bag do not last.
+    Files that the scenario refers to are copied beside it, because the files unpacked from a bag are temporary.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         if scenario is None:
@@ -134,7 +134,7 @@ def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Iden
 
 
 def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
-    """A node's table with its files copied beside ``path``, and no identity: the values have changed."""
+    """Return a node's table with its files copied beside ``path``, and no identity, as the values have changed."""
     update: dict[str, str] = {"run_id": ""}
     for row in type(table).rows().values():
         file = Path(str(getattr(table, row.name))) if row.is_path else Path()
@@ -148,12 +148,12 @@ def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
 
 @dataclass(frozen=True)
 class Form:
-    """The tool's position over the spindle angle, averaged.
+    """Averaged tool position over the spindle angle.
 
     Attributes:
-        radius: at even angles from 0 on [m], shape (points,).
-        revolutions: first and last that count, from 1.
-        scatter: RMS of a revolution's difference from the average [m].
+        radius: position at equally spaced angles from 0 [m], shape (points,).
+        revolutions: first and last averaged revolution, counted from 1.
+        scatter: RMS difference of a revolution from the average [m].
     """
 
     radius: np.ndarray
@@ -162,10 +162,10 @@ class Form:
 
 
 def form(recorded: Recorded) -> Form:
-    """The tool's recorded position averaged by angle, over the later half of the revolutions.
+    """Return the recorded tool position averaged by angle, over the second half of the revolutions.
 
     Raises:
-        InputError: no encoder, no position, or not one complete revolution.
+        InputError: the bag has no encoder, no tool position, or not one complete revolution.
         LatheError: samples are missing or not finite.
     """
     tool = recorded.find("tool", messages.TOOL)
@@ -180,7 +180,7 @@ def form(recorded: Recorded) -> Form:
     arrays = [recorded.whole(topic, field) for topic, field in ((spindle.topic, spindle.angle), source)]
     common = min(array.size for array in arrays)
     angle, position = arrays[0][:common] - spindle.turns, arrays[1][:common]
-    # An encoder of few counts stands still for some samples: the first of each counts.
+    # An encoder with few counts repeats its value for some samples: the first of each counts.
     new = np.diff(angle, prepend=-np.inf) > 0.0
     every = evenly(angle[new], position[new], _FORM_POINTS)
     if not every.size:
@@ -191,10 +191,10 @@ def form(recorded: Recorded) -> Form:
 
 
 def write_form(path: Path, found: Form) -> None:
-    """Write a form as a CSV file that a tool's ``profile_file`` takes.
+    """Write a form as a CSV file for the ``profile_file`` parameter of a tool.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     first, last = found.revolutions
     scatter = f"{found.scatter * 1e6:.4g} um RMS"

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Re-simulation: the spindle turns as in a bag, everything behind it is computed again.
+"""Re-simulation: the spindle turns as recorded in a bag, everything downstream of it is computed again.
 
-With nothing changed every bit must come out as it was recorded. With another controller the run shows what that
-controller would have made of the same spindle, disturbances and form.
+Without changes the results are bit-identical to the recording. With another controller the run shows how that
+controller would have performed with the same spindle, disturbances and form.
 
-A bag that does not say what made it is served with a scenario beside it: the spindle is the recorded one, the rest
-is the scenario's, with the drive identified from the recorded command and position if that is asked for.
+A bag without a scenario needs one beside it: the spindle is the recorded one, the rest is the scenario's, on request
+with the drive identified from the recorded command and position.
 """
 
 import tempfile
@@ -44,22 +44,22 @@ from lathe_rc.part import ErrorsByRevolution
 
 @dataclass(frozen=True)
 class Resimulation:
-    """The result of a re-simulation.
+    """Result of a re-simulation.
 
     Attributes:
-        scenario: what ran.
-        changed: whether it is another than that of the bag, or the bag has none.
+        scenario: the simulated scenario.
+        changed: whether it differs from that of the bag, or the bag has none.
         samples: length of the run.
-        wall_s: it took [s].
-        digest: of each signal topic.
-        recorded: the same of the bag; empty if the recording is not complete.
-        rms: form error by revolution [m], shape (revolutions,); empty without a tool.
-        recorded_rms: the same of the bag.
-        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], where
-            the recorded error is not in the bag but made from them; otherwise empty.
-        positions: topics and fields of the bag that this position is; otherwise empty.
-        drives: that were identified.
-        warnings: what has changed since the bag was made, of classes of others.
+        wall_s: wall time of the run [s].
+        digest: digest of each signal topic.
+        recorded: the same digests of the bag; empty if the recording is incomplete.
+        rms: form error by revolution, RMS [m], shape (revolutions,); empty without a tool.
+        recorded_rms: recorded form error by revolution, RMS [m].
+        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], if the recorded
+            error is not in the bag but derived from both; otherwise empty.
+        positions: topics and fields of the bag that give the recorded position; otherwise empty.
+        drives: identified drives.
+        warnings: changes of third-party classes since the bag was made.
     """
 
     scenario: Scenario
@@ -77,22 +77,22 @@ class Resimulation:
 
     @property
     def different(self) -> list[str]:
-        """Topics that are not as they were recorded."""
+        """Return the topics whose digests differ from the recorded ones."""
         return [topic for topic in sorted(self.recorded) if self.digest.get(topic) != self.recorded[topic]]
 
     @property
     def missing(self) -> list[str]:
-        """Topics that were not recorded."""
+        """Return the topics that were not recorded."""
         return sorted(self.digest.keys() - self.recorded.keys())
 
     @property
     def simulated_s(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self.samples * self.scenario.shared.step
 
 
 class _Digests:
-    """Digests of an offline run, its topics made fully qualified; a sink."""
+    """Sink that computes the digests of an offline run by fully qualified topic."""
 
     def __init__(self, cell: Cell) -> None:
         self._step_ns = cell.master.shared.step_ns
@@ -100,7 +100,7 @@ class _Digests:
         self._sparse = {f"/{topic}": SparseTopic() for topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Add a piece to the digests."""
+        """Add a chunk to the digests."""
         for topic, signals in dense.items():
             self._digester.dense(f"/{topic}", signals)
         for topic, found in sparse.items():
@@ -114,10 +114,10 @@ class _Digests:
 
 
 def with_controller(scenario: Scenario, file: Path) -> Scenario:
-    """Replace the nodes that a parameter file names; what all nodes share stays as it was.
+    """Replace the nodes contained in a parameter file; parameters shared by all nodes remain unchanged.
 
     Raises:
-        InputError: a node that the scenario has not, or a parameter that is refused.
+        InputError: the scenario does not have a node of the file, or a parameter is not valid.
     """
     shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
     nodes = dict(scenario.nodes)
@@ -163,17 +163,17 @@ def resimulate(
     parameters: Path | None = None,
     output: Path | None = None,
 ) -> Resimulation:
-    """Run the cell of a bag again behind its recorded spindle.
+    """Run the cell of a bag again with its recorded spindle.
 
     Args:
-        path: the bag.
-        overrides: ``NODE.PARAM=VALUE``; not of the spindle, if the scenario is the bag's.
-        scenario: parameter file that takes the place of the bag's scenario; None: the bag has one.
+        path: path of the bag.
+        overrides: parameters as ``NODE.PARAM=VALUE``; not of the spindle, if the scenario is the bag's.
+        scenario: parameter file that replaces the bag's scenario; None: the scenario of the bag.
         controller: parameter file whose nodes replace those of the scenario.
-        topics: topic of the bag by relative topic of the cell, where they are called otherwise.
-        identified: the electrodynamic drives are those identified from the bag.
-        parameters: file to write the scenario to that runs; None: none is written.
-        output: folder of a bag to write the result to; must not exist; None: none is written.
+        topics: topic of the bag by relative topic of the cell, where the two differ.
+        identified: whether to identify the electrodynamic drives from the bag.
+        parameters: file for the parameters of the simulated scenario; None: no file.
+        output: folder of a bag for the result; must not exist; None: no bag.
 
     Raises:
         InputError: the bag has no encoder, or no scenario and none is given; the changes cannot work; a drive
@@ -204,7 +204,7 @@ def resimulate(
         with _without_strangers(path, changed=changed):
             cell, compared, events = wire(chosen, original, recorded, source)
         warnings += cell.warnings if changed else []
-        # Events go in as they took effect: their samples depended on an operator or on the recorded spindle.
+        # Events are inserted as they took effect: their samples depended on an operator or on the recorded spindle.
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)
@@ -248,10 +248,10 @@ def resimulate(
 
 
 def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequence[str]) -> Scenario:
-    """The bag's scenario, with the files that it does not hold as ``overrides`` name them.
+    """Return the bag's scenario; ``overrides`` name the files that the bag does not contain.
 
     Raises:
-        InputError: it has none; says what it has and what is asked for.
+        InputError: the bag has no scenario; the message states what it has and what is needed.
     """
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
@@ -262,11 +262,11 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequenc
 
 @contextmanager
 def _without_strangers(path: Path, *, changed: bool) -> Iterator[None]:
-    """Say what to do where nobody publishes what a cell reads since nodes of others did: the bag has no more of them.
+    """Explain an unpublished topic in the cell that a third-party node, not part of the bag, once published.
 
     Args:
-        path: the bag.
-        changed: whether the cell is another than the recorded one; then it may be for another reason.
+        path: path of the bag.
+        changed: whether the cell differs from the recorded one; then the cause may be another.
     """
     try:
         yield
@@ -295,7 +295,7 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
 
 
 def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
-    """Refuse to be asked for others than the bag has; a controller's own that has none gets those of the bag."""
+    """Reject events other than the bag's; a controller file without events gets those of the bag."""
     if original is None:
         return
     for name, table in chosen.nodes.items():
@@ -306,5 +306,5 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
 
 
 def _recorded_digests(path: Path) -> dict[str, str]:
-    """Return the digests of a bag, recorded or made now from all of it; empty if it is not complete."""
+    """Return the digests of a bag, stored or computed from all of it; empty if the bag is incomplete."""
     return check.recorded(path) or check.check(path).digests
