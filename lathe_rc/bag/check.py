@@ -20,7 +20,7 @@ from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.files import contents, replacing
 
-DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, as the harness found them
+DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness
 _MOST_FINDINGS = 20  # listed for one topic
 _MOST_DIGESTS = 2**20  # size of that file [B]
 

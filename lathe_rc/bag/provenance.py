@@ -27,10 +27,10 @@ from lathe_rc.files import contents
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
-FILE = "lathe_rc.file."  #: and NODE.PARAM: what was in the file that the parameter names
-ORIGINS = "lathe_rc.origins"  #: where classes of others come from, if there are any
-HELD = "lathe_rc.held"  #: samples from which on the newest value of a topic stands for those of a lost node
-RECOVERED = "lathe_rc.recovered"  #: that the bag was completed, and what that cost
+FILE = "lathe_rc.file."  #: prefix of NODE.PARAM: content of the file that the parameter refers to
+ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are any
+HELD = "lathe_rc.held"  #: by topic of a lost node, the sample from which its last value was repeated
+RECOVERED = "lathe_rc.recovered"  #: report of a recovery, with the losses
 _MOST_FILE = 2**19  # longest such file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # displayed characters of a hash

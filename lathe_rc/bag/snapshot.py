@@ -8,9 +8,9 @@ from pathlib import Path
 
 from lathe_rc.errors import InputError
 
-SNAPSHOT = "lathe_rc.snapshot"  #: text of a bag that says which part of the run it has, and why
+SNAPSHOT = "lathe_rc.snapshot"  #: metadata entry with the section of the run in the bag, and its triggers
 
-_MOST_TRIGGERS = 1000  # of a snapshot, that are listed individually
+_MOST_TRIGGERS = 1000  # triggers of a snapshot that are listed individually
 
 
 @dataclass

@@ -38,7 +38,7 @@ class Format(ABC):
         place: file or folder to create; must not exist.
     """
 
-    folder = True  #: whether the place is a folder with a file for each topic
+    folder = True  #: whether the output is a folder with one file per topic
 
     def __init__(self, place: Path) -> None:
         self.place = place

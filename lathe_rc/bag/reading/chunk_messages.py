@@ -10,11 +10,11 @@ import numpy.typing as npt
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, TooMuchError
 from lathe_rc.jit import kernel
 
-HEAD = struct.Struct("<BQ")  #: opcode and length ahead of a record
+HEAD = struct.Struct("<BQ")  #: opcode and length at the head of a record
 _HEAD = HEAD.size
 _MESSAGE = 5  # opcode
 _BEFORE = 22  # bytes of a message record ahead of its data: channel, sequence, log time, publish time
-BEFORE_DATA = _HEAD + _BEFORE  #: both [B]
+BEFORE_DATA = _HEAD + _BEFORE  #: bytes of a message record ahead of its data, opcode and length included [B]
 
 Bytes = npt.NDArray[np.uint8]
 Places = npt.NDArray[np.uint64]

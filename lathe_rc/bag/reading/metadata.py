@@ -191,7 +191,7 @@ def read_yaml(text: str, what: str) -> Any:
     """
     check_yaml(text, what)
     try:
-        return yaml.load(text, Loader=_YAML)  # noqa: S506 - makes texts alone
+        return yaml.load(text, Loader=_YAML)  # noqa: S506 - returns strings only
     except yaml.YAMLError as error:
         raise ValueError(f"{what}: {getattr(error, 'problem', 'not YAML')}") from None
 

@@ -29,9 +29,9 @@ from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, To
 from lathe_rc.bag.reading.unpacking import CHUNK, Budget, read_chunk
 
 Parsed = TypeVar("Parsed")
-Told = Callable[[str, int], None]  #: a damage, and the bytes in which messages may have stood
+Told = Callable[[str, int], None]  #: a damage, and the number of bytes in which messages may be lost
 
-MAGIC = len(MCAP0_MAGIC)  #: length of what a file begins and ends with [B]
+MAGIC = len(MCAP0_MAGIC)  #: length of the magic bytes at both ends of a file [B]
 _INDEX = struct.Struct("<HI")  # channel, length of the pairs of time and place
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 _FOOTER, _DATA_END = 29, 13  # [B]

@@ -36,9 +36,9 @@ _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
 _KINDS = (".mcap", ".db3", ".zstd")
 _RECOVER = "; lathe bag recover saves the rest"
-_WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # what broken bytes and files lead to
+_WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # caused by damaged bytes and files
 
-Read = tuple[Span, Mapping[int, str]]  # and its channels that are wanted
+Read = tuple[Span, Mapping[int, str]]  # a span and its requested channels
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,14 @@ def _refuse_link(file: Path, bag: Path) -> None:
     Raises:
         InputError: the file is such a link.
     """
-    folder = Path(os.path.realpath(bag))  # unlike Path.resolve, it takes links that go round
+    folder = Path(os.path.realpath(bag))  # unlike Path.resolve, it accepts circular links
     if file != bag and not Path(os.path.realpath(file)).is_relative_to(folder):
         raise InputError(f"{file}: a link that leads out of the bag; allowed: the file itself in its place")
 
 
 def name_of(path: Path) -> str:
     """Return the name of a bag, for the names of derived files; paths ``.`` and ``..`` are resolved."""
-    return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails where links go round
+    return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails on circular links
 
 
 class Source:
@@ -155,7 +155,7 @@ class Source:
             for file in files:
                 _refuse_link(file, self.path)
             if not all(file.exists() for file in files):
-                files += others  # which may be the same, renamed: recover takes them as well
+                files += others  # may be renamed copies; recover reads them as well
             else:
                 self.contradictions += [
                     f"{metadata.NAME} does not name {file.name}: not read; lathe bag recover saves its messages too"
@@ -199,7 +199,7 @@ class Source:
     def _storage(self, path: Path, depth: int = 0) -> Storage:
         """Open one file of the bag, unpacking it first if it is compressed as a whole."""
         if not path.is_file():
-            raise ValueError("no file" if path.exists() else "there is no such file")  # a pipe would keep us waiting
+            raise ValueError("no file" if path.exists() else "there is no such file")  # opening a pipe would block
         with path.open("rb") as stream:
             head = stream.read(len(_SQLITE))
         if head.startswith(MCAP0_MAGIC):
@@ -370,8 +370,8 @@ def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Ite
         if at_a_time > MOST_OPEN:
             raise ValueError(f"chunks of the same time take more than {MOST_OPEN} B; record them in order of time")
 
-    # The merge asks each generator for its first message at once, which would unpack all chunks of the group: a mark at
-    # the span's first time comes ahead of them.
+    # The merge requests the first message of each generator at once, which would unpack all chunks of the group: a mark
+    # at the span's first time precedes them.
     def late(span: Span, wanted: Mapping[int, str]) -> Iterator[Message]:
         yield "", span.first_ns, b""
         yield from chain.from_iterable(span.read(wanted, start, stop, budget))

@@ -20,7 +20,7 @@ from lathe_rc.errors import InputError, shown
 
 _LAST = 2**63 - 1  # largest integer of SQLite
 _LOG_HEAD, _FRAME_HEAD = 32, 24  # of a write-ahead log [B]; both have the same two random numbers while a frame counts
-_JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # at the end of a rollback journal that names another
+_JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # at the end of a rollback journal that names a super-journal
 _WRONG = (ValueError, sqlite3.Error, OverflowError)  # exceptions that damaged bytes lead to
 
 
@@ -39,13 +39,13 @@ def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
         OSError: the copy cannot be created.
         sqlite3.Error: the database is damaged.
     """
-    beside = Path(os.path.realpath(path))  # the folder in which SQLite expects the logs
+    beside = Path(os.path.realpath(path))  # SQLite expects the logs beside the target of a link
     found = [beside.with_name(f"{beside.name}-{kind}") for kind in ("wal", "journal")]
     logs = [log for log in found if log.is_file() and log.stat().st_size]
     for log in logs:
         if log.is_symlink():
             raise InputError(f"{log}: a link; allowed: the file itself in its place")
-        if log.name.endswith("-journal") and _names_another(log):  # which SQLite would remove
+        if log.name.endswith("-journal") and _names_another(log):  # which SQLite would delete
             raise ValueError(f"{log.name}: it names a further journal; no recorder writes such")
     if not logs:
         return path, 0
@@ -53,7 +53,7 @@ def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
     shutil.copyfile(path, copy)
     for log in logs:
         shutil.copyfile(log, folder / f"{path.name}{log.name.removeprefix(beside.name)}")
-    # Any connection works a hot journal into the database; a write-ahead log needs the checkpoint.
+    # Any connection applies a hot journal to the database; a write-ahead log needs the checkpoint.
     with contextlib.closing(sqlite3.connect(copy)) as base:
         _, frames, _ = base.execute("PRAGMA wal_checkpoint").fetchone()
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
@@ -137,7 +137,7 @@ def left_over(size: int) -> str:
 
 
 def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
-    base.execute("SELECT id FROM topics LIMIT 0")  # an error where there is no such table
+    base.execute("SELECT id FROM topics LIMIT 0")  # fails if there is no such table
     columns = ("id", "name", "type", "serialization_format", "offered_qos_profiles")
     for number, topic, msgtype, encoding, profiles in select(base, "topics", columns):
         if not isinstance(number, int) or not 0 <= number <= _LAST:

@@ -14,7 +14,7 @@ from lathe_rc.bag.reading.unpacking import Budget
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 
-CDR = "cdr"  #: the serialization of ROS 2, the only one that is read
+CDR = "cdr"  #: serialization of ROS 2, the only supported one
 
 
 @dataclass(frozen=True)

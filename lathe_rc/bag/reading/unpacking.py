@@ -49,7 +49,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
     """
     if not 0 <= size <= MOST_BYTES:
         raise ValueError(f"{size} B when unpacked; allowed: up to {MOST_BYTES}")
-    if compression and len(data) > size + size // 128 + _OVERHEAD:  # a million empty frames take a second to read
+    if compression and len(data) > size + size // 128 + _OVERHEAD:  # a million empty frames would take a second to read
         raise ValueError(f"{len(data)} B that unpack to {size}; no compression does")
     try:
         if compression == "zstd":

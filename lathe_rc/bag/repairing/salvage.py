@@ -34,8 +34,8 @@ from lathe_rc.errors import InputError, shown
 
 ROS2 = "ros2"  #: profile of the files of rosbag2
 
-_MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the bytes of a message
-_ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message that is compressed by itself; CDR begins with a zero
+_MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the data of a message
+_ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of an individually compressed message; CDR begins with a zero
 _PAGE = 4096  # bytes of a database that are reported as lost where SQLite gives no number
 _MOST_ID_BITS = 62  # of a row
 _MOST_DAMAGE = 1000  # reported places
@@ -342,7 +342,7 @@ class _Definitions:
     def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
         self._salvage, self._sound = salvage, sound
         self._known: dict[tuple[int, int], _Definition] = {}
-        self.topics: dict[int, Topic] = {}  #: by number of the channel, that have come
+        self.topics: dict[int, Topic] = {}  #: by channel number, of the messages so far
         self._lost: Counter[str] = Counter()  # messages by the reason for not copying them
         self._why: dict[int, str] = {}
         self._searched = False
@@ -387,7 +387,7 @@ class _Definitions:
                 topic = self.topics[number] = self._made(content)
             except MemoryError:
                 raise
-            except Exception as error:  # mcap raises any exception for damaged bytes
+            except Exception as error:  # noqa: BLE001 - mcap raises any exception for damaged bytes
                 self._why[number] = shown(error)
             else:
                 return topic

@@ -55,8 +55,8 @@ class Resimulation:
         recorded: the same digests of the bag; empty if the recording is incomplete.
         rms: form error by revolution, RMS [m], shape (revolutions,); empty without a tool.
         recorded_rms: recorded form error by revolution, RMS [m].
-        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], if the recorded
-            error is not in the bag but derived from both; otherwise empty.
+        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], if the
+            recorded error is not in the bag but derived from both; otherwise empty.
         positions: topics and fields of the bag that give the recorded position; otherwise empty.
         drives: identified drives.
         warnings: changes of third-party classes since the bag was made.

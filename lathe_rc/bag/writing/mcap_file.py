@@ -29,8 +29,8 @@ from mcap.writer import MCAP0_MAGIC
 from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-TIMES = (16, 8)  #: where log time and publish time stand ahead of a message's bytes [B]
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of what follows: log time and place in pairs
+TIMES = (16, 8)  #: distance of log time and publish time from the beginning of a message's data [B]
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the following pairs of log time and place
 _FOOTER = struct.Struct("<BQQQ")
 _ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # reserved on the disk for index and metadata [B]
 _LEVEL = -5  # of zstd: 20 % of the time of its default level, for files 7 % larger (docs/bags.md)
@@ -140,7 +140,7 @@ class McapFile:
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
-                # A sparse file would promise blocks that a full disk does not have.
+                # A sparse file would not reserve any blocks of the disk.
                 os.posix_fallocate(stream.fileno(), 0, needed)
             self._kept = needed
 
@@ -221,7 +221,7 @@ class McapFile:
     def _write_chunk(self) -> None:
         self._keep_room()
         with self._chunk.getbuffer() as memory, memory[: self._size] as whole:
-            # Copies: views of the chunk, alive in the traceback of a full disk, would block it.
+            # Copies: views of the chunk, kept alive by the traceback of a full disk, would block its buffer.
             messages = walk(whole.toreadonly()).messages
             crc = crc32(whole)
             data = self._compressor.compress(whole) if self._compressor else bytes(whole)
@@ -267,7 +267,7 @@ class McapFile:
         """Append an attachment or metadata record copied from another file; ``last``: see `add_metadata`."""
         self.flush()
         record, stream = _record(opcode, content), ReadDataStream(io.BytesIO(content))
-        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long for its escapes
+        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long because of escapes
             self._described += len(record)
             self._keep_room()
         place = {"offset": self._offset, "length": len(record)}

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from lathe_rc.errors import LatheError
 
-MOST_EARLY = 2**28  #: messages that may wait for the first one on /clock [B]
+MOST_EARLY = 2**28  #: total size of messages that may wait for the first one on /clock [B]
 
 
 class Recorded(NamedTuple):

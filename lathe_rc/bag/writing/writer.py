@@ -26,7 +26,7 @@ Compression = Literal["zstd", "none"]
 Durability = Literal["volatile", "transient_local"]
 Records = tuple[bytes | None, bytes]
 
-FLUSH_PERIOD = 0.5  #: [s] of wall time after which a recorder writes messages out even if they fill no chunk
+FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they fill no chunk [s]
 _FOREVER = QosTime(9223372036, 854775807)
 _NEVER = 2**63 - 1  # start of a bag without a message, as rosbags writes it [ns]
 
