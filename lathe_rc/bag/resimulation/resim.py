@@ -295,7 +295,7 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
 
 
 def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
-    """Reject events other than the bag's; a controller file without events gets those of the bag."""
+    """Reject events and faults that differ from those of the bag; a node without any gets those of the bag."""
     if original is None:
         return
     for name, table in chosen.nodes.items():

@@ -260,7 +260,7 @@ class Snapshots:
     # ---- output --------------------------------------------------------------------------------------
 
     def _write(self, item: _Item, snapshot: Snapshot, bag: BagWriter) -> None:
-        """Write an item if it belongs to a snapshot; an earlier latched message gets the time of its first sample."""
+        """Write an item if it belongs to a snapshot; an earlier latched message gets the first sample's time."""
         first_ns = self._stamp(snapshot.first)
         if isinstance(item.key, RowPlan):
             if item.log_ns >= first_ns:
