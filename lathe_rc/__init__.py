@@ -7,7 +7,7 @@
     result = lathe_rc.run(piston, bag="piston_bag")
     print(result.errors.rms[-1], result.digest)
 
-Its names are listed in ``__init__.pyi``; `help` of each has an example.
+The public names are listed in ``__init__.pyi``; the docstring of each contains an example.
 """
 
 import importlib

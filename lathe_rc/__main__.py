@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m lathe_rc``: the command line; ``./lathe`` runs this file."""
+"""Entry point of ``python -m lathe_rc``: the command line; ``./lathe`` runs this file."""
 
 import sys
 

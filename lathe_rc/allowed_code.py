@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Code and files that data may name: data is a bag, a scenario that lies in one, the announcement of a member.
+"""Permissions for code and files named by untrusted data: a bag, a scenario inside a bag, a member's announcement.
 
-Code runs where an installed package offers it by an entry point of ours, or where the user has allowed its package:
-with ``--allow-code``, or by a scenario of the user's own in ``lathe run`` or in a Python program. Data names files in
-its own folder alone.
+Code is imported only if an installed package offers it through an entry point of lathe_rc, or if the user has allowed
+its package: with ``--allow-code``, or through a scenario of the user's own in ``lathe run`` or in a Python program.
+Data may only name files in its own folder.
 
-Here is the list of packages, one for a call of a command; its child processes are given the same.
+This module holds the list of allowed packages, one list per command call; child processes get the same list.
 """
 
 import contextlib
@@ -27,15 +27,15 @@ _METADATA, _HEAD = "metadata.yaml", b"rosbag2_bagfile_information"
 
 @dataclass
 class _Call:
-    """A call of a command.
+    """Permissions of one command call.
 
     Attributes:
         allowed: packages that may be imported.
-        here: those of them that are looked for in the current folder as well, behind all that is installed.
-        folder: the current folder, when the first of these was named.
-        own: packages that a scenario of the user's own names are allowed.
-        own_is_here: they are looked for in the current folder as well.
-        named: gives the texts of the user's parameter files and command line, paths among them.
+        here: allowed packages that are also searched in the current folder, after all installed packages.
+        folder: the current folder at the time when the first of these packages was allowed.
+        own: whether packages named by the user's own scenarios are allowed.
+        own_is_here: whether these packages are also searched in the current folder.
+        named: function that returns the strings of the user's parameter files and command line, including paths.
     """
 
     allowed: set[str] = field(default_factory=set)
@@ -50,10 +50,10 @@ _calls = [_Call(own=True)]  # the first is a Python program's own
 
 
 class _CurrentFolder(MetaPathFinder):
-    """Finds allowed packages in the current folder.
+    """Import finder for allowed packages in the current folder.
 
-    The folder itself does not come to Python's path: its other files would take the place of modules that are missing,
-    metadata in it would count as that of an installed package, and a ``sitecustomize.py`` would run in child processes.
+    The folder itself is not added to Python's path: its other files would replace missing modules, metadata in it would
+    count as that of an installed package, and a ``sitecustomize.py`` would run in child processes.
     """
 
     importing = False  #: an allowed package is being imported: modules beside it are found as well
@@ -61,7 +61,7 @@ class _CurrentFolder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """See `importlib.abc.MetaPathFinder`."""
+        """Find an allowed module in the current folder (implements `importlib.abc.MetaPathFinder`)."""
         now = _calls[-1]
         if path is not None or not now.folder or not (self.importing or fullname in now.here):
             return None
@@ -73,10 +73,10 @@ _finder = _CurrentFolder()
 
 @contextlib.contextmanager
 def call(*, own: bool = False) -> Iterator[None]:
-    """Begin a call of a command: nothing is allowed yet, and what gets allowed is so until its end.
+    """Begin a command call with an empty list of allowed packages; permissions granted in the block end with it.
 
     Args:
-        own: as in a Python program, packages that scenarios of the user's own name are allowed.
+        own: whether packages named by the user's own scenarios are allowed, as in a Python program.
     """
     _calls.append(_Call(own=own))
     try:
@@ -87,7 +87,7 @@ def call(*, own: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def importing(module: str) -> Iterator[None]:
-    """Let what an allowed package of the current folder imports be found beside it."""
+    """Let an allowed package of the current folder import the modules beside it, within the block."""
     before, _finder.importing = _finder.importing, module.partition(".")[0] in _calls[-1].here
     try:
         yield
@@ -96,10 +96,10 @@ def importing(module: str) -> Iterator[None]:
 
 
 def allow(package: str) -> None:
-    """Allow a package, which may lie in the current folder.
+    """Allow a package, which may be in the current folder.
 
     Raises:
-        InputError: it is no name of one.
+        InputError: the string is no package name.
     """
     if not package.isidentifier():
         raise InputError(f"{OPTION} {shown(package)!r}; allowed: the name of a package, without dots, like my_law")
@@ -107,7 +107,7 @@ def allow(package: str) -> None:
 
 
 def allow_named(name: object) -> None:
-    """Allow the package of a class ``package.module:Class`` in a scenario of the user's own, if this call takes it."""
+    """Allow the package of a class ``package.module:Class`` in a user's own scenario, if this call permits it."""
     module, colon, _ = str(name).partition(":")
     if colon and _calls[-1].own:
         _allow(module.partition(".")[0], here=_calls[-1].own_is_here)
@@ -124,22 +124,22 @@ def _allow(package: str, *, here: bool) -> None:
 
 
 def allow_own_code() -> None:
-    """Allow what a scenario of the user's own names, in the current folder as well unless that is a bag's."""
+    """Allow packages named by the user's own scenarios, also from the current folder unless it belongs to a bag."""
     _calls[-1].own, _calls[-1].own_is_here = True, bag_around(Path.cwd()) is None
 
 
 def is_allowed(module: str) -> bool:
-    """Whether the user has allowed the package of a module."""
+    """Return whether the user has allowed the package of a module."""
     return module.partition(".")[0] in _calls[-1].allowed
 
 
 def arguments() -> list[str]:
-    """The options that allow a child process the same packages."""
+    """Return the command-line options that allow the same packages in a child process."""
     return [word for package in sorted(_calls[-1].allowed) for word in (OPTION, package)]
 
 
 def taken_from(words: Sequence[str]) -> list[str]:
-    """A command line without these options, whose packages are allowed then.
+    """Allow the packages of all ``--allow-code`` options, and return the command line without these options.
 
     Raises:
         InputError: an option has no package.
@@ -155,14 +155,17 @@ def taken_from(words: Sequence[str]) -> list[str]:
 
 
 def interpreter(module: str) -> list[str]:
-    """The command that runs a module as ``python -m`` does, without the current folder on its path."""
+    """Return the command that runs a module like ``python -m``, without the current folder on its path."""
     # Python 3.10 has no -P.
     run = "import sys; sys.path[:] = filter(None, sys.path); from runpy import run_module; "
     return [sys.executable, "-c", f"{run}run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)", module]
 
 
 def bag_around(folder: Path) -> Path | None:
-    """The bag that a folder is, or lies in; None: none. Storage files of ROS 2 make a bag, or its metadata."""
+    """Return the bag that a folder is or belongs to; None: none.
+
+    A folder counts as a bag if it has storage files or metadata of ROS 2 bags.
+    """
     try:
         here = folder.resolve()
         if any(file.suffix in _STORAGES for file in here.iterdir()):
@@ -180,10 +183,13 @@ def _is_bag(metadata: Path) -> bool:
 
 
 def user_names(texts: Callable[[], Collection[str]]) -> None:
-    """Tell what gives the texts of the user's parameter files and command line: members may announce the same files."""
+    """Set the function that returns the strings of the user's parameter files and command line.
+
+    Members may announce the files that are named there.
+    """
     _calls[-1].named = texts
 
 
 def is_named(path: str) -> bool:
-    """Whether the user names a file, see `user_names`."""
+    """Return whether the user's parameter files or command line name a file, see `user_names`."""
     return path in _calls[-1].named()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array statements that kernels write as calls: of slices Numba compiles messages about shapes as well, for seconds."""
+"""Array statements as functions for kernels.
+
+For statements on slices, Numba also compiles error messages about shapes, which takes seconds.
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,20 +14,20 @@ Array = npt.NDArray[np.float64]
 
 @inlined
 def put(into: Array, values: Array) -> None:
-    """``into[:] = values``, for arrays of the same shape (n,) that do not overlap."""
+    """Copy ``values`` into ``into``: arrays of the same shape (n,) that do not overlap."""
     for k in range(into.size):
         into[k] = values[k]
 
 
 @inlined
 def put_scaled(into: Array, factor: float, values: Array) -> None:
-    """``into[:] = factor * values``, likewise."""
+    """Compute ``into[:] = factor * values`` for arrays of the same shape (n,) that do not overlap."""
     for k in range(into.size):
         into[k] = factor * values[k]
 
 
 @inlined
 def subtract(into: Array, values: Array) -> None:
-    """``into -= values``, likewise."""
+    """Compute ``into -= values`` for arrays of the same shape (n,) that do not overlap."""
     for k in range(into.size):
         into[k] -= values[k]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line, ``lathe``: it knows its commands by name and imports the one that is called or completed.
+"""Command line ``lathe``: commands are listed by name and imported only when called or completed.
 
-To list the commands takes no more than their names and summaries, so that is answered at once.
+A list of the commands needs only their names and summaries, so that it is printed without delay.
 """
 
 import io
@@ -19,26 +19,26 @@ from lathe_rc.errors import LatheError, shown
 
 
 class _Command(click.Command):
-    """A command whose module is imported when it is called, not when it is listed."""
+    """Command whose module is imported when it is called, not when it is listed."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        """Make the context of the imported command."""
+        """Return the Click context of the imported command."""
         return imported(str(self.name)).make_context(info_name, args, parent, **extra)
 
 
 class Group(click.Group):
-    """The commands, and errors of the project as one line and an exit code."""
+    """Command group that prints each error of lathe_rc as one line and ends with its exit code."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete also the commands of a checkout's launcher, which names them in the environment."""
+        """Complete command names, including the commands of a checkout's launcher, which the environment lists."""
         also = os.environ.get("_LATHE_ALSO", "").split()
         own = [CompletionItem(name) for name in also if name.startswith(incomplete) and not incomplete.startswith("-")]
         return [*super().shell_complete(ctx, incomplete), *own]
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; errors of the project are one line and an exit code."""
+        """Run a command; an error of lathe_rc is printed as one line and sets the exit code."""
         # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         for stream in (sys.stdout, sys.stderr):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of ``lathe`` by name, with their summaries; the module of one is imported when it is asked for."""
+"""Commands of ``lathe`` by name, with their summaries; the module of a command is imported on demand."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -35,6 +35,6 @@ _BESIDES = {"container": "node"}  # commands in the module of another one
 
 
 def imported(name: str) -> "click.Command":
-    """A command with its module."""
+    """Return a command after importing its module."""
     module = load(f"lathe_rc.commands.{_BESIDES.get(name, name)}")
     return cast("click.Command", getattr(module, name))

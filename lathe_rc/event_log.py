@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event log of a run in words: events of nodes, and what the supervisor says."""
+"""Readable event log of a run: events of the nodes, and messages of the supervisor."""
 
 from dataclasses import dataclass
 
@@ -25,12 +25,12 @@ LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say
 
 @dataclass(frozen=True)
 class LogEntry:
-    """An event at a sample.
+    """Event at a sample.
 
     Attributes:
-        sample: from which on.
-        topic: on which it was said.
-        text: what.
+        sample: first sample of the event.
+        topic: topic of the message.
+        text: description of the event.
     """
 
     sample: int
@@ -39,7 +39,7 @@ class LogEntry:
 
 
 def entries(recording: Recording) -> list[LogEntry]:
-    """The entries of a run, in order."""
+    """Return the log entries of a run, in order."""
     topics = [topic for topic in recording.sparse if recording.types[topic] in LOGGED]
     said = [message for topic in topics for message in recording.messages(topic)]
     found = [LogEntry(message.index, message.topic, text(message)) for message in said]
@@ -47,7 +47,7 @@ def entries(recording: Recording) -> list[LogEntry]:
 
 
 def text(message: Sparse) -> str:
-    """One line for a message of these types; nothing in it is trusted."""
+    """Describe an event message in one line; its content is treated as untrusted."""
     values = message.values
     if message.type == messages.EVENT:
         return str(values["action"])

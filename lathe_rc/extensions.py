@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extensions of the cell from other packages: classes by name, ours and theirs.
+"""Third-party plug-ins: registries of classes by name, built-in and from other packages.
 
-A class is named by a name of ours, by a name that an installed package offers as an entry point, or by where it
-stands, ``package.module:Class``, if an entry point offers that or the user has allowed the package, see
+A class is named by a built-in name, by the name of an installed package's entry point, or by its location
+``package.module:Class``, if an entry point offers that location or the user has allowed the package, see
 `lathe_rc.allowed_code`.
 """
 
@@ -32,15 +32,15 @@ V = TypeVar("V")
 
 
 class PluginRegistry(Mapping[str, V], Generic[V]):
-    """The classes of one sort, ours and those of other packages, by name.
+    """Registry of objects of one sort by name, built-in and from other packages.
 
-    Iteration gives our names and those that installed packages offer; ``package.module:Name`` is found as well where
-    `permits` says so.
+    Iteration yields the built-in names and the entry points of installed packages; ``package.module:Name`` can be
+    looked up as well if `permits` allows it.
 
     Args:
-        what: one of them, in words.
-        own: ours, or where they stand, ``package.module:Class``: a module is imported when its class is asked for.
-        group: of the entry points.
+        what: description of one such object.
+        own: built-in objects, or their locations ``package.module:Class``; a location is imported on first use.
+        group: group of the entry points.
 
     Attributes:
         group: see above.
@@ -59,11 +59,11 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> V:
-        """The class of this name.
+        """Return the object of a name.
 
         Raises:
-            KeyError: nobody offers it.
-            InputError: it may not or cannot be imported, or is none of these.
+            KeyError: no package offers the name.
+            InputError: its import is not allowed or fails, or it is no object of this sort.
         """
         own = self.own.get(name)
         if own is not None and not isinstance(own, str):
@@ -82,37 +82,37 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
 
     def permits(self, name: str) -> bool:
-        """Whether a name may be looked up: data cannot name code that is neither offered nor allowed."""
+        """Return whether a name may be looked up: data cannot name code that is neither offered nor allowed."""
         module, colon, _ = name.partition(":")
         if not colon or allowed_code.is_allowed(module):
             return True
         return any(f"{point.module}:{point.attr}" == name for point in _offered(self.group).values())
 
     def why_not(self, name: str) -> str:
-        """Why a name may not be looked up, and what to do."""
+        """Return the reason why a name may not be looked up, with a remedy."""
         package = shown(name.partition(":")[0].partition(".")[0])
         return f"code that no installed package offers; allowed: install {package}, or {allowed_code.OPTION} {package}"
 
     @abstractmethod
     def _checked(self, name: str, found: Any) -> V:
-        """The imported object, if it is one of these."""
+        """Return an imported object after checking its type."""
 
     def _refused(self, name: str, found: Any, wanted: str) -> InputError:
         return InputError(f"{self._what} {shown(name)!r} is {shown(repr(found))}; allowed: {wanted}")
 
     def offered_by(self, name: str) -> str:
-        """Distribution and version of what an installed package offers; empty: nobody does, or it is ours."""
+        """Return distribution and version of the package that offers a name; empty for built-in and unknown names."""
         if name in self.own or name not in _offered(self.group) or is_ours(_offered(self.group)[name].module):
             return ""
         return _distribution(_offered(self.group)[name].dist)
 
 
 class Objects(PluginRegistry[V]):
-    """Objects of one class, by name; see `PluginRegistry`.
+    """Registry of instances of one class, see `PluginRegistry`.
 
     Args:
         what, own, group: see `PluginRegistry`.
-        kind: their class.
+        kind: class of the instances.
     """
 
     def __init__(self, what: str, kind: type[V], own: Mapping[str, V | str], group: str) -> None:
@@ -126,11 +126,11 @@ class Objects(PluginRegistry[V]):
 
 
 class Registry(PluginRegistry[type[T]], Generic[T]):
-    """Classes of one sort by name; see `PluginRegistry`.
+    """Registry of classes with a common base, see `PluginRegistry`.
 
     Args:
         what, own, group: see `PluginRegistry`.
-        base: class that all of them derive from.
+        base: base class of all registered classes.
     """
 
     def __init__(self, what: str, base: Any, own: Mapping[str, type[T] | str], group: str) -> None:
@@ -143,11 +143,11 @@ class Registry(PluginRegistry[type[T]], Generic[T]):
         raise self._refused(name, found, f"a class that derives from {self._base.__module__}.{self._base.__name__}")
 
     def allowed(self) -> str:
-        """The names, in words."""
+        """The allowed names as readable text."""
         return in_words(self)
 
     def origin(self, name: str) -> Mapping[str, str] | None:
-        """Where a class of others comes from: distribution, version, hash of its source; None: it is ours."""
+        """Return the origin of a third-party class: distribution, version, hash of its source; None: it is built in."""
         if name in self.own:
             return None
         module = self[name].__module__
@@ -156,13 +156,13 @@ class Registry(PluginRegistry[type[T]], Generic[T]):
 
 @contextmanager
 def code_of_others(what: str) -> Iterator[None]:
-    """Make one line of whatever code of others raises.
+    """Convert any exception of third-party code into a one-line error.
 
     Args:
-        what: it is for, in words.
+        what: purpose of the code, in words.
 
     Raises:
-        InputError: says what was raised, and in which line of which file.
+        InputError: the code raised an exception; the message contains it, with the file and line.
     """
     try:
         yield
@@ -193,7 +193,7 @@ def _attribute(module: str, attribute: str, what: str) -> Any:
 
 
 def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
-    """The entry points of installed packages, by name.
+    """Return the entry points of installed packages by name.
 
     Raises:
         InputError: two packages offer the same name.
@@ -203,7 +203,7 @@ def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
 
 @cache
 def _offered_along(group: str, path: tuple[str, ...]) -> Mapping[str, importlib.metadata.EntryPoint]:  # noqa: ARG001 - the key
-    """Those that are found along a path, ``sys.path``: to look takes a tenth of a second."""
+    """Return the entry points found along ``sys.path``; cached, since a search takes 0.1 s."""
     found: dict[str, importlib.metadata.EntryPoint] = {}
     for point in importlib.metadata.entry_points(group=group):
         other = found.setdefault(point.name, point)
@@ -214,7 +214,7 @@ def _offered_along(group: str, path: tuple[str, ...]) -> Mapping[str, importlib.
 
 
 def in_words(names: Iterable[str]) -> str:
-    """The allowed names where ``names`` are known, and classes of others."""
+    """Format the allowed names where ``names`` are known, and the forms of third-party names."""
     listed = ", ".join(names)
     return f"{listed}, or PACKAGE.MODULE:CLASS" if listed else "PACKAGE.MODULE:CLASS"
 
@@ -224,30 +224,30 @@ def _distribution(dist: importlib.metadata.Distribution | None) -> str:
 
 
 def search_path() -> str:
-    """Where Python looks for modules here, for the ``PYTHONPATH`` of another interpreter; what is in it stays first."""
+    """Return the module search path for the ``PYTHONPATH`` of another interpreter; its present entries stay first."""
     given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     return os.pathsep.join(dict.fromkeys([*given, *(str(Path(folder).absolute()) for folder in sys.path)]))
 
 
 def is_ours(module: str) -> bool:
-    """Tell whether a module is of this distribution: the folder of compiled code changes with its source.
+    """Return whether a module belongs to lathe_rc, whose source the version of the compiled-code folder covers.
 
-    The source of others is not looked at there; what is kept of their steps is, see `lathe_rc.compiled.step`.
+    The source of third-party modules is not covered there, but by the cache of their steps (`lathe_rc.compiled.step`).
     """
     return module.startswith(("lathe_rc.", "lathe_papers."))
 
 
 @cache
 def source_hash(module: str, *, imports: bool = False) -> str:
-    """Hash of the source that a module stands in: of all files of its package, or of the file alone.
+    """Hash the source of a module: all files of its package, or its single file.
 
     Args:
-        module: see above.
-        imports: of what it imports as well, beside lathe_rc and what kernels need. Of what is installed that counts
-            which sources outside import, but not what it imports in turn.
+        module: the module.
+        imports: whether to include imported packages, except lathe_rc and the dependencies of kernels. Of installed
+            packages, the direct imports of sources outside count, but not their own imports.
 
     Raises:
-        InputError: it has no file.
+        InputError: the module has no file.
     """
     if module == "__main__":
         raise InputError("__main__ is no module that other processes can import; put the class into a file of its own")
@@ -275,7 +275,7 @@ COMMON = {
 
 
 def _files(top: str) -> list[Path]:
-    """The source of a package or module."""
+    """Return the source files of a package or module."""
     module = sys.modules[top]
     if paths := [Path(each) for each in getattr(module, "__path__", ())]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
@@ -284,7 +284,7 @@ def _files(top: str) -> list[Path]:
 
 
 def _imports(text: bytes) -> set[str]:
-    """Packages that a source imports."""
+    """Return the packages that a source file imports."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
@@ -296,12 +296,12 @@ def _imports(text: bytes) -> set[str]:
 
 @cache
 def _packages() -> Mapping[str, list[str]]:
-    """Distributions by package; to look through all of them takes half a second."""
+    """Return the distributions by package; cached, since a full scan takes 0.5 s."""
     return importlib.metadata.packages_distributions()
 
 
 def origin(module: str) -> Mapping[str, str]:
-    """Where a module that has been imported comes from: distribution and version, if it has one; hash of its source."""
+    """Return the origin of an imported module: distribution and version, if it has one, and the hash of its source."""
     names = _packages().get(module.partition(".")[0], [])
     dist = importlib.metadata.distribution(names[0]) if names else None
     told = {"distribution": dist.name, "version": dist.version} if dist else {}
@@ -309,11 +309,11 @@ def origin(module: str) -> Mapping[str, str]:
 
 
 class Named(Generic[T]):
-    """Marks a parameter that names a class of a registry: ``Annotated[str, Named(REGISTRY)]``.
+    """Annotation of a parameter whose value names an entry of a registry: ``Annotated[str, Named(REGISTRY)]``.
 
     Args:
-        registry: where it is looked up, when the value is read.
-        special: names beside those of the registry.
+        registry: registry in which a value is looked up when it is read.
+        special: further allowed names.
     """
 
     def __init__(self, registry: Registry[T], special: tuple[str, ...] = ()) -> None:
@@ -321,21 +321,21 @@ class Named(Generic[T]):
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """Names that need no import."""
+        """Return the names that can be listed without an import."""
         return (*self.special, *self.registry.own)
 
     def allowed(self) -> str:
-        """The values that the parameter accepts, in words."""
+        """Return the allowed values of the parameter as readable text."""
         names = [*(name or "''" for name in self.special), *self.registry]
         return f"one of {in_words(names)}" if names else in_words(names)
 
     def others(self, value: object) -> list[str]:
-        """The names of classes of other packages in a parameter's value, a name or a list of some."""
+        """Return the third-party class names in a parameter's value, which is a name or a list of names."""
         names = value if isinstance(value, list) else [value]
         return [str(name) for name in names if name not in self.choices]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        """Check the name where a value is read."""
+        """Return the Pydantic schema that checks the name when a value is read."""
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, name: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports: of commands and executables, and of packages that not every installation has."""
+"""Imports of commands and executables, and of optional packages (extras)."""
 
 import importlib.util
 import signal
@@ -30,7 +30,7 @@ _CHECKOUT = {
 
 
 def refusal(module: str | None) -> LatheError | None:
-    """The error for a module that cannot be imported; None: it belongs to no extra."""
+    """Return the error for a module that cannot be imported; None: the module belongs to no extra."""
     extra = _EXTRAS.get((module or "").partition(".")[0])
     if extra is None:
         return None
@@ -39,7 +39,7 @@ def refusal(module: str | None) -> LatheError | None:
 
 @contextmanager
 def named() -> Iterator[None]:
-    """Say in one line how to install what an import lacks.
+    """Convert the import error of a missing extra into one line that says how to install it.
 
     Raises:
         LatheError: a module of an extra is missing.
@@ -56,7 +56,7 @@ def require(module: str) -> None:
     """Check that a module of an extra is installed, without importing it.
 
     Raises:
-        LatheError: it is not; says how to install it.
+        LatheError: the module is missing; the message says how to install it.
     """
     if importlib.util.find_spec(module) is None:
         missing = refusal(module)
@@ -65,10 +65,10 @@ def require(module: str) -> None:
 
 
 def load(name: str) -> ModuleType:
-    """Import a module. Ctrl-C meanwhile ends the process at once, as any program that has not begun.
+    """Import a module; Ctrl-C during the import ends the process at once.
 
-    Half an import has nothing to put in order; an exception in the middle of it would be shown with all that was being
-    imported, or turned by a library into another error.
+    An interrupted import needs no cleanup, and a KeyboardInterrupt in the middle of it would print the whole import
+    chain, or a library would convert it into another error.
     """
     if threading.current_thread() is not threading.main_thread():
         return importlib.import_module(name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounded reads, writes that are whole or not at all, and checksums of files that lathe_rc reads again.
+"""Bounded reads, atomic writes, and checksums of files that lathe_rc reads again.
 
-A checksum stands inside its file, so that both are written at once: at the end, or where the writer of a format has
-left `ROOM` for it, in a text that other programs read as any other.
+The checksum is part of its file, so that both are written at once: at the end, or in the `ROOM` that the writer of a
+format has reserved for it in a text that other programs can still read.
 """
 
 import contextlib
@@ -25,14 +25,14 @@ ROOM = _MARK + _DIGITS * b"0"  #: for a checksum
 
 
 class DamagedError(ValueError):
-    """A file has another content than the one that its checksum was made of."""
+    """Mismatch between the content of a file and its checksum."""
 
 
 def contents(path: Path, most: int = MOST) -> bytes:
-    """The content of a file. Pipes and system files, at which a reader could wait for ever, are refused.
+    """Return the content of a file; pipes and system files, which can block a reader forever, are rejected.
 
     Raises:
-        OSError: it cannot be read; EFBIG: it is longer than ``most`` bytes.
+        OSError: the file cannot be read; EFBIG: it is longer than ``most`` bytes.
     """
     found = bytearray()
     with open(path, "rb", opener=open_file) as stream:
@@ -47,7 +47,7 @@ def contents(path: Path, most: int = MOST) -> bytes:
 
 
 def open_file(name: str, flags: int) -> int:
-    """An opener, for `open`, of files alone: a pipe or a device could keep a reader for ever."""
+    """Open regular files only (``opener`` for `open`): opening a pipe or a device could block forever."""
     number = os.open(name, flags | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
@@ -56,21 +56,21 @@ def open_file(name: str, flags: int) -> int:
 
 
 def sealed(content: bytes) -> bytes:
-    """The content of a file with its checksum in the last `ROOM`; without one, at the end."""
+    """Return the content of a file with its checksum in the last `ROOM`, or at the end if there is none."""
     place = content.rfind(ROOM)
     head, tail = (content, b"") if place < 0 else (content[:place], content[place + len(ROOM) :])
     return head + _MARK + _checksum(head, tail) + tail
 
 
 def unsealed(content: bytes, *, needed: bool = True) -> memoryview:
-    """The content of a file that `sealed` has made, up to its checksum.
+    """Return the content of a file written with `sealed`, up to its checksum.
 
     Args:
-        content: see above.
-        needed: whether it must have a checksum: files of older versions have none.
+        content: the bytes of the file.
+        needed: whether a checksum is required; files of older versions have none.
 
     Raises:
-        DamagedError: it is not as it was written, or there is no checksum.
+        DamagedError: the content does not match the checksum, or a required checksum is missing.
     """
     view, place = memoryview(content), content.rfind(_MARK)
     if place < 0 and not needed:
@@ -89,10 +89,10 @@ def _checksum(head: bytes | memoryview, tail: bytes | memoryview) -> bytes:
 
 
 def check_place(option: str, path: Path) -> None:
-    """Refuse a place where no file can be written, before anything is computed.
+    """Check that a file can be written at a path, before any computation.
 
     Raises:
-        InputError: it is a folder, or in a folder that does not exist; ``option`` names it.
+        InputError: the path is a folder, or its folder does not exist; the message names ``option``.
     """
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise InputError(f"{option} {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
@@ -100,12 +100,13 @@ def check_place(option: str, path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file beside ``path`` that takes its place when the block ends: on the disk, then renamed.
+    """Write a file atomically: yield a temporary path beside ``path``, which replaces ``path`` at the end of the block.
 
-    Whatever happens before leaves the old file as it was, and nothing beside it.
+    The temporary file is flushed to the disk and then renamed. After an error the old file is unchanged, and the
+    temporary file is removed.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     beside = None
     try:
@@ -128,7 +129,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """The permissions that new files of this process do not have; temporary files have none for others."""
+    """Return the umask of this process; temporary files are created without permissions for other users."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same cell in every host: the test of a stage that a user has written."""
+"""Comparison of a cell across all hosts, as a test of a user's own stage."""
 
 import importlib.util
 import os
@@ -19,18 +19,18 @@ _OTHER_BLOCK = 23  # samples: divides neither a revolution nor a second
 
 
 def digests_by_host(scenario: Scenario, folder: str | os.PathLike[str]) -> dict[str, Digests]:
-    """Return the digests of a scenario's signals in every host that this machine has: equal, unless a stage is wrong.
+    """Return the digests of a scenario's signals in every host of this machine; they differ only if a stage is wrong.
 
     Args:
-        scenario: short: it runs seven times.
-        folder: for its bag.
+        scenario: the scenario; it should be short, since it runs seven times.
+        folder: folder for the bag.
 
     Returns:
-        The digests by host: ``offline`` (by way of its bag as well, read and simulated again), offline with blocks of
-        another length, as one of a batch, and, where there is ROS 2, composed in one process and with a process a node.
+        The digests by host: ``offline`` (also re-simulated from its bag), offline with another block length, as a cell
+        of a batch, and, if ROS 2 is installed, composed in one process and with one process per node.
 
     Raises:
-        LatheError: a run has failed.
+        LatheError: a run failed.
 
     Example:
         >>> import lathe_rc

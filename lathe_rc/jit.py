@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: allow-untyped-calls
-"""Compilation of inner loops: one decorator, one place for its settings, one cache.
+"""Compilation of inner loops: one decorator with common settings, and one cache.
 
-Numba keeps compiled code in two sorts of files: an index of the signatures of a kernel, and the code for each. It
-trusts both: a flipped bit is a wrong number, or the end of the process. So each of our files has a checksum, and a
-damaged one is removed and made anew. A cache that cannot be written stops no run.
+Numba stores compiled code in two kinds of files: an index of the signatures of a kernel, and the code of each. It does
+not verify them: a flipped bit changes a number or crashes the process. So each file of this cache has a checksum, and a
+damaged file is removed and written again. A cache that is not writable stops no run.
 """
 
 import contextlib
@@ -53,7 +53,7 @@ _KERNELS = (
 
 
 def _source_hash() -> str:
-    """Hash of every file that may hold a kernel."""
+    """Return the hash of every file that may hold a kernel."""
     digest = hashlib.sha256(Path(__file__).read_bytes())
     for pattern in _KERNELS:
         for path in sorted(_PACKAGE.glob(pattern)):
@@ -65,10 +65,10 @@ _SOURCES = _source_hash()
 
 
 def cache_folder() -> Path:
-    """The folder of compiled code.
+    """Return the folder of compiled code.
 
-    Numba looks for changes in the file of a kernel, not in those of the kernels that it calls: a cache shared between
-    versions of the source would go on using old arithmetic. So each version has its own.
+    Numba detects changes in the file of a kernel, but not in the kernels that it calls: a cache shared between versions
+    of the source would run outdated code. So each version of the source has its own folder.
     """
     return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / _SOURCES
 
@@ -81,7 +81,10 @@ if "NUMBA_CACHE_DIR" not in os.environ:
 
 
 def read_kept(path: Path) -> memoryview | None:
-    """The content of a file of the cache; None: it is not there, or damaged, which is said, and it is removed."""
+    """Return the content of a file of the cache; None if it is missing or damaged.
+
+    A damaged file is reported and removed.
+    """
     try:
         return unsealed(contents(path, _MOST))
     except (FileNotFoundError, NotADirectoryError):
@@ -98,7 +101,7 @@ def read_kept(path: Path) -> memoryview | None:
 
 @cache
 def say_not_kept(reason: str) -> None:
-    """Say, once in a process, that compiled code is not kept."""
+    """Print once per process that compiled code cannot be cached."""
     print(
         f"lathe: {cache_folder()}: compiled code cannot be kept ({reason}), so that each process compiles it for "
         "itself; NUMBA_CACHE_DIR in the environment names another folder",
@@ -107,7 +110,7 @@ def say_not_kept(reason: str) -> None:
 
 
 def can_keep() -> bool:
-    """Whether compiled code can be kept: the folder can be written, and there is room; if not, say so."""
+    """Return whether compiled code can be cached: the folder is writable and has room; otherwise print a warning."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -120,7 +123,7 @@ def can_keep() -> bool:
 
 
 class _Place(_CacheLocator):
-    """The folder of a kernel, which need not be there, nor writable; the kernel needs no source file."""
+    """Cache location of a kernel, whose folder need not exist or be writable; the kernel needs no source file."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file = file  # Numba names it in its warnings
@@ -145,7 +148,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _Files(IndexDataCacheFile):
-    """The files of a kernel."""
+    """Cache files of a kernel: index and code."""
 
     @contextlib.contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
@@ -163,7 +166,7 @@ class _Files(IndexDataCacheFile):
 
 
 class _Cache(FunctionCache):
-    """The cache of a kernel."""
+    """Compilation cache of a kernel."""
 
     _impl_class = _Implementation
 
@@ -192,11 +195,10 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function of scalars and arrays; compiled code is kept between runs.
+    """Compile a function of scalars and arrays with Numba; compiled code is cached between runs.
 
-    Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives the
-    same bits whatever the length of the block. Division by zero gives inf or NaN as in NumPy. Other threads have the
-    interpreter meanwhile.
+    Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives bit-identical
+    results for every block length. Division by zero gives inf or NaN as in NumPy. The kernel releases the GIL.
 
     Example:
         >>> import lathe_rc
@@ -210,15 +212,15 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """A `kernel` that is copied into the kernels that call it.
+    """Compile a `kernel` that is inlined into the kernels that call it.
 
-    For what is called once a sample: to hand over an array costs as much as ten operations.
+    It suits functions called once per sample, since passing an array costs as much as ten operations.
     """
     return cast("Callable[P, R]", _compiled(function, forceinline=True))
 
 
 def entry(function: Callable[..., int]) -> Any:
-    """Compile a function of six addresses and whole numbers that returns one; other kernels `call` its ``address``."""
+    """Compile a function of six addresses or integers to an integer; other kernels `call` its ``address``."""
     signature = (types.int64,) * 6, types.int64
     compiled = _kept(CFunc(function, signature, locals={}, options={"error_model": "numpy"}), function)
     compiled.compile()

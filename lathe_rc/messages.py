@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The message types of the cell, read from their .msg files; CDR without ROS."""
+"""Message types of the cell, read from their .msg files, and CDR encoding without ROS."""
 
 from functools import cache
 from pathlib import Path
@@ -45,7 +45,7 @@ Signals = dict[str, Samples]  #: the arrays of a block by field name
 
 @cache
 def _own() -> "Typesdict":
-    """The types of lathe_rc."""
+    """Return the message types of lathe_rc."""
     found: Typesdict = {}
     for path in sorted((Path(__file__).with_name("msg_defs") / "msg").glob("*.msg")):
         found.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"{PACKAGE}/msg/{path.stem}"))
@@ -54,43 +54,46 @@ def _own() -> "Typesdict":
 
 @cache
 def store() -> Typestore:
-    """ROS 2's own types and those of lathe_rc; they take a while to load, and a run without a bag needs none."""
+    """Return the type store with the types of ROS 2 and lathe_rc.
+
+    Loading it takes a while, and a run without a bag does not need it.
+    """
     types = get_typestore(Stores.ROS2_JAZZY)
     types.register(_own())
     return types
 
 
 def fields(msgtype: str) -> list[tuple[str, Any]]:
-    """Names and kinds of a type's fields, in order, as rosbags has them."""
+    """Return the names and kinds of a type's fields, in order, in the form that rosbags uses."""
     return list((_own() if msgtype in _own() else store().fielddefs)[msgtype][1])
 
 
 def _with(field: str) -> frozenset[str]:
-    """The types of lathe_rc that have a field."""
+    """Return the message types of lathe_rc that have a given field."""
     return frozenset(name for name in _own() if any(field == given for given, _ in fields(name)))
 
 
 @cache
 def block_types() -> frozenset[str]:
-    """Message types of topics that carry a block a block."""
+    """Return the message types of topics with one message per block."""
     return _with("block")
 
 
 @cache
 def sparse_types() -> frozenset[str]:
-    """Message types of topics that carry messages at chosen samples."""
+    """Return the message types of topics with messages at individual samples."""
     return _with("sample_index") | {JOINTS}
 
 
 @cache
 def signal_types() -> frozenset[str]:
-    """Message types of all signal topics."""
+    """Return the message types of all signal topics."""
     return block_types() | sparse_types()
 
 
 @cache
 def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
-    """The array fields of a block type, in order, with their element types."""
+    """Return the array fields of a block type, in order, with their element types."""
     found = {}
     for name, (kind, detail) in fields(msgtype):
         if kind == Nodetype.SEQUENCE:
@@ -100,17 +103,17 @@ def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
 
 
 def full(topic: str) -> str:
-    """The fully qualified name of a topic; results of the engine come without the slash."""
+    """Return the fully qualified name of a topic; topic names of the engine have no leading slash."""
     return "/" + topic.lstrip("/")
 
 
 def allocate(msgtype: str, samples: int) -> Signals:
-    """Zeroed arrays for ``samples`` samples of a block type."""
+    """Return zeroed arrays for ``samples`` samples of a block type."""
     return {name: np.zeros(samples, dtype) for name, dtype in sample_fields(msgtype).items()}
 
 
 def header(index: int, step_ns: int) -> Any:
-    """std_msgs/Header with the simulated time of sample ``index``."""
+    """Return a std_msgs/Header with the simulated time of sample ``index``."""
     seconds, nanoseconds = divmod(START_NS + index * step_ns, 1_000_000_000)
     types = store().types
     stamp = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
@@ -118,37 +121,37 @@ def header(index: int, step_ns: int) -> Any:
 
 
 def stamp_ns(message: Any) -> int:
-    """Simulated time [ns] in a message's header."""
+    """Return the simulated time [ns] in a message's header."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def stamp_of(data: bytes | memoryview) -> int:
-    """Simulated time [ns] of an encoded message whose first field is a header; nothing else of it is decoded."""
+    """Return the simulated time [ns] of an encoded message by decoding the time stamp of its leading header alone."""
     stamp = decode("builtin_interfaces/msg/Time", bytes(data[:12]))  # the header's first field
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def encode(msgtype: str, message: Any) -> bytes:
-    """CDR bytes of a message, padded to a multiple of four as DDS hands them over."""
+    """Encode a message as CDR bytes, padded to a multiple of four as in DDS."""
     data = bytes(store().serialize_cdr(message, msgtype))
     return data + bytes(-len(data) % 4)
 
 
 def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
-    """The fields of a message, without its header, sender and run.
+    """Return the fields of a message, without its header, sender and run.
 
     Raises:
-        ValueError: the bytes are no such message.
+        ValueError: the bytes are no message of this type.
     """
     return {name: value for name, value in vars(decode(msgtype, data)).items() if name not in NOT_SIGNALS}
 
 
 def decode(msgtype: str, data: bytes) -> Any:
-    """A message from CDR bytes; arrays are views of the bytes.
+    """Decode a message from CDR bytes; its arrays are views of the bytes.
 
     Raises:
-        ValueError: the bytes are no such message.
+        ValueError: the bytes are no message of this type.
     """
     try:
         return store().deserialize_cdr(data, msgtype)

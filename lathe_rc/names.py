@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names: suggestions for an unknown one, and ROS namespaces of cells, ``/`` or ``/a/b``."""
+"""Name utilities: suggestions for unknown names, and ROS namespaces of cells (``/`` or ``/a/b``)."""
 
 import re
 from collections.abc import Iterable
@@ -13,17 +13,17 @@ _MOST_LISTED = 16  # names that a message lists; more of them are looked up else
 
 
 def _in(name: str, other: str) -> bool:
-    """Whether a name is what somebody remembers of another one."""
+    """Return whether a name of at least two characters is contained in another one."""
     return len(name) > 1 and name in other
 
 
 def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
-    """The names that may replace an unknown one, in words.
+    """Suggest replacements for an unknown name, as readable text.
 
     Args:
-        name: that nobody has.
-        known: the names that there are.
-        listing: what lists them all, a command or a place; empty: nothing does.
+        name: the unknown name.
+        known: all known names.
+        listing: command or place that lists all names; empty: none.
     """
     names = list(known)
     close = dict.fromkeys([*get_close_matches(name, names, _MOST_CLOSE), *(each for each in names if _in(name, each))])
@@ -37,10 +37,10 @@ def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
 
 
 def checked_namespace(namespace: str) -> str:
-    """The namespace, if it is one.
+    """Return the ROS namespace after checking it.
 
     Raises:
-        InputError: it is none.
+        InputError: the string is no valid namespace.
     """
     if not _NAMESPACE.fullmatch(namespace):
         raise InputError(f"namespace {namespace!r}; allowed: / or /NAME or /NAME/NAME, of letters, digits and _")
@@ -48,5 +48,5 @@ def checked_namespace(namespace: str) -> str:
 
 
 def absolute(namespace: str, name: str) -> str:
-    """A name after its namespace has been put before it."""
+    """Return the absolute name in a namespace."""
     return name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting processes by way of a fork server, see `lathe_rc.nodes.fork_server`; this module imports no ROS.
+"""Process start through a fork server, see `lathe_rc.nodes.fork_server`; this module does not import ROS.
 
-`multiprocessing` has a fork server, too, but imports the user's main module anew in each process: a script without
-``if __name__ == "__main__"`` would run itself again, and so would a notebook. Nor can it load kernels on request.
+The fork server of `multiprocessing` imports the user's main module anew in each process: a script without
+``if __name__ == "__main__"`` would run itself again, and so would a notebook. It also cannot load kernels on request.
 """
 
 import atexit
@@ -30,14 +30,14 @@ _MOST = 2**16  # [B] of an answer
 
 
 class Child:
-    """A process that the fork server has started; its methods are those of `subprocess.Popen`.
+    """Process started by the fork server, with the methods of `subprocess.Popen`.
 
     Args:
-        pid: its number.
-        descriptor: its pidfd, which never names another process, even when the number is used again.
+        pid: process ID.
+        descriptor: pidfd of the process, which stays unique even if the process ID is reused.
 
     Attributes:
-        returncode: as that of `subprocess.Popen`.
+        returncode: exit code, as in `subprocess.Popen`.
     """
 
     def __init__(self, pid: int, descriptor: int) -> None:
@@ -48,14 +48,14 @@ class Child:
         self._ended = threading.Event()
 
     def poll(self) -> int | None:
-        """Its exit code once it has ended."""
+        """Return the exit code of the process; None while it runs."""
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end.
+        """Wait for the end of the process.
 
         Raises:
-            subprocess.TimeoutExpired: it has not ended in ``timeout`` seconds.
+            subprocess.TimeoutExpired: the process has not ended within ``timeout`` seconds.
         """
         if not self._ended.wait(timeout):
             raise subprocess.TimeoutExpired(str(self.pid), timeout or 0.0)
@@ -63,28 +63,28 @@ class Child:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal, unless it has ended."""
+        """Send a signal to the process, unless it has ended."""
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._descriptor, number)
 
     def kill(self) -> None:
-        """Send SIGKILL."""
+        """Send SIGKILL to the process."""
         self.send_signal(signal.SIGKILL)
 
     def end(self, code: int) -> None:
-        """Take the exit code that the server reports."""
+        """Store the exit code that the fork server reports."""
         self.returncode = code
         self._ended.set()
 
 
 class ForkServer:
-    """A fork server of this process; it ends when this process does.
+    """Fork server of this process, which ends together with it.
 
     Raises:
-        LatheError: there is no ROS 2 here.
+        LatheError: ROS 2 is not installed.
 
     Attributes:
-        lost: it has ended before.
+        lost: whether the server has ended prematurely.
     """
 
     def __init__(self) -> None:
@@ -106,10 +106,10 @@ class ForkServer:
         atexit.register(self.close)
 
     def preload(self, nodes: Mapping[str, tuple[str, Mapping[str, object]]]) -> None:
-        """Load what nodes need, while this process does something else.
+        """Load the modules and kernels of nodes in the server, without waiting for it.
 
         Args:
-            nodes: kind and parameters of each.
+            nodes: kind and parameters of each node.
         """
         with self._asking, contextlib.suppress(BrokenPipeError):
             self._line.send(json.dumps({"preload": nodes}).encode())
@@ -123,14 +123,14 @@ class ForkServer:
         log: int,
         command: Sequence[str] = (),
     ) -> Child:
-        """Start a process in a session of its own, in this process's folder.
+        """Start a process in a new session, with the current folder of this process.
 
         Args:
-            arguments: of `lathe_rc.nodes.container`, which it is to be.
-            environment: all of it.
-            report: where its `lathe_rc.nodes.report.Reporter` writes; the caller may close it then.
-            log: descriptor of a file for what it prints.
-            command: what it is to be instead.
+            arguments: command-line arguments of `lathe_rc.nodes.container`, which the process runs.
+            environment: complete environment of the process.
+            report: socket for its `lathe_rc.nodes.report.Reporter`; the caller may close it after the call.
+            log: descriptor of the file for its output.
+            command: command to run in place of the container.
 
         Raises:
             LatheError: the server has ended.
@@ -152,7 +152,7 @@ class ForkServer:
         return child
 
     def _listen(self) -> None:
-        """Take the server's answers; without it no exit code would be known, so its processes end with it."""
+        """Process the server's answers; at its end its processes are killed, since exit codes would be unknown."""
         with contextlib.suppress(OSError):
             while (answer := socket.recv_fds(self._line, _MOST, 1))[0]:
                 pid, code = json.loads(answer[0])
@@ -168,7 +168,7 @@ class ForkServer:
         self._started.put(None)
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         with contextlib.suppress(OSError):
             self._line.shutdown(socket.SHUT_RDWR)
         self._process.terminate()  # it may be busy with compiling what nobody wants any more
@@ -181,7 +181,7 @@ def _server_of(_pid: int) -> ForkServer:
 
 
 def server() -> ForkServer:
-    """The fork server of this process, started when it is first needed."""
+    """Return the fork server of this process, and start it on the first call."""
     if _server_of(os.getpid()).lost:
         _server_of.cache_clear()
     return _server_of(os.getpid())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Public names of a package: its stub lists them, for type checkers as well, and each is imported when it is used.
+"""Lazy public names of a package: its stub lists them, also for type checkers, and each is imported on first use.
 
-So a package offers what is spread over its modules, and to import it costs nothing (PEP 562).
+So a package can export names of many modules without import costs (PEP 562).
 """
 
 import ast
@@ -14,7 +14,7 @@ from typing import Any
 
 @cache
 def homes(package: str) -> dict[str, tuple[str, str]]:
-    """Return module and name there of each public name of a package."""
+    """Return the module of each public name of a package, and its name there."""
     stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi")
     lines = ast.parse(stub.read_text(encoding="utf-8")).body
     imports = [line for line in lines if isinstance(line, ast.ImportFrom)]
@@ -22,10 +22,10 @@ def homes(package: str) -> dict[str, tuple[str, str]]:
 
 
 def attribute(package: str, name: str) -> Any:
-    """Return a public name of a package: its module-level ``__getattr__``.
+    """Return a public name of a package; serves as its module-level ``__getattr__``.
 
     Raises:
-        AttributeError: it has no such name.
+        AttributeError: the package has no such name.
     """
     if name == "__all__":
         return sorted(homes(package))

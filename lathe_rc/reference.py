@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference page in Markdown: nodes, topics, messages and parameters, as the code has them."""
+"""Reference page in Markdown: nodes, topics, messages and parameters, generated from the code."""
 
 import inspect
 import json
@@ -26,7 +26,7 @@ _SCHEDULE = f"{messages.PACKAGE}/srv/Schedule"
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the complete reference page."""
     parts = [_introduction(), _shared(), *map(node, TABLES.own), *map(_beside, BESIDE), _host(), _messages()]
     return "\n\n".join(parts) + "\n"
 
@@ -75,7 +75,7 @@ def _parameters(rows: Mapping[str, Row]) -> str:
 
 
 def _only(table: type[NodeParameters], base: type[SharedParameters]) -> dict[str, Row]:
-    """The parameters that a table adds to those of its base."""
+    """Return the parameters that a table adds to those of its base."""
     return {name: row for name, row in table.rows().items() if name not in base.model_fields}
 
 
@@ -92,7 +92,7 @@ Own: each node has its own value.
 
 
 def node(kind: str) -> str:
-    """The section of a kind of node, also one of another package."""
+    """Return the section of a kind of node, built-in or third-party."""
     table = TABLES[kind]
     stage = STAGES[kind](kind, table()) if kind in STAGES else None
     parts = [f"## {kind}", inspect.getdoc(table) or ""]
@@ -169,7 +169,7 @@ def _messages() -> str:
 
 
 def _definition(text: str) -> Iterator[str]:
-    """The comment at the head of a definition and a table for each of its parts."""
+    """Return the comment at the head of a message or service definition, and one table for each of its parts."""
     about: list[str] = []
     rows: list[list[str]] = []
     for line in map(str.strip, text.splitlines()):

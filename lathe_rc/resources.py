@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the scenarios and profiles that come with lathe_rc lie."""
+"""Locations of the scenarios and profiles that are installed with lathe_rc."""
 
 import os
 import sys
@@ -10,18 +10,19 @@ from lathe_rc.names import instead
 
 
 def config_folders() -> list[Path]:
-    """Folders with configuration, the nearest first: a checkout, ament prefixes, the Python environment."""
+    """Return the configuration folders, nearest first: a checkout, ament prefixes, the Python environment."""
     prefixes = [prefix for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
     shared = [Path(prefix) / "share" / "lathe_rc" / "config" for prefix in [*prefixes, sys.prefix]]
     return [folder for folder in [Path(__file__).parents[1] / "config", *shared] if folder.is_dir()]
 
 
 def scenario(path: Path) -> Path:
-    """The file of a scenario: `find` of ``path``, or of the same name with ``.yaml``.
+    """Return the file of a scenario: `find` of ``path``, or of the same name with ``.yaml``.
 
     Raises:
-        InputError: there is none; says which have names like that. Or a name is that of one in the current folder and
-            of one that comes with lathe_rc.
+        InputError: there is no such file; the message names similar ones. Or the current folder and lathe_rc both have
+        a
+            scenario of this name.
     """
     # A folder of that name, such as one of lathe new, is no scenario.
     folder = path.is_dir() and bool(path.name.strip(".")) and find(path.with_suffix(".yaml")).exists()
@@ -38,12 +39,12 @@ def scenario(path: Path) -> Path:
 
 
 def find(path: Path) -> Path:
-    """``path`` itself if it exists or is absolute; otherwise the same name in a configuration folder, if any."""
+    """Return ``path`` itself if it exists or is absolute; otherwise the same name in a configuration folder, if any."""
     if path.exists() or path.is_absolute():
         return path
     return next((folder / path for folder in config_folders() if (folder / path).exists()), path)
 
 
 def is_own(path: Path) -> bool:
-    """Whether a file is one of those that come with lathe_rc."""
+    """Return whether a file is installed with lathe_rc."""
     return any(path.resolve().is_relative_to(folder.resolve()) for folder in config_folders())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packages of one's own to begin with, from lathe_rc/templates: a law, a drive, a stage or a study."""
+"""New user packages from the templates in lathe_rc/templates: a law, a drive, a stage or a study."""
 
 import keyword
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from lathe_rc.extensions import COMMON
 
 @dataclass(frozen=True)
 class Kind:
-    """A package that ``lathe new`` can begin.
+    """Template of a package for ``lathe new``.
 
     Attributes:
-        summary: of the package.
-        group: of its entry point.
-        members: nodes of its scenario beside spindle and recorder; ``{}`` is the new one; empty: it has none.
+        summary: description of the package.
+        group: group of its entry point.
+        members: nodes of its scenario beside spindle and recorder; ``{}`` is the new node; empty: no scenario.
     """
 
     summary: str
@@ -42,19 +42,19 @@ KINDS = {
 
 
 def begin(kind: str, name: str, place: Path, *, compiled: bool) -> list[str]:
-    """Write a package.
+    """Create a package from a template.
 
     Args:
-        kind: one of `KINDS`.
-        name: of the package and its folder.
-        place: where the folder is to be.
-        compiled: with a compiled step.
+        kind: kind of package, one of `KINDS`.
+        name: name of the package and its folder.
+        place: parent folder of the new folder.
+        compiled: whether the package has a compiled step.
 
     Returns:
-        Its files.
+        The written files.
 
     Raises:
-        InputError: the name cannot be, the folder exists or cannot be written.
+        InputError: the name is not allowed, or the folder exists or cannot be written.
     """
     _check_name(name)
     folder, chosen = place / name, KINDS[kind]
@@ -82,7 +82,7 @@ def begin(kind: str, name: str, place: Path, *, compiled: bool) -> list[str]:
 
 
 def _check_name(name: str) -> None:
-    """Refuse what cannot be the name of a package and a node."""
+    """Reject a name that is not allowed for a package and a node."""
     if not (name.isascii() and name.isidentifier() and name == name.lower()) or name.startswith("_"):
         raise InputError(f"{name!r}; allowed: small letters, digits and _, a letter first")
     if keyword.iskeyword(name) or name in COMMON:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SROS2 policies: what each node of a cell may publish, read, serve and call. Made from the wiring, without ROS.
+"""SROS2 policies: the topics and services that each node of a cell may use, derived from the wiring without ROS.
 
-DDS security knows processes, not nodes: an enclave is what one process may do, the union of its nodes' profiles.
-Nothing is denied by name, since what no profile of an enclave allows is denied.
+DDS security applies to processes, not to nodes: an enclave holds the permissions of one process, the union of its
+nodes' profiles. No name is denied explicitly, since everything outside the profiles of an enclave is denied.
 """
 
 import xml.etree.ElementTree as ET
@@ -47,13 +47,13 @@ _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # that the nodes of ros2 top
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """The permissions of one node. Names are relative to its namespace, or absolute where the whole domain shares them.
+    """Permissions of one node; names are relative to its namespace, or absolute if the whole domain shares them.
 
     Attributes:
-        namespace: of the node; ``/`` or ``/a/b``.
-        node: its name.
-        publish, subscribe: topics.
-        reply, request: services.
+        namespace: namespace of the node, ``/`` or ``/a/b``.
+        node: name of the node.
+        publish, subscribe: topics that the node publishes and subscribes to.
+        reply, request: services that the node offers and calls.
     """
 
     namespace: str
@@ -68,11 +68,11 @@ Policy = dict[str, list[Profile]]  #: profiles of each enclave, by its path
 
 
 class _Maker:
-    """Profiles of the nodes of a cell and of those beside it.
+    """Builder of the profiles for the nodes of a cell and for tools beside it.
 
     Args:
-        scenario: with a recorder.
-        namespace: of the cell.
+        scenario: scenario with a recorder.
+        namespace: namespace of the cell.
     """
 
     def __init__(self, scenario: Scenario, namespace: str) -> None:
@@ -82,7 +82,7 @@ class _Maker:
         self.members: list[Profile] = []
 
     def member(self, name: str, group: Sequence[str]) -> Profile:
-        """A node of the cell that shares its process with ``group``; what is published there it reads in memory."""
+        """Return the profile of a node that shares its process with ``group``, whose topics it reads in memory."""
         kind, stage = self._scenario.kind(name), self._cell.stages.get(name)
         own = {topic for topic, source in self._signals.items() if source.node == name}
         reads = {topic for topic in self._signals if stage is None or stage in self._cell.readers(topic)}
@@ -114,7 +114,7 @@ class _Maker:
         services: Iterable[str] = (),
         logs: bool = True,
     ) -> Profile:
-        """A node with what every node of rclpy has; ``services`` are its own."""
+        """Return a profile with the permissions common to all rclpy nodes and those of the arguments."""
         return Profile(
             namespace=self._namespace,
             node=name,
@@ -124,20 +124,20 @@ class _Maker:
         )
 
     def rerun_bridge(self) -> Profile:
-        """It reads the signals that a scene shows."""
+        """Return the profile of the Rerun bridge, which reads the signals shown in a scene."""
         return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
 
     def replayer(self) -> Profile:
-        """It takes the place of the cell: it publishes what a bag of it holds, not as members but by itself."""
+        """Return the profile of the replayer, which alone publishes the topics of a recorded cell."""
         topics = [*self._signals, *_RECORDED, _CLOCK]
         return self._node(REPLAYER, publish=topics, services=_SERVICES[REPLAYER], logs=False)
 
     def topic_recorder(self) -> Profile:
-        """It reads every topic of the cell."""
+        """Return the profile of the topic recorder, which reads every topic of the cell."""
         return self._node(TOPIC_RECORDER, subscribe=self._published() - {_LOG, _PARAMETER_EVENTS}, logs=False)
 
     def operator(self) -> Profile:
-        """A person with the tools of ROS, which give their nodes names of their own."""
+        """Return the profile of an operator with the ROS command-line tools, which generate their own node names."""
         return Profile(
             namespace=self._namespace,
             node=OPERATOR,
@@ -167,19 +167,19 @@ def policy(
     namespace: str = "/",
     beside: Iterable[str] = (),
 ) -> Policy:
-    """The permissions of a scenario's processes.
+    """Return the permissions of a scenario's processes.
 
     Args:
-        scenario: the cell; it gets a recorder if it has none.
-        groups: names of nodes that share a process, the others have their own; None: as the scenario says.
-        namespace: of the cell, ``/`` or ``/a/b``.
-        beside: others that are let in, of `BESIDE`.
+        scenario: the scenario; a recorder is added if it has none.
+        groups: names of nodes that share a process; all other nodes have their own; None: as in the scenario.
+        namespace: namespace of the cell, ``/`` or ``/a/b``.
+        beside: further tools with permissions, out of `BESIDE`.
 
     Returns:
         The profiles of each enclave. Its path is the fully qualified name of its process's first node.
 
     Raises:
-        InputError: the scenario cannot be wired, a node in ``groups`` that there is not, or no ROS namespace.
+        InputError: the scenario cannot be wired, ``groups`` has an unknown node, or the namespace is not valid.
     """
     checked_namespace(namespace)
     # The bag's folder is no matter of policy.
@@ -193,7 +193,7 @@ def policy(
 
 
 def to_xml(made: Policy, title: str) -> str:
-    """The policy as SROS2 reads it, version 0.2.0; ``title`` says whose it is."""
+    """Return the policy as SROS2 XML, version 0.2.0, with ``title`` as its heading."""
     root = ET.Element("policy", version="0.2.0")
     enclaves = ET.SubElement(root, "enclaves")
     for path, profiles in made.items():
@@ -222,6 +222,6 @@ def _append(element: ET.Element, profile: Profile) -> None:
 
 
 def _expression(profile: Profile, name: str) -> str:
-    """A name as policies have it: ~ stands for the node's own."""
+    """Return a name in the notation of policies, where ~ stands for the node's own name."""
     own = f"{profile.node}/"
     return f"~/{name.removeprefix(own)}" if name.startswith(own) else name

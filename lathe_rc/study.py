@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of a study: parameters in, a result out that can be printed, drawn and written as JSON."""
+"""Interface of a study: parameters as input, and a result that can be printed, drawn and written as JSON."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,59 +22,59 @@ P = TypeVar("P", bound="StudyParameters")
 
 
 class StudyParameters(Table):
-    """Parameters of a study: a table as nodes have it, whose lists are never empty."""
+    """Parameters of a study: a parameter table as of a node, in which lists must not be empty."""
 
     listing: ClassVar[str] = "lathe study {} --help"
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse empty lists: there would be nothing to compute."""
+        """Reject empty lists, with which the study would compute nothing."""
         for name, row in type(self).rows().items():
             if row.is_list and not getattr(self, name):
                 raise InputError(f"{name} = []; allowed: at least one value, {row.allowed()}")
 
 
 class Track(Protocol):
-    """Passes items on and shows how many are done."""
+    """Progress display for a loop: yields the items and shows the number of finished ones."""
 
     def __call__(self, items: Sequence[T], /) -> Iterable[T]:
-        """The items, one by one."""
+        """Yield the items one by one."""
 
 
 def untracked(items: Sequence[T], /) -> Iterable[T]:
-    """Pass the items on and show nothing."""
+    """Yield the items without a progress display."""
     return items
 
 
 class Result(Protocol):
-    """The result of a study; a frozen dataclass."""
+    """Result of a study; a frozen dataclass."""
 
     def to_json(self) -> dict[str, Any]:
-        """Everything in numbers, finite or None."""
+        """Return all numbers of the result for JSON, each finite or None."""
 
     def table(self) -> "RenderableType":
-        """The computed numbers beside those of the paper, at most 80 columns wide."""
+        """Return a table of the computed numbers beside those of the paper, at most 80 columns wide."""
 
     def draw(self, figure: "Figure") -> None:
-        """Fill an empty figure."""
+        """Draw the result into an empty figure."""
 
 
 class Run(Protocol[P_contra]):
-    """A study's function; pure: the same parameters give the same result."""
+    """Function of a study; pure: equal parameters give equal results."""
 
     def __call__(self, parameters: P_contra, track: Track = ...) -> Result:
-        """Compute the study; its longest loop goes over ``track(items)``."""
+        """Compute the study; its longest loop iterates over ``track(items)``."""
 
 
 @dataclass(frozen=True)
 class Study(Generic[P]):
-    """A table or figure of a paper, or a question that one raises, computed anew.
+    """Reproduction of a table or figure of a paper, or of a question that a paper raises.
 
     Attributes:
-        name: on the command line.
-        doc: one line.
-        parameters: its table.
-        run: computes it.
-        size: of its figure [in], width and height.
+        name: name on the command line.
+        doc: summary in one line.
+        parameters: class of its parameters.
+        run: function that computes the study.
+        size: width and height of its figure [in].
     """
 
     name: str
@@ -85,7 +85,7 @@ class Study(Generic[P]):
 
 
 def comparison(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> RichTable:
-    """A table in the style of all studies; the first column is text, the others are numbers."""
+    """Return a table in the common style of the studies; the first column has text, the others have numbers."""
     table = RichTable(title=Text(title), title_justify="left", show_edge=False, header_style="bold")
     for number, column in enumerate(columns):
         table.add_column(Text(column), justify="right" if number else "left")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command group ``lathe bag``: what a bag holds, whether it is whole, making it whole, its tachogram."""
+"""Command group ``lathe bag``: content, verification and recovery of a bag, and its tachogram."""
 
 import json
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ def bag() -> None:
 
 
 def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
-    """First and last revolution of the part, if the bag has one; in memory that does not grow with the bag."""
+    """Return the first and last revolution of the part, if the bag has one; memory use does not grow with the bag."""
     if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
         return None
     ends = part.FirstAndLast(types)
@@ -101,7 +101,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
 
 
 def _print_about(console: Console, about: Mapping[str, str]) -> None:
-    """Texts that a bag says of itself."""
+    """Print the metadata strings of a bag."""
     for key, text in about.items():
         if key == provenance.SCENARIO:
             console.print("scenario:")
@@ -117,7 +117,7 @@ def _print_about(console: Console, about: Mapping[str, str]) -> None:
 
 
 def _date(log_ns: int) -> str | None:
-    """Date of a log time in UTC; None: simulated time, which begins near 0."""
+    """Return the date of a log time in UTC; None for simulated time, which begins near 0."""
     if log_ns < _SIMULATED:
         return None
     return datetime.fromtimestamp(log_ns // 10**9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")

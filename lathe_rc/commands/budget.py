@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe budget``: what the form error of a scenario is made of."""
+"""Command ``lathe budget``: contributions of the causes to the form error of a scenario."""
 
 import json
 

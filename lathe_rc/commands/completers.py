@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words for the shell: functions for ``shell_complete=`` of options and arguments.
+"""Shell completion: functions for ``shell_complete=`` of options and arguments.
 
-A shell waits for them, so each imports no more than its answer takes: NumPy alone takes longer than all of Click.
+Completion is interactive, so each function imports as little as possible: NumPy alone takes longer than all of Click.
 """
 
 import contextlib
@@ -16,12 +16,12 @@ from lathe_rc import resources
 
 
 def beginning(words: Iterable[str], incomplete: str) -> list[CompletionItem]:
-    """Return the words that begin with what is typed."""
+    """Return the words that begin with the typed prefix."""
     return [CompletionItem(word) for word in words if word.startswith(incomplete)]
 
 
 def scenarios(_ctx: click.Context, _param: click.Parameter | None, incomplete: str) -> list[CompletionItem]:
-    """Complete a scenario: those that come with lathe_rc and of this folder; a path, once it looks like one."""
+    """Complete a scenario of lathe_rc or of the current folder, or a file path if the word looks like one."""
     if os.sep in incomplete or incomplete.startswith((".", "~")):
         return [CompletionItem(incomplete, type="file")]
     names = {file.stem for folder in resources.config_folders() for file in folder.glob("*.yaml")}
@@ -36,14 +36,17 @@ def kinds(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list
 
 
 def nodes(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete NODE+NODE of the scenario, each node once."""
+    """Complete NODE+NODE with nodes of the scenario, each at most once."""
     *before, _ = incomplete.split("+")
     others = [node for node in _kinds_by_node(ctx) if node not in before]
     return beginning(("+".join([*before, node]) for node in others), incomplete)
 
 
 def targets(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete NODE.PARAM= of the scenario, or of all kinds of nodes where none is named; first the node alone."""
+    """Complete NODE.PARAM= of the scenario, or of all kinds of nodes if the command line has no scenario.
+
+    The node is completed first, then the parameter.
+    """
     known = _kinds_by_node(ctx)
     node, dot, _ = incomplete.partition(".")
     if known and not dot:
@@ -60,7 +63,7 @@ def targets(ctx: click.Context, _param: click.Parameter, incomplete: str) -> lis
 
 
 def _kinds_by_node(ctx: click.Context) -> dict[str, str]:
-    """Kinds of the nodes in the scenario of a command line; empty without a readable scenario."""
+    """Return the kinds of the nodes in the command line's scenario; empty if no scenario can be read."""
     import yaml
 
     # Click gives up at an option without a value, such as the one that is being typed, and leaves arguments aside.

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe completion``: scripts that let a shell complete the command line.
+"""Command ``lathe completion``: shell scripts for command-line completion.
 
-Click answers, see `lathe_rc.commands.completers`. Its own scripts put a blank behind every word, also behind a node
-whose parameter is still to come, and those for zsh and fish call the `lathe` of the PATH in place of ./lathe.
+Click computes the completions, see `lathe_rc.commands.completers`. Click's own scripts append a blank to every word,
+also to a node whose parameter is still missing, and those for zsh and fish call the `lathe` of the PATH in place of
+./lathe.
 """
 
 import os
@@ -20,7 +21,7 @@ _SHELLS = ("bash", "zsh", "fish")
 
 
 def _startup(shell: str) -> Path:
-    """The file that a shell reads when it starts."""
+    """Return the start-up file of a shell."""
     home = Path.home()
     if shell == "fish":
         return Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "fish" / "config.fish"

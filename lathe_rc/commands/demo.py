@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe demo``: a cell of ROS 2 processes, recorded, with a picture of the result."""
+"""Command ``lathe demo``: a recorded cell of ROS 2 processes, with a figure of the result."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from lathe_rc.commands import options
 
 
 class Demo(NamedTuple):
-    """A cell that is shown.
+    """Cell of a demonstration.
 
     Attributes:
-        scenario: of its file.
-        announcement: before it runs.
-        title: of the figure.
-        overrides: of the scenario, as for ``--set``.
-        peer: overrides that put another law in the place of the scenario's, which runs offline and is drawn as well.
-        peer_name: of that law.
+        scenario: name of its scenario.
+        announcement: text printed before the run.
+        title: title of the figure.
+        overrides: overrides of the scenario, as for ``--set``.
+        peer: overrides that select another law for comparison, which runs offline and is drawn as well.
+        peer_name: name of the other law.
     """
 
     scenario: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe export``: a bag's signals as CSV, Parquet or NumPy files."""
+"""Command ``lathe export``: signals of a bag as CSV, Parquet or NumPy files."""
 
 from pathlib import Path
 

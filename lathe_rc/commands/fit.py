@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command group ``lathe fit``: models from measurements, with the parameters to set."""
+"""Command group ``lathe fit``: models from measurements, with the parameters to set."""
 
 import json
 from collections.abc import Mapping
@@ -63,7 +63,7 @@ def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
 
 
 def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | None) -> None:
-    """Both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
+    """Draw both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
     from matplotlib.figure import Figure
 
     stages = [(model, "model", "measured")]
@@ -135,10 +135,10 @@ def channel(
 
 
 def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, delay: float) -> dict[str, Any]:
-    """The fastest PID with margins [rad] and [1] at a delay [s], and its loop.
+    """Return the fastest PID with margins [rad] and [1] at a delay [s], and its loop.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such PID.
     """
     from lathe_rc.analysis import pid_tuning  # SciPy's optimisers take a second
 
@@ -166,7 +166,7 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
 
 
 def _show(summary: Mapping[str, Any], delay: float) -> None:
-    """Print all that has been found."""
+    """Print the results of the fit."""
     out = console()
 
     for name in ("model", "inverse"):

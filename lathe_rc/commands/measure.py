@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe measure``: a recorded part as the workshop measures it, revolution by revolution."""
+"""Command ``lathe measure``: workshop measurements of a recorded part by revolution."""
 
 import json
 import re
@@ -22,7 +22,7 @@ _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra"
 
 
 def table(found: Measurement, revolutions: list[int]) -> Table:
-    """Table of revolutions, in µm."""
+    """Return a table of the revolutions, in µm."""
     lines = tables.table(*_COLUMNS, title="form error and roundness [µm]")
     for revolution in revolutions:
         numbers = part.numbers(found, revolution)
@@ -38,7 +38,7 @@ def table(found: Measurement, revolutions: list[int]) -> Table:
 
 
 def _chosen(text: str, whole: int) -> list[int]:
-    """Revolutions, counted from 0, that a text such as 1,4,10-12 names; without one, some spread over all."""
+    """Parse revolutions such as 1,4,10-12 into indices from 0; without a text, select some spread over all."""
     if not text:
         return tables.spread(whole)
     chosen: list[int] = []
@@ -53,10 +53,10 @@ def _chosen(text: str, whole: int) -> list[int]:
 
 
 def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float | None) -> Lay | str | None:
-    """The surface along the part, or why there is none; None: neither the command nor the bag names a nose.
+    """Return the surface along the part, or the reason for its absence; None: no nose radius in command and bag.
 
     Raises:
-        InputError: the command names one, and there is none.
+        InputError: the command names a nose radius, but there is no surface.
     """
     if nose_mm:
         return part.surface(recording, found, nose_mm * 1e-3)

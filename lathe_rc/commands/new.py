@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe new``: a package of one's own to begin with, which runs and is tested as it is."""
+"""Command ``lathe new``: create a user package that runs and has tests from the start."""
 
 from pathlib import Path
 

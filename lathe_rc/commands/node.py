@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands ``lathe node`` and ``lathe container``: nodes in this process, as ``ros2 run`` starts them."""
+"""Commands ``lathe node`` and ``lathe container``: nodes in this process, as with ``ros2 run``."""
 
 import sys
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help
 
 
 class _PassingThrough(click.Command):
-    """A command that passes on unknown options; a first -h or --help is its own."""
+    """Command that passes on unknown options, and handles only a leading -h or --help itself."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Show the help if it comes first; pass on everything else."""
+        """Show the help for a leading -h or --help; pass on all other arguments."""
         if args[:1] in (["-h"], ["--help"]):
             click.echo(ctx.get_help())
             ctx.exit()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments and options that several commands have; to import them takes no more than Click."""
+"""Arguments and options shared by several commands; this module imports only Click."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a run, as tables and lines for the terminal."""
+"""Result of a run as tables and lines for the terminal."""
 
 from collections.abc import Mapping
 from itertools import groupby
@@ -20,7 +20,7 @@ _ALIKE = 4  # of them that follow one another: those in between are left out
 
 
 def table(result: harness.Result) -> Table:
-    """Table of the part in its first and last revolution."""
+    """Return a table of the part's form error in its first and last revolution."""
     columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
     found = tables.table("", *columns.values(), left=1)
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
@@ -30,7 +30,7 @@ def table(result: harness.Result) -> Table:
 
 
 def _events(result: harness.Result) -> Table:
-    """Table of the event log, as far as there is room; of a row of equal events the first and the last."""
+    """Return a table of the event log, limited in length; a series of similar events is shortened to its ends."""
     table = tables.table("time [s]", "topic", "what happened", left=3, overflow="fold")
     table.columns[0].justify = "right"
     step, rows = result.scenario.shared.step, list[tuple[str, str, str]]()
@@ -45,7 +45,7 @@ def _events(result: harness.Result) -> Table:
 
 
 def facts(result: harness.Result) -> list[str]:
-    """Growth of the form error, tolerance, blocks, pace, and messages that were refused, a line each."""
+    """Return one line each on error growth, tolerance, blocks, pace and rejected messages."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
     surface = result.surface
     return [
@@ -60,7 +60,7 @@ def facts(result: harness.Result) -> list[str]:
 
 
 def _margins(result: harness.Result) -> list[str]:
-    """The stability margin of each learning controller, in one line."""
+    """Return the stability margins of all learning controllers in one line."""
     margins = [
         f"{name} {'not known' if margin is None else f'{margin:.4g}'}" for name, margin in result.margins.items()
     ]
@@ -68,7 +68,7 @@ def _margins(result: harness.Result) -> list[str]:
 
 
 def _lateness(lateness: Lateness) -> list[str]:
-    """Lateness of the blocks, in words."""
+    """Describe the lateness of the blocks."""
     within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in lateness.within.items())
     return [
         f"{lateness.late} of {lateness.blocks} blocks late; the schedule slipped by {lateness.slipped:.3g} s",
@@ -77,7 +77,7 @@ def _lateness(lateness: Lateness) -> list[str]:
 
 
 def show_budget(found: Budget) -> None:
-    """Print a budget, cause by cause."""
+    """Print an error budget, one row per cause."""
     lines = tables.table("cause", "share of the power [%]", "RMS [µm]", "maximum [µm]", left=1)
     whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
     for each in (*found.rows, whole):
@@ -89,7 +89,7 @@ def show_budget(found: Budget) -> None:
 
 
 def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "", budget: Budget | None = None) -> None:
-    """Print a run: its part, events, facts, budget and files; ``note``: one more fact."""
+    """Print the result of a run: part, events, facts, budget and files; ``note``: an additional line."""
     console = Console()
     if result.errors.rms.size:
         console.print(table(result))

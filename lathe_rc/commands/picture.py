@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of an option ``--figure``."""
+"""Image file of an option ``--figure``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 def check_place(path: Path) -> None:
-    """Refuse before anything is computed.
+    """Check before any computation that an image file can be written.
 
     Raises:
-        InputError: no picture can be written there.
+        InputError: no image can be written to the path.
     """
     if path.suffix.lower() != ".png":
         raise InputError(f"--figure {path}; allowed: a file name that ends in .png")
@@ -23,10 +23,10 @@ def check_place(path: Path) -> None:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure.
+    """Write a figure to a file.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         figure.savefig(path, dpi=130)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form error of a run by revolution, drawn in the terminal."""
+"""Terminal plot of the form error by revolution."""
 
 import math
 
@@ -17,18 +17,18 @@ _STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}
 
 
 def show(result: harness.Result, console: Console) -> None:
-    """Draw the plot in a terminal that can show it; not in a pipe or a file."""
+    """Print the plot to a terminal that can display it, but not to a pipe or a file."""
     seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
     if seen and (text := drawn(result, console.width)):
         console.print(text)
 
 
 def drawn(result: harness.Result, width: int) -> Text | None:
-    """The plot, a line of names above it; None if there are no two revolutions.
+    """Return the plot with a legend line above it; None if there are fewer than two revolutions.
 
     Args:
-        result: of the run.
-        width: [characters].
+        result: result of the run.
+        width: width of the plot [characters].
     """
     import plotext  # takes a while, and many look at no plot
 
@@ -64,6 +64,6 @@ def drawn(result: harness.Result, width: int) -> Text | None:
 
 
 def _decades(low: float, high: float) -> list[int]:
-    """Powers of ten from below to above."""
+    """Return the exponents of the powers of ten that enclose the values."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     return list(range(first, max(last, first + 1) + 1))

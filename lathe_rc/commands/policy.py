@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe policy``: what SROS2 is to allow the nodes of a scenario."""
+"""Command ``lathe policy``: SROS2 permissions of the nodes of a scenario."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress of a run, a budget, a sweep or a tuning, shown on the error stream while it goes on."""
+"""Progress of a run, a budget, a sweep or a tuning on the error stream."""
 
 import time
 from collections import Counter
@@ -49,7 +49,7 @@ class Watch:
         self._bar.stop()
 
     def _log(self, event: harness.Event, now: float) -> None:
-        """Without a terminal, a line now and then."""
+        """Print a progress line at intervals if the output is no terminal."""
         if event["event"] == "compiling" and not self._compiles:
             self._compiles = True
             self._bar.console.print(f"compiling {len(event['nodes'])} stages, once on this machine: some 20 s")
@@ -59,7 +59,7 @@ class Watch:
             self._bar.console.print(f"revolution {event['cycle']:.0f}: {error}", highlight=False)
 
     def __call__(self, event: harness.Event) -> None:
-        """Take an event of the run."""
+        """Update the progress from an event of the run."""
         kind, update = event["event"], self._bar.update
         now = time.monotonic()
         if kind in TROUBLE and (text := TROUBLE[kind](event)):
@@ -99,7 +99,7 @@ class Watch:
 
 
 def watched_budget(scenario: Scenario) -> Budget:
-    """Return the budget of a scenario; the runs that it takes are counted while they go on."""
+    """Return the budget of a scenario, and show the number of finished runs meanwhile."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -108,14 +108,14 @@ def watched_budget(scenario: Scenario) -> Budget:
 
 
 class SweepWatch:
-    """Progress of a sweep or a tuning: cells, cells a second, time left, outcomes.
+    """Progress of a sweep or a tuning: cells, cells per second, remaining time, outcomes.
 
-    Ctrl-C ends the command with a line that says what is kept.
+    Ctrl-C ends the command with a line about the saved results.
 
     Args:
         place: folder of the results.
-        trials: of a tuning; 0: it is a sweep.
-        quiet: without lines and bar.
+        trials: number of trials of a tuning; 0 for a sweep.
+        quiet: whether to print neither lines nor a progress bar.
     """
 
     def __init__(self, place: Path, *, trials: int = 0, quiet: bool = False) -> None:
@@ -153,7 +153,7 @@ class SweepWatch:
             raise click.exceptions.Exit(_INTERRUPTED) from None
 
     def __call__(self, event: Mapping[str, Any]) -> None:
-        """Take an event of `lathe_rc.run_sweep` or `lathe_rc.tune`."""
+        """Update the progress from an event of `lathe_rc.run_sweep` or `lathe_rc.tune`."""
         update = self._bar.update
         if event["event"] == "began":
             self._cells, self._done = event["cells"], event["computed"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe record``: any topics into a bag."""
+"""Command ``lathe record``: record any topics into a bag."""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe reference``."""
+"""Command ``lathe reference``: reference of nodes, topics, messages and parameters."""
 
 import click
 

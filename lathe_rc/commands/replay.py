@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe replay``: the topics of a bag again, for whoever listens."""
+"""Command ``lathe replay``: publish the messages of a bag again."""
 
 import sys
 from pathlib import Path

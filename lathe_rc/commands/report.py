@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe report``: a recording as one HTML page."""
+"""Command ``lathe report``: HTML page of a recording."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe resim``: a recorded run again, behind the same spindle, as it was or with another controller."""
+"""Command ``lathe resim``: re-simulation of a recorded run behind its spindle, unchanged or with another controller."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ _UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": (
 
 
 def _table(found: Resimulation) -> Table:
-    """Recorded and re-simulated form error side by side."""
+    """Return a table of the recorded and the re-simulated form error."""
     positions = found.between_rms.size > 0
     columns = ("revolution", "recorded", "re-simulated", "ratio", *(["positions differ by"] if positions else []))
     table = tables.table(*columns, title="form error, RMS [µm]")
@@ -39,7 +39,7 @@ def _table(found: Resimulation) -> Table:
 
 
 def _drive_table(drive: Identified) -> Table:
-    """Identified parameters beside those of the scenario."""
+    """Return a table of the identified parameters and those of the scenario."""
     columns = ("parameter", "unit", "identified", "standard error", *(["scenario"] if drive.before else []))
     table = tables.table(*columns, title=f"{drive.node} from {drive.command} and {drive.position[0]}", left=2)
     for name in drive_fit.PARAMETERS:
@@ -60,7 +60,7 @@ def _drive_lines(drive: Identified) -> list[str]:
 
 
 def _drive_summary(drive: Identified) -> dict[str, Any]:
-    """Summary of a drive for JSON, in SI units."""
+    """Return the JSON summary of a drive, in SI units."""
     fit = drive.fit
     return {
         "node": drive.node,
@@ -90,7 +90,7 @@ def _topics(given: Sequence[str]) -> dict[str, str]:
 
 
 def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | None) -> tuple[list[Identified], str]:
-    """The drives of a bag without a scenario, and what is asked for beyond them."""
+    """Identify the drives of a bag without a scenario, and return them with the reason why it is not re-simulated."""
     with Source(bag) as source:
         recorded = Recorded(source, topics)
         recorded.check_names(["encoder", "tool", "coarse/command", "coarse/state"])
@@ -233,7 +233,7 @@ def _show(console: Console, found: Resimulation, output: Path | None) -> None:
 
 
 def _write_form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
-    """Write the tool's recorded position by angle."""
+    """Write the tool's recorded position over the angle."""
     with Source(bag) as source:
         found = identify.form(Recorded(source, topics))
     identify.write_form(path, found)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe run``: a scenario to its end."""
+"""Command ``lathe run``: run a scenario to its end."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe run``, once its arguments are known and all is imported."""
+"""Execution of ``lathe run`` after its arguments are parsed and its modules imported."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
 
 def watched(scenario: Scenario, **how: Any) -> harness.Result:
-    """Run a scenario and show its progress; the keywords are those of `lathe_rc.harness.run`."""
+    """Run a scenario with a progress display; the keywords are those of `lathe_rc.harness.run`."""
     with Watch(Console(stderr=True)) as watch:
         return harness.run(scenario, watch=watch, **how)
 
@@ -47,8 +47,8 @@ def run(
     """Run a scenario; the arguments are the options of `lathe_rc.commands.run`.
 
     Raises:
-        InputError: options that do not go together, or a scenario that cannot run.
-        LatheError: the run failed, or is not within the tolerance that is required.
+        InputError: options contradict each other, or the scenario cannot run.
+        LatheError: the run failed, or exceeds the required tolerance.
     """
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor)
     split = scenarios.split(loaded, groups)

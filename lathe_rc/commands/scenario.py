@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario of a command: how its argument and options are read."""
+"""Scenario of a command, read from its argument and options."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from lathe_rc.cell.scenario import Scenario
 def load(
     name: str, overrides: Sequence[str], *, revolutions: float | None = None, speed_factor: float | None = None
 ) -> Scenario:
-    """The scenario of a file, or of a name without ``.yaml`` that is looked up in ``config`` as well.
+    """Load a scenario from a file, or by a name without ``.yaml``, which is also searched in ``config``.
 
     Args:
-        name: of the scenario.
-        overrides: as of ``--set``.
-        revolutions: length of the run; None: as the scenario says.
-        speed_factor: pace of the run; None: as the scenario says.
+        name: file or name of the scenario.
+        overrides: values of ``--set``.
+        revolutions: length of the run; None: as in the scenario.
+        speed_factor: pace of the run; None: as in the scenario.
 
     Raises:
-        InputError: there is none, or it cannot be.
+        InputError: there is no such scenario, or it is not valid.
     """
     loaded = scenarios.load(name, overrides)
     asked = {"revolutions": revolutions, "speed_factor": speed_factor}
@@ -29,10 +29,10 @@ def load(
 
 
 def split(scenario: Scenario, groups: Sequence[str]) -> list[list[str]] | None:
-    """The nodes of each ``--group``; None if none is given: as the scenario says.
+    """Return the nodes of each ``--group``; None if the option is not given: as in the scenario.
 
     Raises:
-        InputError: a node that there is not, or twice.
+        InputError: a node is unknown, or named twice.
     """
     named = [group.split("+") for group in groups if group != "none"]
     scenario.processes(named, "--group")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command group ``lathe study``: one command a study."""
+"""Command group ``lathe study``: one command per study."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from lathe_rc.study import STUDIES, Result, Study, StudyParameters
 
 
 def _value(row: Row, text: str) -> object:
-    """The value that ``text`` gives a parameter: 1,2,3 is a list where one is wanted, and a text stands as it is."""
+    """Parse the string of a parameter: 1,2,3 for a list parameter; a string parameter takes it unchanged."""
 
     def scalar(part: str) -> Value:
         return part if row.type is str else ros_yaml.parse_value(part, f"--set {row.name}")
@@ -34,10 +34,10 @@ def _value(row: Row, text: str) -> object:
 
 
 def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
-    """The parameters of a study from ``PARAM=VALUE`` texts, applied in order.
+    """Return the parameters of a study from ``PARAM=VALUE`` strings, applied in order.
 
     Raises:
-        InputError: one line for the first that is refused.
+        InputError: a parameter or value is not allowed; the message names the first one in one line.
     """
     rows = study.parameters.rows()
     values: dict[str, object] = {}
@@ -60,7 +60,7 @@ def _save(study: Study[Any], result: Result, path: Path) -> None:
 
 
 class _StudyCommand(click.Command):
-    """Runs a study; its help lists the parameters."""
+    """Command that runs a study and lists its parameters in the help."""
 
     def __init__(self, name: str, subject: Study[Any]) -> None:
         self.subject = subject
@@ -83,7 +83,7 @@ class _StudyCommand(click.Command):
         return completers.beginning((f"{name}=" for name in self.subject.parameters.rows()), incomplete)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Append the parameters."""
+        """Append the parameters of the study to the help."""
         with formatter.section("Parameters"):
             formatter.write_dl(
                 [
@@ -108,10 +108,10 @@ class _StudyCommand(click.Command):
 
 
 class _Studies(click.Group):
-    """The studies of lathe_rc and of other packages; an unknown one is refused in one line."""
+    """Command group of the built-in and third-party studies; an unknown name is a one-line error."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete a name without importing its study, or an option."""
+        """Complete an option or the name of a study, without importing the study."""
         if not incomplete.startswith("-"):
             return completers.beginning(STUDIES, incomplete)
         return click.Command.shell_complete(self, ctx, incomplete)
@@ -121,22 +121,22 @@ class _Studies(click.Group):
         return list(STUDIES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a study; None if there is none.
+        """Return the command of a study; None if there is no such study.
 
         Raises:
-            InputError: a study of another package cannot be imported, or is none.
+            InputError: a third-party study cannot be imported, or is no study.
         """
         return _StudyCommand(cmd_name, STUDIES[cmd_name]) if cmd_name in STUDIES else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the studies with their subjects."""
+        """List the studies with their summaries in the help."""
         with formatter.section("Studies"):
             formatter.write_dl([(name, _summary(name)) for name in STUDIES])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Split off the name of a study.
+        """Split the arguments into the name of a study and the rest.
 
         Raises:
             InputError: there is no such study.
@@ -147,7 +147,7 @@ class _Studies(click.Group):
 
 
 def _summary(name: str) -> str:
-    """The subject of a study, and its package if it is not ours; a broken one does not hide the others."""
+    """Return the summary of a study, with its package if it is third-party; errors of its import are shown instead."""
     by = STUDIES.offered_by(name)
     try:
         about = STUDIES[name].doc

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe sweep``: variations of a scenario into a table, and what is in it."""
+"""Command ``lathe sweep``: compute variations of a scenario into a table, and show the table."""
 
 import json
 from collections.abc import Sequence
@@ -21,16 +21,16 @@ _BEST = 5  # cells that are shown
 
 
 def check_crew(scheduler: str | None, workers: int | None) -> None:
-    """Refuse workers of this machine beside those of a scheduler."""
+    """Reject local workers in combination with those of a scheduler."""
     if scheduler and workers:
         raise InputError("--workers with --scheduler; allowed: one of them: a scheduler has its own workers")
 
 
 class _Sweep(click.Group):
-    """``lathe sweep SCENARIO`` is short for ``lathe sweep run SCENARIO``."""
+    """Command group in which ``lathe sweep SCENARIO`` is short for ``lathe sweep run SCENARIO``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Add the name of the command that is left out."""
+        """Insert the omitted command name ``run``."""
         if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
             args = ["run", *args]
         return super().parse_args(ctx, args)
@@ -46,7 +46,7 @@ def sweep() -> None:
 
 
 def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
-    """Values by target, from texts ``TARGET=VALUE``."""
+    """Parse strings ``TARGET=VALUE`` into values by target."""
     found: dict[str, str] = {}
     for text in texts:
         target, equals, value = (part.strip() for part in text.partition("="))
@@ -61,7 +61,7 @@ def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
 def space_of(
     vary: Sequence[str], draw: Sequence[str], tie: Sequence[str], sample: str, seeds: int, cells: Path | None
 ) -> "lathe_rc.Space":
-    """The space that options name: with a sample, ranges without a count are part of it."""
+    """Return the space given by options; with a sample, ranges without a count belong to the sample."""
     from lathe_rc.sweep.space import Space, given
 
     varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
@@ -148,7 +148,7 @@ def run(
 
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
-    """The cells with the smallest largest error, and what was varied in them."""
+    """Return the cells with the smallest maximum error, with their varied parameters, errors and margin."""
     columns = ["cell", *found.folder.targets, "tool.max_error", "tool.rms_error", "margin"]
     table = found.table().select(columns).sort_by("tool.max_error")
     return [each for each in table.slice(0, _BEST).to_pylist() if each["tool.max_error"] is not None]

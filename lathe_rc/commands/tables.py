@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and lines for the terminal."""
+"""Tables and text lines for the terminal."""
 
 from typing import Any
 
@@ -10,23 +10,23 @@ from rich.text import Text
 
 
 def console() -> Console:
-    """Return the standard output: no colours by content, no markup, and no wrapped lines, so that paths stay whole."""
+    """Return a console for the standard output, without highlighting, markup and wrapped lines, which would cut paths."""
     return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
 def spread(whole: int, count: int = 10) -> list[int]:
-    """Return places from 0, the first and the last of all among them, denser at the beginning; at most ``count``."""
+    """Return at most ``count`` indices below ``whole``, including the first and the last, denser at the beginning."""
     return sorted({round(place) - 1 for place in np.geomspace(1, whole, count).tolist()})
 
 
 def table(*columns: str, title: str | None = None, left: int = 0, **options: Any) -> Table:
-    """Return a table without rows.
+    """Return an empty table with columns.
 
     Args:
-        columns: their headings.
-        title: above it.
-        left: so many columns are of text, the others of numbers, which end at the same place.
-        options: of each column, see `rich.table.Table.add_column`.
+        columns: headings of the columns.
+        title: title above the table.
+        left: number of leading text columns, aligned left; the others hold numbers, aligned right.
+        options: options of every column, see `rich.table.Table.add_column`.
     """
     made = Table(title=title, title_justify="left", show_edge=False, header_style="bold")
     for place, column in enumerate(columns):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe tune``: parameters of a scenario that meet goals best."""
+"""Command ``lathe tune``: search for the parameters of a scenario that meet goals best."""
 
 import json
 import math
@@ -160,7 +160,7 @@ def _show(tuning: "Tuning", picture: Path) -> None:
 
 
 def _best_table(tuning: "Tuning", start: "Trial", best: "Trial") -> "Table":
-    """Table of parameters and results: of the start, the best, and the formulas."""
+    """Return a table of parameters and results for the start, the best trial, and the formulas."""
     from lathe_rc.commands.tables import table
 
     def text(value: object) -> str:
@@ -182,7 +182,7 @@ def _best_table(tuning: "Tuning", start: "Trial", best: "Trial") -> "Table":
 
 
 def _results(tuning: "Tuning", trial: "Trial") -> dict[str, str]:
-    """Goals and margin of a trial, by their names."""
+    """Return the formatted goals and margin of a trial by name."""
     percentile = tuning.objectives.percentile
     which = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g} %"
     shown = {f"{name}{which}": value for name, value in tuning.goals_shown(trial).items()}
@@ -192,7 +192,7 @@ def _results(tuning: "Tuning", trial: "Trial") -> dict[str, str]:
 
 
 def _cost_of(start: "Trial", best: "Trial") -> str:
-    """The margin that the best costs, in a sentence."""
+    """Describe the difference in stability margin between the start and the best trial, in a sentence."""
     before, margin = start.score.margin, best.score.margin
     if math.isnan(before):
         return f"the best has {margin:.4g} of margin; the start was refused before it had one"
@@ -201,7 +201,7 @@ def _cost_of(start: "Trial", best: "Trial") -> str:
 
 
 def _history(tuning: "Tuning") -> str:
-    """Trials that were better than all before, in a line."""
+    """Return the successive improvements of the first goal as one line of text."""
     column = tuning.objectives.goals[0].column
     steps: dict[str, int] = {}
     for trial in tuning.improvements:
@@ -225,7 +225,7 @@ def _front_table(tuning: "Tuning") -> "Table":
 
 
 def _summary(tuning: "Tuning") -> dict[str, Any]:
-    """Summary of a tuning for JSON; in SI units, null for unknown numbers."""
+    """Return the JSON summary of a tuning, in SI units, with null for unknown numbers."""
 
     def summary(trial: "Trial | None") -> dict[str, Any] | None:
         if trial is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``lathe view``: a recorded run in Rerun."""
+"""Command ``lathe view``: show a recorded or live run in Rerun."""
 
 import json
 import tempfile
@@ -18,7 +18,7 @@ from lathe_rc.view.rerun_output import Viewer, end_viewer, require, viewer
 
 
 def _show(bag: Path, rate: float, shown: Viewer) -> None:
-    """Show a bag with Rerun's own program until it ends."""
+    """Show a bag in the Rerun viewer until the viewer ends."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name_of(bag)}.rrd"
         write(bag, file, rate=rate)
@@ -32,7 +32,7 @@ def _show(bag: Path, rate: float, shown: Viewer) -> None:
 
 
 def _live(values: Mapping[str, object], *, as_json: bool) -> None:
-    """Show what runs in this domain until Ctrl-C."""
+    """Show the live runs of this ROS domain until Ctrl-C."""
     from lathe_rc.nodes import rerun_bridge
 
     runs = rerun_bridge.run(values, ["--ros-args"])

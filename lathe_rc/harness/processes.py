@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a cell: their domain, start, events and end."""
+"""Processes of a cell: ROS domain, start, events and termination."""
 
 import contextlib
 import itertools
@@ -43,7 +43,7 @@ _numbers = itertools.count(os.getpid() * 37)
 
 
 def how_it_ended(event: Event) -> str:
-    """The description of a process that did not end by itself and in order, from its ``exit``."""
+    """Describe the abnormal end of a process, from its ``exit`` event."""
     code = event["code"]
     return f"{event['node']} " + (
         f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
@@ -51,12 +51,15 @@ def how_it_ended(event: Event) -> str:
 
 
 def ignore(event: Event) -> None:
-    """Watch nothing."""
+    """Ignore an event (default of ``watch``)."""
 
 
 @contextlib.contextmanager
 def free_domain(number: int | None = None) -> Iterator[int]:
-    """A ROS domain that no other program on this machine uses; ``number`` if it is given, and left alone then."""
+    """Reserve a ROS domain that no other program on this machine uses, or the given ``number``.
+
+    A given domain is yielded even if it is in use, since several cells may share it.
+    """
     from domain_coordinator import domain_id
     from domain_coordinator.impl import PORT_BASE
 
@@ -71,9 +74,10 @@ def free_domain(number: int | None = None) -> Iterator[int]:
 
 
 def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
-    """The scenario as its processes run it: with a recorder on ``bag``, and a spindle that waits for all members.
+    """Return the scenario for its processes: with a recorder on ``bag``, and a spindle that waits for all members.
 
-    With ``snapshots`` it makes those too, in that folder; what is not to be kept has none.
+    With ``snapshots``, the recorder also writes snapshots to that folder. Without ``keep``, the bag is temporary: it is
+    not compressed, and there are no snapshots.
     """
     nodes = dict(scenario.nodes)
     name, table = scenario.recorder
@@ -90,22 +94,23 @@ def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path 
 
 
 class Processes:
-    """The processes of a cell, from start to end; a context manager that leaves none behind.
+    """Processes of a cell from start to end, as a context manager that terminates all of them.
 
     Args:
-        scenario: with a recorder, as `with_recorder` makes it.
+        scenario: scenario with a recorder, as `with_recorder` returns it.
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of all nodes.
         start: see `run`.
-        prefix: words that run a command somewhere else, as those of ``ip netns exec``, by the first node of a process,
-            which is then an interpreter of its own.
+        prefix: command prefix by the first node of a process, such as ``ip netns exec NAME``; the process is then
+            spawned as a new interpreter.
 
     Attributes:
-        pids: process of each node.
+        pids: process ID by node.
         domain: the ROS domain in use.
-        refused: messages from outside the cell that the nodes refused, by sender; known when they have ended.
-        not_reached: events that the run was too short for, by node; the same.
+        refused: number of messages from outside the cell that the nodes rejected, by sender; complete when the nodes
+            have ended.
+        not_reached: scheduled events after the end of the run, by node; complete when the nodes have ended.
     """
 
     def __init__(
@@ -137,7 +142,7 @@ class Processes:
         self.domain = -1
 
     def __enter__(self) -> "Processes":
-        """Start them."""
+        """Start the processes."""
         try:
             self.domain = self._stack.enter_context(free_domain(self._wanted_domain))
             self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-log-")))
@@ -153,7 +158,7 @@ class Processes:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End them."""
+        """Terminate the processes."""
         self.stop()
 
     def _start(self, group: Sequence[str]) -> None:
@@ -185,13 +190,13 @@ class Processes:
         self._threads.append(listener)
 
     def _command(self, first: str, arguments: Sequence[str]) -> list[str]:
-        """The command that starts a process as an interpreter of its own; empty where it is to be forked."""
+        """Return the command that spawns a process as a new interpreter; empty if the process is forked."""
         prefix = self._prefix.get(first, ())
         words = [*prefix, *allowed_code.interpreter("lathe_rc.nodes.container"), *arguments]
         return words if prefix or self._fresh else []
 
     def _listen(self, name: str, line: socket.socket, child: Child) -> None:
-        """Turn a process's reports, and its end, into events."""
+        """Convert the reports and the exit of a process into events."""
         with line, line.makefile("r", encoding="utf-8") as reports:
             with contextlib.suppress(OSError):
                 for report in reports:
@@ -200,14 +205,14 @@ class Processes:
         self._say("exit", name, code=code)
 
     def _say(self, event: str, name: str, **values: object) -> None:
-        """An event of the harness's own, as nodes report theirs."""
+        """Queue an event of the harness, in the format of the nodes' events."""
         self._events.put({"event": event, "node": name, "monotonic_ns": time.monotonic_ns(), **values})
 
     def events(self, silence: float) -> Iterator[Event]:
-        """Events as they come.
+        """Yield the events of the cell as they arrive.
 
         Raises:
-            LatheError: nothing was heard for ``silence`` seconds.
+            LatheError: no event arrived for ``silence`` seconds.
         """
         heard = time.monotonic()
         while True:
@@ -244,11 +249,11 @@ class Processes:
 
     @property
     def _settling(self) -> float:
-        """How long a cell may take to its safe state without an event [s]."""
+        """Longest time without an event while the cell reaches its safe state [s]."""
         return _SETTLING + max(getattr(table, "restart_time", 0.0) for table in self._scenario.nodes.values())
 
     def _restarted(self, event: Event) -> bool:
-        """Start a process that was killed once more, if others can take the place of all its nodes."""
+        """Restart a killed process if all its nodes have a restart file, and return whether it was restarted."""
         name = event["node"]
         group = name.split("+")
         kept = all(getattr(self._scenario.nodes.get(node), "restart_file", "") for node in group)
@@ -263,7 +268,7 @@ class Processes:
         return True
 
     def _goes_on(self, name: str) -> bool:
-        """Whether the cell does something about the end of a node or process: it waits, and goes to its safe state."""
+        """Whether the cell handles the end of a node or process: its members wait, and then reach the safe state."""
         masters = set(self._scenario.masters)
         waits = all(self._scenario.nodes[master].window for master in masters)
         return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
@@ -274,26 +279,26 @@ class Processes:
 
     @property
     def _complete(self) -> bool:
-        """Whether all samples are in a bag that is closed: nothing can be lost any more."""
+        """Whether all samples are in a closed bag, so that no data can be lost any more."""
         return bool(self._newest.get("closed", {}).get("complete"))
 
     @property
     def _all_leave(self) -> bool:
-        """Whether each node of the processes that still run has done its part or given up."""
+        """Whether every node of the running processes has finished or given up."""
         return bool(self._running) and all(node in self._left for name in self._running for node in name.split("+"))
 
     def _end_the_silent(self) -> None:
-        """Kill and name the processes that do not end by themselves though the run does not need them any more."""
+        """Kill and report the processes that do not end although the run no longer needs them."""
         for name in self._running:
             self._abandoned.add(name)
             self._say("stuck", name, place=self._place(name))
             self._children[name].kill()
 
     def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
-        """Wait for an event of a kind, from a node, with certain values.
+        """Wait for an event of a given kind, node and values.
 
         Raises:
-            LatheError: a process ended with a failure first.
+            LatheError: a process failed before the event.
         """
         for event in self.events(_SILENCE_LIMIT):
             wanted = {"event": kind, **values} | ({"node": node} if node else {})
@@ -309,7 +314,7 @@ class Processes:
             The last event of each kind.
 
         Raises:
-            LatheError: a node failed or was killed; says which.
+            LatheError: a node failed or was killed; the message names it.
         """
         for event in self.events(_SILENCE_LIMIT):
             watch(event)
@@ -323,7 +328,7 @@ class Processes:
         return self._newest
 
     def _raise_failure(self, event: Event) -> None:
-        """Raise what went wrong first; nodes that gave up because of another ("abandoned") are no cause."""
+        """Raise the error for the first failure; nodes that gave up because of another ("abandoned") are ignored."""
         node = event["node"]
         if event["event"] == "abandoned":
             self._is_no_cause(node)
@@ -341,18 +346,18 @@ class Processes:
             self._lose(node, self._end_of(node, event["code"]))
 
     def _is_no_cause(self, node: str) -> None:
-        """The end of the process of a node needs no other explanation."""
+        """Mark the end of a node's process as explained, so that it is not reported as a failure."""
         self._abandoned.update(name for name in self._children if node in name.split("+"))
 
     def _lose(self, name: str, why: str, error: type[LatheError] = LatheError) -> None:
-        """Raise why a node or process has ended, or keep it until the time master says how the cell went on."""
+        """Raise the reason why a node or process ended, or store it until the time master reports the reaction."""
         if not self._goes_on(name):
             self._hear_of_the_dead()
             raise error(self._with_the_lost(why))
         self._lost.append((name, why))
 
     def _hear_of_the_dead(self) -> None:
-        """Learn how those processes ended whose death the cell has noticed before their end was told here."""
+        """Collect the exit reasons of dead processes that the time master has reported before their ``exit`` event."""
         for name in self._running:
             if self._restarts[name] or not self._dead & {absolute(self._namespace, node) for node in name.split("+")}:
                 continue
@@ -360,32 +365,32 @@ class Processes:
                 self._lost.append((name, self._end_of(name, self._children[name].wait(timeout=_GRACE))))
 
     def _end_of(self, name: str, code: int) -> str:
-        """How a process has ended, and where it says why."""
+        """Describe the end of a process, with the place of a crash or the last line of its log."""
         return f"{how_it_ended({'node': name, 'code': code})}{self._crash(name) if code < 0 else self._tail(name)}"
 
     def _with_the_lost(self, message: str) -> str:
-        """A message after what became of nodes, as far as it does not say that itself."""
+        """Prepend the reasons of lost nodes to a message, unless it contains them already."""
         further = [why for name, why in self._lost if why.removeprefix(f"{name}: ") not in message]
         return "; ".join([*further, message])
 
     def _log(self, name: str) -> list[str]:
-        """The lines that a process has written."""
+        """Return the lines of a process's log."""
         log = self._folder / f"{name.split('+', maxsplit=1)[0]}.log"
         return log.read_text(encoding="utf-8", errors="replace").strip().splitlines() if log.exists() else []
 
     def _tail(self, name: str) -> str:
-        """The last line of a process's log."""
+        """Return the last line of a process's log."""
         lines = self._log(name)
         return f": {lines[-1].strip()}" if lines else ""
 
     def _crash(self, name: str) -> str:
-        """Where a library has crashed, if one has: the innermost call that `faulthandler` has written."""
+        """Return the innermost call of a crash in a library, as written by `faulthandler`; empty: no crash."""
         lines = self._log(name)
         start = next((place for place, line in enumerate(lines) if line.startswith("Current thread")), len(lines))
         return f" in {lines[start + 1].strip()}" if start + 1 < len(lines) else ""
 
     def _place(self, name: str) -> str:
-        """Where a process is that says nothing, by its innermost call."""
+        """Return the innermost call of an unresponsive process."""
         child, before = self._children[name], len(self._log(name))
         with contextlib.suppress(ProcessLookupError):
             child.send_signal(signal.SIGUSR1)
@@ -401,7 +406,7 @@ class Processes:
         return "".join(f"; {name}{self._tail(name)}" for name in self._children)
 
     def stop(self) -> None:
-        """End every process: in order if it listens, by SIGKILL if it does not."""
+        """Stop every process: by SIGTERM, or by SIGKILL if it does not end in time."""
         for number in (signal.SIGCONT, signal.SIGTERM):
             for child in self._children.values():
                 if child.poll() is None:

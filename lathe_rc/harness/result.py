@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a run."""
+"""Result of a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -28,24 +28,25 @@ Mode = Literal["offline", "composed", "processes"]
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """The result of a run.
+    """Result of a run.
 
     Attributes:
-        scenario: what ran.
-        mode: the host.
-        samples: length of the run.
-        wall_s: from block 0 to the last block computed and recorded by every member [s].
-        bag: where it is recorded; None if it was not to be kept, or in snapshots alone.
+        scenario: the scenario of the run.
+        mode: host of the run.
+        samples: number of samples.
+        wall_s: wall time from block 0 until the last block is computed and recorded by every member [s].
+        bag: path of the bag; None if nothing or only snapshots were recorded.
         snapshots: bags of parts of the run, see `lathe_rc.bag.writing.snapshots`.
-        recording: all signals.
-        refused: messages from outside the cell that the nodes refused, by sender.
-        not_reached: events that the run was too short for, by node.
-        unchecked: what the check before the start could not see, since laws or drives of others do not tell it.
-        warnings: doubts about parameters that can be meant, and what makes the form worse than the laws can do, with
-            its cure, as the check before the start found them.
+        recording: all signals of the run.
+        refused: number of messages from outside the cell that the nodes rejected, by sender.
+        not_reached: scheduled events after the end of the run, by node.
+        unchecked: properties that the check before the start could not verify, because third-party laws or drives do
+            not declare them.
+        warnings: suspicious but allowed parameters, and settings that make the form error larger than necessary, each
+            with a remedy, from the check before the start.
         margins: stability margin by learning controller, 1 less the largest factor of a cycle over all frequencies
-            and speeds (sup|Q - γZ| of repetitive control) [1]; None of a law that tells no factor.
-        lateness: of the blocks; None if there was no pace to keep, as offline or with a ``speed_factor`` of 0.
+            and speeds (sup|Q - γZ| of repetitive control) [1]; None for a law without a factor.
+        lateness: lateness of the blocks; None if the run had no pace, as offline or with a ``speed_factor`` of 0.
 
     Example:
         >>> import lathe_rc
@@ -76,12 +77,12 @@ class Result:
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
-        """The scenario and the result, in a line."""
+        """Return the scenario and its result in one line."""
         bag = f"bag {self.bag}" if self.bag else "no bag"
         return f"<Result of {self.scenario.name}: {', '.join([self.mode, *self.errors.told(), bag])}>"
 
     def _repr_html_(self) -> str:
-        """The same as a table with the form error by revolution, for notebooks."""
+        """Return the result as an HTML table with the form error by revolution, for notebooks."""
         count, *errors = self.recording.errors.told()
         rows = [("scenario", self.scenario.name), ("host", self.mode)]
         rows += [("length", f"{self.simulated_s:.4g} s, {count}")]
@@ -90,25 +91,25 @@ class Result:
         return html.table((), rows) + self.recording.errors_picture()
 
     def frame(self, topic: str) -> Any:
-        """A topic as a table: a row a sample, or a message; see `lathe_rc.cell.recording.Recording.frame`."""
+        """Return a topic as a table with one row per sample or message (`lathe_rc.cell.recording.Recording.frame`)."""
         return self.recording.frame(topic)
 
     def plot(self, title: str | None = None) -> "Figure":
-        """Desired form, form error over angle, form error by revolution; see `lathe_rc.drawing.form.draw`.
+        """Plot the desired form, the form error over the angle and by revolution (`lathe_rc.drawing.form.draw`).
 
         Args:
-            title: of the figure; None: the scenario's name.
+            title: title of the figure; None: the scenario's name.
         """
         return self.recording.plot(self.scenario.name if title is None else title)
 
     @property
     def blocks(self) -> int:
-        """Blocks that the spindle sent."""
+        """Number of blocks that the spindle sent."""
         return -(-self.samples // self.scenario.shared.block_size)
 
     @property
     def dropped(self) -> int:
-        """Blocks that some member lost: none, since a run that loses any ends in a LossyRunError."""
+        """Number of blocks lost by any member: always 0, since a run with losses raises LossyRunError."""
         return 0
 
     @property
@@ -118,32 +119,32 @@ class Result:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over wall time."""
+        """Ratio of simulated to wall time."""
         return self.simulated_s / self.wall_s
 
     @property
     def errors(self) -> FormErrors:
-        """Form error by revolution; of no revolution if the scenario has no tool."""
+        """Form error by revolution; without revolutions if the scenario has no tool."""
         return self.recording.errors
 
     @cached_property
     def part(self) -> Measurement:
-        """The part as the workshop measures it; see `lathe_rc.part`."""
+        """Workshop measurements of the part (`lathe_rc.part`)."""
         return part.measured(self.recording)
 
     @property
     def verdict(self) -> Verdict | None:
-        """Whether the part is in tolerance; None if the scenario's tool has no ``tolerance``."""
+        """Whether the part is within tolerance; None if the scenario's tool has no ``tolerance``."""
         return part.verdict(self.scenario, self.recording)
 
     @property
     def growth(self) -> Growth | None:
-        """The growth of a form error that diverges, or grows otherwise; None if it does not."""
+        """Growth of a diverging or otherwise growing form error; None if it does not grow."""
         return part.error_growth(self.recording)
 
     @cached_property
     def surface(self) -> Lay | str | None:
-        """The surface along the part, or why there is none; None: the scenario has no tool with a `nose_radius`."""
+        """Surface along the part, or the reason for its absence; None: no tool of the scenario has a `nose_radius`."""
         tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
         radius = next((table.nose_radius for table in tools if table.nose_radius), 0.0)
         if not radius or not self.errors.rms.size:
@@ -164,7 +165,7 @@ class Result:
         return entries(self.recording)
 
     def summary(self) -> dict[str, object]:
-        """The output of ``lathe run --json``."""
+        """Return the output of ``lathe run --json``."""
         errors, step, verdict, growth = self.errors, self.scenario.shared.step, self.verdict, self.growth
 
         def of(revolution: int) -> dict[str, Any] | None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run, in any host, from the checks to the bag.
+"""Run of one scenario in any host, from the checks to the bag.
 
-What writes and reads bags is imported where there is one: a run without a bag does not wait for that.
+The modules that write and read bags are imported only when a bag is requested, so other runs start faster.
 """
 
 import contextlib
@@ -41,23 +41,23 @@ def run(
     """Run a scenario to its end.
 
     Args:
-        scenario: what to run; its spindle must have a number of revolutions.
+        scenario: the scenario to run; its spindle must have a number of revolutions.
         mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
-            a process.
-        groups: nodes that share a process, for ``processes``, the others have their own; None: as the scenario says.
-        bag: folder to record to; None: nothing is kept. Where the recorder's ``mode`` is ``snapshot``, their folder
-            is named after it, and the whole run is kept until its end alone.
+            a process of its own.
+        groups: nodes that share a process, for ``processes``; all other nodes have their own; None: as in the scenario.
+        bag: folder to record to; None: nothing is recorded. If the recorder's ``mode`` is ``snapshot``, the folder of
+            the snapshots is named after it, and the recording of the whole run is deleted at its end.
         watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
-            run's samples and step [s]: from then on nothing is refused.
+            number of samples and step [s]: after it, the run is no longer rejected.
         domain: ROS domain; None: a free one.
-        namespace: ROS namespace of the cell: two cells with one each can share a domain.
-        start: ``fork``: processes are copies of one that has imported what they need; ``spawn``: interpreters of
-            their own.
+        namespace: ROS namespace of the cell; cells with different namespaces can share a domain.
+        start: ``fork``: processes are forks of a server with preloaded imports; ``spawn``: each process is a new
+            interpreter.
 
     Raises:
-        InputError: the scenario cannot work, the run does not fit into memory, or the bag's folder exists or has no
-            folder to be made in.
-        LatheError: a node failed or was killed; the bag, if one was asked for, is readable.
+        InputError: the scenario is invalid, the run does not fit into memory, or the bag's folder exists or has no
+            parent folder.
+        LatheError: a node failed or was killed; a requested bag is still readable.
         LossyRunError: a free-running cell lost blocks.
 
     Example:
@@ -146,7 +146,7 @@ def _run(
 
 
 def _lateness(events: Mapping[str, Event]) -> Lateness | None:
-    """The pace, as the time master reports it."""
+    """Return the lateness of the blocks as reported by the time master."""
     if "pace" not in events:
         return None
     told = events["pace"]
@@ -155,17 +155,17 @@ def _lateness(events: Mapping[str, Event]) -> Lateness | None:
 
 
 def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
-    """The bag that keeps the whole run, if one does."""
+    """Return the bag of the whole run; None if only snapshots or nothing was recorded."""
     return None if scenario.recorder[1].mode == "snapshot" else bag
 
 
 def _bags_in(folder: Path | None) -> list[Path]:
-    """The snapshots in a folder, in the order of their triggers."""
+    """Return the snapshots in a folder, in the order of their triggers."""
     return sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
 
 
 class _Watcher:
-    """A sink that turns an offline run into the events of a cell of nodes."""
+    """Sink that converts an offline run into the events of a cell of nodes."""
 
     def __init__(self, watch: Callable[[Event], None]) -> None:
         self._watch = watch
@@ -173,7 +173,7 @@ class _Watcher:
     def chunk(
         self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, Sequence[Sparse]]
     ) -> None:
-        """See `lathe_rc.cell.engine.Sink`."""
+        """Report the progress of a chunk of samples (implements `lathe_rc.cell.engine.Sink`)."""
         for topic, found in sparse.items():
             for message in found:
                 if message.type == messages.LEARNING:
