@@ -10,7 +10,7 @@ from rich.text import Text
 
 
 def console() -> Console:
-    """Return a console for the standard output, without highlighting, markup and wrapped lines, which would cut paths."""
+    """Return a console for the standard output, without highlighting, markup and line wrapping, which splits paths."""
     return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps and tuning: many variations of a cell, computed by Dask, one row of a table each.
+"""Sweeps and tuning: many variations of a cell, computed by Dask, with one table row per cell.
 
-`space` defines the cells, `row` the row of one, `folder` the storage of the rows; `workers` computes them, `sweep` ties
-these together, and `tune` searches with them.
+`space` defines the cells, `row` the row of a cell, and `folder` the storage of the rows. `workers` computes the cells,
+`sweep` combines these modules, and `tune` runs a search with them.
 """
 
 __all__ = ["page"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derived parameters of a cell: formulas that tie them to other parameters."""
+"""Derived parameters of a cell, computed by formulas from other parameters."""
 
 import ast
 import math
@@ -17,7 +17,7 @@ _FUNCTIONS = {"sqrt": math.sqrt, "exp": math.exp, "log": math.log, "sin": math.s
 
 
 def _names(formula: str) -> set[str]:
-    """Return the targets that a formula names."""
+    """Return the parameter targets that occur in a formula."""
     try:
         tree = ast.parse(formula.strip(), mode="eval")
     except SyntaxError:
@@ -30,10 +30,10 @@ def _names(formula: str) -> set[str]:
 
 
 def ordered(ties: Mapping[str, str]) -> list[str]:
-    """Return the tied targets, each after those that it depends on.
+    """Return the derived parameters in the order of evaluation, each after the ones that it depends on.
 
     Raises:
-        InputError: the formulas depend on one another in a circle.
+        InputError: the formulas depend on one another in a cycle.
     """
     depends = {target: _names(formula) & ties.keys() for target, formula in ties.items()}
     try:
@@ -45,7 +45,7 @@ def ordered(ties: Mapping[str, str]) -> list[str]:
 
 
 class Formulas:
-    """Formulas of the tied parameters, parsed once for all cells of a space."""
+    """Formulas of the derived parameters, parsed once for all cells of a space."""
 
     def __init__(self, scenario: Scenario, ties: Mapping[str, str]) -> None:
         self._scenario, self._ties = scenario, {target: ties[target] for target in ordered(ties)}
@@ -57,10 +57,10 @@ class Formulas:
         self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
 
     def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
-        """Add the tied values to those of a cell, in place, and return them.
+        """Add the derived values to the values of a cell, in place, and return them.
 
         Raises:
-            InputError: a formula has no value.
+            InputError: a formula has no finite value.
         """
         for target, formula in self._ties.items():
             known: dict[str, Any] = {"pi": math.pi}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of parameters on a goal, from the rows of a sweep, and the yield: the share of cells within a limit.
+"""Effects of parameters on a goal, computed from the rows of a sweep, and the yield: the share of cells within a limit.
 
 With y the goal of the n cells that have one and the parameter's values in m bins b of n_b cells each,
 
@@ -31,15 +31,15 @@ _WIDE = 30.0  # ratio of the largest to the smallest value above which an axis i
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """A parameter and its values in the cells.
+    """Parameter of a sweep and its values in the cells.
 
     Attributes:
         name: target of the parameter.
         label: name with the unit.
-        values: values in the cells, shape (n,); of a text, its place in ``texts``; NaN where there is none.
-        log: whether it was varied on a log range.
-        texts: texts for the values 0, 1, ...; empty: the values are numbers.
-        tied: whether a formula gives the values.
+        values: values in the cells, shape (n,); for strings, the index into ``texts``; NaN where there is none.
+        log: whether the parameter was varied on a logarithmic range.
+        texts: strings for the values 0, 1, ...; empty for numeric values.
+        tied: whether the parameter is derived by a formula.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Axis:
 
     @property
     def distinct(self) -> Samples:
-        """Distinct values, ascending."""
+        """Distinct values in ascending order."""
         return np.unique(self.values[np.isfinite(self.values)])
 
 
@@ -60,8 +60,8 @@ class Bins:
     """Bins of the values of an axis.
 
     Attributes:
-        index: bin of each cell; -1 where the cell has no value.
-        low, mid, high: ends and middle of the bins.
+        index: bin index of each cell; -1 where the cell has no value.
+        low, mid, high: lower end, middle and upper end of each bin.
     """
 
     index: Index
@@ -76,15 +76,15 @@ class Bins:
 
 
 def is_wide(values: Samples) -> bool:
-    """Whether positive numbers span so wide a range that a logarithmic axis shows more."""
+    """Return whether positive numbers span such a wide range that a logarithmic axis is clearer."""
     known = values[np.isfinite(values)]
     return bool(known.size and known.min() > 0.0 and known.max() > _WIDE * known.min())
 
 
 def bins(axis: Axis, exact: int, most: int) -> Bins:
-    """Return one bin for each value if there are at most ``exact`` values, else ``most`` bins of equal width.
+    """Return one bin per distinct value if there are at most ``exact`` values, else ``most`` bins of equal width.
 
-    On a log range the widths of the logarithms are equal.
+    On a logarithmic range the bins have equal widths in the logarithm.
     """
     distinct = axis.distinct
     scaled = np.log(distinct) if axis.log else distinct
@@ -110,7 +110,10 @@ def bins(axis: Axis, exact: int, most: int) -> Bins:
 
 
 def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
-    """Whether the cells are all combinations of the values, each equally often, and every cell has a goal."""
+    """Return whether the cells form a complete grid.
+
+    In a complete grid every combination of the values is equally frequent, and every cell has a goal value.
+    """
     free = [axis for axis in axes if not axis.tied]
     if not free or not np.isfinite(goal).all() or not all(np.isfinite(axis.values).all() for axis in free):
         return False
@@ -123,18 +126,18 @@ def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
 
 
 def _quantile_bins(values: Samples, count: int) -> Index:
-    """Return bins of about equal numbers of cells; equal values share a bin."""
+    """Return quantile bins with about equal numbers of cells; equal values share a bin."""
     place = np.searchsorted(np.sort(values), values, side="left")
     return np.unique(place * count // values.size, return_inverse=True)[1].astype(np.int64)
 
 
 @dataclass(frozen=True)
 class Effect:
-    """The effect of a parameter on a goal.
+    """Effect of a parameter on a goal.
 
     Attributes:
-        share: share of the goal's variance that it explains by itself; None: too few cells, or a constant goal.
-        rank: Spearman's rank correlation, -1 to 1; None also for texts that have no order.
+        share: share of the goal's variance explained by the parameter alone; None: too few cells, or a constant goal.
+        rank: Spearman's rank correlation, -1 to 1; None also for strings without an order.
     """
 
     share: float | None
@@ -146,7 +149,7 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
 
     Args:
         axis: the parameter.
-        goal: goal of the cells, shape (n,); NaN where a cell has none.
+        goal: goal of each cell, shape (n,); NaN where a cell has none.
         exact: whether the cells are a complete grid, see `is_grid`.
     """
     known = np.isfinite(goal) & np.isfinite(axis.values)
@@ -173,12 +176,12 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
 
 @dataclass(frozen=True, eq=False)
 class Yield:
-    """Share of the cells that are within a limit of the goal.
+    """Yield of a sweep: share of the cells that are within a limit of the goal.
 
     Attributes:
-        goal: goal of the cells that have one, ascending.
-        cells: number of all cells; a failed cell is within no limit.
-        above: whether the goal should be large, not small.
+        goal: goal values of all cells that have one, ascending.
+        cells: number of all cells; a failed cell is never within a limit.
+        above: whether large goals are better than small ones.
     """
 
     goal: Samples
@@ -186,11 +189,11 @@ class Yield:
     above: bool = False
 
     def share(self, limit: float) -> float:
-        """Return the share of all cells whose goal is at most (if `above`, at least) a limit."""
+        """Return the share of all cells whose goal is at most (if `above`, at least) the limit."""
         return self._within(limit) / self.cells
 
     def interval(self, limit: float) -> tuple[float, float]:
-        """Return the 95 % confidence interval (Wilson) of the share, for cells that are a random sample."""
+        """Return the 95 % confidence interval (Wilson) of the share, provided that the cells are a random sample."""
         found = scipy.stats.binomtest(self._within(limit), self.cells).proportion_ci(0.95, method="wilson")
         return float(found.low), float(found.high)
 
@@ -200,14 +203,14 @@ class Yield:
         return int(np.searchsorted(self.goal, limit, side="right"))
 
     def point(self, share: float) -> float | None:
-        """Return the tightest limit that this share of all cells is within; None: too few cells have a goal."""
+        """Return the tightest limit met by a given share of all cells; None: too few cells have a goal value."""
         needed = int(np.ceil(share * self.cells - 1e-9))  # rounding must not ask for one cell more
         if not 0 < needed <= self.goal.size:
             return None
         return float(self.goal[self.goal.size - needed] if self.above else self.goal[needed - 1])
 
     def curve(self, most: int) -> tuple[Samples, Samples]:
-        """Return limits and shares of at most ``most`` points, the first and the last cell among them."""
+        """Return the yield curve: limits and shares at up to ``most`` points, including the first and last cell."""
         place = np.unique(np.linspace(0, self.goal.size - 1, min(most, self.goal.size)).round().astype(np.int64))
         kept = self.goal.size - place if self.above else place + 1
         return self.goal[place], kept / self.cells

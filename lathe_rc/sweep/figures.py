@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a sweep as Vega-Lite specifications, and the data sets that they share.
+"""Figures of a sweep as Vega-Lite specifications, and their shared data sets.
 
-Data sets: ``pair-I-J`` (I < J) has a row for each pair of bins of two axes, ``one-I`` for each bin of one axis, and
-``bins-I`` has the positions of the bins. In the rows, a and b are bins; n cells, of which d have a goal; m, s and l are
-the median, the smallest and the largest goal, p and q its 5 and 95 % points.
+Data sets: ``pair-I-J`` (I < J) has one row per pair of bins of two axes, ``one-I`` one row per bin of one axis, and
+``bins-I`` the positions of the bins. In the rows, a and b are bin indices; n is the number of cells, and d the number
+of cells with a goal value; m, s and l are the median, the smallest and the largest goal, p and q its 5 and 95 % points.
 """
 
 import math
@@ -31,14 +31,14 @@ _STATISTICS = {"m": "median", "s": "smallest", "l": "largest"}
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A goal by which cells are judged.
+    """Goal by which cells are ranked.
 
     Attributes:
         name: name of the column.
         label: name with the unit.
-        unit: unit of the values; empty: none.
-        values: values in the cells, shape (n,); NaN where there is none.
-        above: whether it should be large, not small.
+        unit: unit of the values; empty if there is none.
+        values: goal values of the cells, shape (n,); NaN where there is none.
+        above: whether large values are better than small ones.
     """
 
     name: str
@@ -49,32 +49,32 @@ class Goal:
 
     @property
     def log(self) -> bool:
-        """Whether its axes are logarithmic."""
+        """Whether the axes of the goal are logarithmic."""
         return is_wide(self.values)
 
     @property
     def scale(self) -> Spec:
-        """Scale of an axis of the goal."""
+        """Vega-Lite scale of the goal's axis."""
         return axis_scale(log=self.log)
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """Cells that have a goal, best first; equal ones in the order of the cells."""
+        """Indices of the cells with a goal value, best first; equal ones in the order of the cells."""
         known = np.flatnonzero(np.isfinite(self.values))
         return known[np.argsort(-self.values[known] if self.above else self.values[known], kind="stable")]
 
     def told(self, value: float) -> str:
-        """Format a value with the unit."""
+        """Format a value with its unit."""
         return f"{said(value)} {self.unit}".rstrip()
 
 
 def said(value: float) -> str:
-    """Format a number for readers."""
+    """Format a number with four significant digits."""
     return f"{value:.4g}"
 
 
 def effect_said(effect: Effect) -> tuple[str, str]:
-    """Format the share and the rank correlation of an effect; empty: there is none."""
+    """Format the share and the rank correlation of an effect; empty strings for missing values."""
     # Adding 0.0 turns -0.0 into 0.0: a value that rounds to 0 is shown without a sign.
     share = "" if effect.share is None else f"{round(effect.share, 3) + 0.0:.3f}"
     return share, "" if effect.rank is None else f"{round(effect.rank, 2) + 0.0:+.2f}"
@@ -84,7 +84,7 @@ def effect_said(effect: Effect) -> tuple[str, str]:
 
 
 def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: Index) -> Rows:
-    """Return statistics of the goal in each group of cells; a group without cells has no row."""
+    """Return statistics of the goal in each group of cells; empty groups are left out."""
     known = (group >= 0) & np.isfinite(goal)
     cells, done = (np.bincount(group[some], minlength=count) for some in (group >= 0, known))
     # One sort by group and goal gives all quantiles: group k has the places first[k] to first[k] + done[k] - 1.
@@ -102,7 +102,7 @@ def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: In
 
 
 def pair(first: Bins, second: Bins, goal: Samples) -> Rows:
-    """Return the data set of two axes."""
+    """Return the data set of a pair of axes."""
     group = np.where((first.index < 0) | (second.index < 0), -1, first.index * second.count + second.index)
     a, b = np.divmod(np.arange(first.count * second.count), second.count)
     return _grouped(group, a.size, goal, "msl", a=a, b=b)
@@ -114,7 +114,7 @@ def one(place: Bins, goal: Samples) -> Rows:
 
 
 def places(axis: Axis, found: Bins) -> Rows:
-    """Return positions and names of the bins of an axis."""
+    """Return the positions and names of an axis's bins."""
     index = np.arange(found.count)
     if axis.texts:
         return rows(i=index, t=list(axis.texts[: found.count]))
@@ -129,9 +129,10 @@ def places(axis: Axis, found: Bins) -> Rows:
 
 
 def _looked_up(place: int, axis: Axis, prefix: str, others: Sequence[int] = ()) -> Spec:
-    """Return the transform that looks up the positions of an axis's bins.
+    """Return the Vega-Lite transform that looks up the bin positions of an axis.
 
-    A data set of two axes has them in their order: the bin is ``a``, or ``b`` if one of the others comes before.
+    A data set of two axes has its bins in the order of the axes: the bin is ``a``, or ``b`` if one of the others
+    precedes.
     """
     fields = ["t"] if axis.texts else ["t", "x", "x0", "x1"]
     source = {"data": {"name": f"bins-{place}"}, "key": "i", "fields": fields}
@@ -144,13 +145,13 @@ def _named(axis: Axis, prefix: str) -> Spec:
 
 
 def _along(axis: Axis, found: Bins, field: str) -> Spec:
-    """Return the encoding of a numeric field, on an axis from the first to the last bin."""
+    """Return the encoding of a numeric field on an axis from the first to the last bin."""
     ends = [float(found.low[0]), float(found.high[-1])]
     return quantity(field, axis.label, scale=axis_scale(log=axis.log, ends=ends), axis=_AXIS)
 
 
 def _span(channel: str, axis: Axis, found: Bins) -> Spec:
-    """Return the encoding of a bin from its low to its high end."""
+    """Return the encoding of a bin from its lower to its upper end."""
     if axis.texts:
         return {channel: _named(axis, channel)}
     return {channel: _along(axis, found, f"{channel}x0"), f"{channel}2": {"field": f"{channel}x1"}}
@@ -162,7 +163,7 @@ def _tip(goal: Goal, **names: Axis) -> Rows:
 
 
 def _choice(what: str) -> Spec:
-    """Return the control by which readers choose a statistic of several cells."""
+    """Return the control for selecting a statistic of several cells."""
     choice = {"input": "select", "options": list(_STATISTICS), "labels": list(_STATISTICS.values()), "name": f"{what} "}
     return {"name": "shown", "value": "m", "bind": choice}
 
@@ -171,7 +172,7 @@ _CHOSEN = {"calculate": "datum[shown]", "as": "v"}
 
 
 def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal) -> Spec:
-    """Return the heat map of the goal over two parameters; fields without a goal are grey."""
+    """Return the heat map of the goal over two parameters; bins without a goal value are grey."""
     (x, x_bins), (y, y_bins) = axes[across], axes[up]
     where = {**_span("x", x, x_bins), **_span("y", y, y_bins), "tooltip": _tip(goal, xt=x, yt=y)}
     scale = {**goal.scale, "scheme": "viridis", "reverse": goal.above}
@@ -189,7 +190,10 @@ def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal
 
 
 def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goal: Goal) -> Spec:
-    """Return the goal over one parameter: a line for each value of another one, or the median with a band."""
+    """Return the line plot of the goal over one parameter.
+
+    It has one line per value of a second parameter, or without one the median with a band.
+    """
     x, x_bins = axes[across]
     place = _named(x, "x") if x.texts else _along(x, x_bins, "xx")
     known = {"filter": "datum.d > 0"}
@@ -236,7 +240,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
 
 
 def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
-    """Return bars of the share of the goal's variance that each parameter explains."""
+    """Return the bar chart of the goal's variance shares explained by each parameter."""
     texts = []
     for name, effect in zip(names, effects, strict=True):
         share, rank = effect_said(effect)
@@ -257,7 +261,7 @@ def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
 
 
 def cumulative(found: Yield, goal: Goal, tolerance: float | None) -> Spec:
-    """Return the curve of the share of cells within a limit, with the limits of 95 and 99 % of the cells."""
+    """Return the cumulative curve of cells within a limit, with the limits of 95 and 99 % of the cells."""
     limits, shares = found.curve(_POINTS)
     points = [(found.point(share), f"{share:.0%}", level) for share, level in zip(_SHARES, (0.32, 0.2), strict=True)]
     marks = [(limit, level, f"{name}: {goal.told(limit)}") for limit, name, level in points if limit is not None]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folder of a sweep: the varied cell, the requested spaces, and the rows as a Parquet data set.
 
-DIR/scenario.yaml    the cell, as it was given
+DIR/scenario.yaml    the cell, as given
 DIR/sweep.json       identity of the cell, measures, and the spaces or the request of a tuning
-DIR/rows/*.parquet   one row for each cell, see `lathe_rc.sweep.row`
+DIR/rows/*.parquet   one row per cell, see `lathe_rc.sweep.row`
 
-Each of these files has a checksum, which is compared when it is read; files of older versions have none.
+Each of these files has a checksum, which is verified on reading; files of older versions have none.
 """
 
 import io
@@ -39,7 +39,7 @@ _MOST = 2**30  # longest file of rows [B]
 
 @dataclass(frozen=True)
 class Request:
-    """Request of a tuning, see `lathe_rc.sweep.tune`; ``targets`` are the columns of its parameters."""
+    """Request of a tuning (`lathe_rc.sweep.tune`); ``targets`` are the columns of its parameters."""
 
     targets: list[str]
     free: dict[str, str | list[Value]]
@@ -55,7 +55,7 @@ class Request:
 
 @dataclass(frozen=True)
 class _Contents:
-    """Content of a sweep.json, see `Folder`."""
+    """Content of a sweep.json file, see `Folder`."""
 
     format: int
     name: str
@@ -66,7 +66,7 @@ class _Contents:
 
 
 class Folder:
-    """A sweep on disk.
+    """Sweep on disk.
 
     Args:
         path: folder of the sweep.
@@ -76,10 +76,10 @@ class Folder:
         scenario: the varied cell.
         measures: further columns of the rows.
         spaces: requested spaces, in order.
-        tuning: request of a tuning; None: the sweep is no tuning.
+        tuning: request of a tuning; None for a plain sweep.
 
     Raises:
-        InputError: the folder holds no sweep.
+        InputError: the folder is no folder of a sweep.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,10 +105,10 @@ class Folder:
         measures: Sequence[Measure],
         tuning: Request | None = None,
     ) -> "Folder":
-        """Open the sweep or the tuning of a folder, with one more space; a missing folder is made.
+        """Open the sweep or tuning in a folder, and add a space; a missing folder is created.
 
         Raises:
-            InputError: the folder holds something else.
+            InputError: the folder has other contents.
             LatheError: the folder cannot be written.
         """
         if not (path / _WRITING).exists():  # else another process has begun it just now
@@ -149,37 +149,37 @@ class Folder:
         return Folder(path)
 
     def locked(self, *, wait: bool = False) -> AbstractContextManager[None]:
-        """Keep other processes from computing into the folder.
+        """Lock the folder, so that no other process computes into it.
 
         Args:
-            wait: whether to wait for a process that does so already.
+            wait: whether to wait until another process releases the lock.
 
         Raises:
-            InputError: another process computes into the folder, and ``wait`` is false.
+            InputError: another process holds the lock, and ``wait`` is false.
         """
         return locked(self.path / "lock", wait=wait)
 
     @property
     def targets(self) -> list[str]:
-        """The parameters that differ between the cells."""
+        """Parameters that differ between the cells."""
         tuned = self.tuning.targets if self.tuning else ()
         named = [*tuned, *(target for space in self.spaces for target in space.targets())]
         return [target for target in dict.fromkeys(named) if target != "seed"]
 
     @property
     def schema(self) -> pa.Schema:
-        """Columns of the rows."""
+        """Arrow schema of the rows."""
         return row.schema(self.scenario, self.targets, self.measures)
 
     def keys(self) -> set[str]:
-        """Return the keys of the computed cells."""
+        """Return the keys of all computed cells."""
         return set(self._read(["key"]).column("key").to_pylist())
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows, in the order of the cells.
+        """Return the table of rows in cell order.
 
         Args:
-            columns: columns to read; None: all.
+            columns: columns to read; None: all columns.
         """
         found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
         for target in self.targets:
@@ -201,7 +201,7 @@ class Folder:
         return pa.concat_tables([whole, *(self._rows(path, columns) for path in paths)])
 
     def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
-        """Return the rows of a file."""
+        """Return the rows of one Parquet file."""
         content = pa.BufferReader(_read(path))
         try:
             names = pyarrow.parquet.read_schema(content).names
@@ -216,7 +216,7 @@ class Folder:
         """Return the row of a cell, by column.
 
         Raises:
-            InputError: there is no such cell, or it is not computed.
+            InputError: the cell does not exist, or is not computed yet.
         """
         found = self.table().filter(pyarrow.compute.field("cell") == number).to_pylist()
         if not found:
@@ -226,20 +226,20 @@ class Folder:
         return cast("dict[str, Any]", found[0])
 
     def values(self, number: int) -> dict[str, Value]:
-        """Return the varied values of a cell.
+        """Return the varied values of a cell, by target.
 
         Raises:
-            InputError: there is no such cell, or it is not computed.
+            InputError: the cell does not exist, or is not computed yet.
         """
         found = self.row(number)
         values = {target: found[target] for target in self.targets}
         return values if found["seed"] in (None, self.scenario.shared.seed) else {**values, "seed": found["seed"]}
 
     def write(self, rows: Sequence[pa.Table]) -> None:
-        """Add rows, as one file.
+        """Write rows as one additional Parquet file.
 
         Raises:
-            LatheError: the file cannot be written; the rows before are kept.
+            LatheError: the file cannot be written; existing rows are preserved.
         """
         place = self.path / "rows"
         # Several processes may compute a tuning: without the lock two could take the same number for their files.
@@ -250,9 +250,9 @@ class Folder:
 
 
 def _parquet(rows: pa.Table) -> bytes:
-    """Return a Parquet file with a checksum of the whole in its metadata.
+    """Return a Parquet file with a checksum of the complete file in its metadata.
 
-    Its pages have checksums of their own for other programs; these do not cover the rest of the file.
+    Its pages also have the standard checksums for other programs, which do not cover the rest of the file.
     """
     content = io.BytesIO()
     with pyarrow.parquet.ParquetWriter(content, rows.schema, compression="zstd", write_page_checksum=True) as writer:
@@ -272,7 +272,7 @@ def _contents(path: Path) -> _Contents:
 
 
 def _read(path: Path) -> bytes:
-    """Return the content of a file of a sweep.
+    """Return the content of a file of a sweep, after verifying its checksum.
 
     Raises:
         InputError: the file cannot be read, or is damaged.
@@ -288,7 +288,7 @@ def _read(path: Path) -> bytes:
 
 
 def _refuse_others(path: Path) -> None:
-    """Refuse a path that exists and is no folder of a sweep."""
+    """Reject an existing path that is no folder of a sweep."""
     if not os.path.lexists(path):
         return
     with _reading(path):
@@ -299,10 +299,10 @@ def _refuse_others(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    """Hold the lock of a file.
+    """Hold the lock of a file within the block.
 
     Raises:
-        InputError: the file cannot be made; without ``wait``: another process holds the lock.
+        InputError: the file cannot be created; without ``wait``: another process holds the lock.
     """
     lock = filelock.FileLock(path)
     with _reading(path):
@@ -318,7 +318,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Report an error of reading in one line."""
+    """Convert an error of reading into one line."""
     try:
         yield
     except OSError as error:
@@ -327,10 +327,10 @@ def _reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Report an error of writing to a folder in one line.
+    """Convert an error of writing to a folder into one line.
 
     Raises:
-        LatheError: an operation in the block has failed.
+        LatheError: an operation in the block failed.
     """
     try:
         yield

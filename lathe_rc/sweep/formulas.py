@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a cell by formulas, with which a search is compared.
+"""Parameters of a cell by closed-form rules, as a reference for a search.
 
 For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
 
@@ -52,11 +52,11 @@ _FAR = 2.0  # longest lead of the grid, in lags of the drive
 
 
 class Found(NamedTuple):
-    """Value of a parameter by a formula.
+    """Parameter value given by a formula.
 
     Attributes:
         value: value of the parameter.
-        formula: the formula in words.
+        formula: description of the formula.
     """
 
     value: float
@@ -64,12 +64,12 @@ class Found(NamedTuple):
 
 
 def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, Found]:
-    """Return the values by formulas of the parameters that have one.
+    """Return the values of all parameters that have a formula.
 
     Args:
-        scenario: the cell; parameters that are no targets keep its values.
-        targets: ``NODE.PARAM``.
-        margin: stability margin 1 - sup|Q - γZ| that learning has to keep.
+        scenario: the cell; parameters that are not in ``targets`` keep its values.
+        targets: parameters to be computed, ``NODE.PARAM``.
+        margin: required stability margin 1 - sup|Q - γZ| of learning.
     """
     cell = Cell(scenario.nodes)
     found: dict[str, Found] = {}
@@ -92,7 +92,7 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
         return _flat(loop, free, gain, margin)
 
     def factor(lead: float, q_time: float) -> float:
-        """Return sup|Q - γZ|; infinite where the memory cannot hold Q."""
+        """Return sup|Q - γZ|; infinite if the memory is too short for Q."""
         return loop.factor({"lead_time": lead, "q_time": q_time, "learning_gain": gain})
 
     found: dict[str, Found] = {}
@@ -119,7 +119,10 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
 
 
 def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict[str, Found]:
-    """Return the values for a flat Q; the lead is the lag of the drive where that allows such a Q, else as given."""
+    """Return the values for a flat Q.
+
+    The lead is the lag of the drive if such a Q exists with it, else the scenario's value.
+    """
     given = loop.stage.parameters
     assert isinstance(given, LearningControllerParameters), "it has a Q"
     stop, ripple = (None if name in free else getattr(given, name) for name in ("q_stop", "q_ripple"))
@@ -163,7 +166,7 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
 
 
 def _least(cost: Callable[[float], float], longest: float) -> float:
-    """Return the lead with the least cost."""
+    """Return the lead with the lowest cost."""
     # The cost may have several minima: a coarse grid finds the deepest one, and the bounded search refines it.
     leads = np.linspace(0.0, longest, _LEADS + 1)[1:]
     best = int(np.argmin([cost(float(lead)) for lead in leads]))
@@ -173,7 +176,7 @@ def _least(cost: Callable[[float], float], longest: float) -> float:
 
 
 def _shortest(factor: Callable[[float], float], margin: float) -> float:
-    """Return the shortest time of Q with which the factor is at most 1 - margin; `_NONE` if there is none."""
+    """Return the shortest Q time for which the factor is at most 1 - margin; `_NONE` if there is none."""
     longest = _LONGEST
     while factor(longest) > 1.0 - margin:  # also where the memory cannot hold Q
         longest /= 2.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figure of a tuning: its history or, of several goals, the trade-off between the first and the last."""
+"""Figure of a tuning: history of one goal, or the trade-off between the first and the last of several goals."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,10 @@ def _title(tuning: Tuning, column: str) -> str:
 
 
 def chart(tuning: Tuning) -> alt.LayerChart:
-    """Return the goal and the best so far over the trials; of several goals, the last one over the first."""
+    """Return the chart of a tuning.
+
+    For one goal it shows the goal and the best value so far over the trials, for several goals the last over the first.
+    """
     columns = [goal.column for goal in tuning.objectives.goals]
     front = {trial.number for trial in tuning.front}
     improvements = {trial.number for trial in tuning.improvements}
@@ -62,14 +65,14 @@ def chart(tuning: Tuning) -> alt.LayerChart:
 
 
 def _scale(rows: list[dict[str, Any]], name: str) -> alt.Scale:
-    """Return the scale of an axis: logarithmic, if all values are above 0 and span more than a decade."""
+    """Return the scale of an axis: logarithmic if all values are positive and span more than a decade."""
     values = [row[name] for row in rows if row[name] is not None]
     log = bool(values) and min(values) > 0.0 and max(values) > 10.0 * min(values)
     return alt.Scale(type="log") if log else alt.Scale(zero=False)
 
 
 def write(tuning: Tuning) -> Path:
-    """Write the figure to the tuning's folder: history.png, and an interactive history.html that needs no network.
+    """Write the figure into the tuning's folder: history.png, and an interactive history.html that works offline.
 
     Returns:
         The path of the PNG.

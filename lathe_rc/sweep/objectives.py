@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objectives of a tuning: goals, constraints, and the share of the cells that has to meet them.
+"""Objectives of a tuning: goals, constraints, and the percentile of the cells that counts.
 
-A goal is a column of a row (`lathe_rc.sweep.row`) to be minimised, or maximised with a minus before it. A constraint is
-a limit of a column. Of several cells (plants and spindles) the worst one or a percentile counts. A cell that was
-refused, diverged or failed has an infinite cost.
+A goal is a column of a row (`lathe_rc.sweep.row`) to be minimised, or to be maximised if a minus precedes it. A
+constraint is a limit of a column. With several cells (plants and spindles), the worst one or a percentile counts. A
+cell with the status refused, diverged or failed has an infinite cost.
 """
 
 import math
@@ -27,26 +27,26 @@ _CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
 
 
 class Goal(NamedTuple):
-    """Column of a row that is minimised, or maximised if ``largest``."""
+    """Goal of a tuning: a column that is minimised, or maximised if ``largest``."""
 
     column: str
     largest: bool
 
     @property
     def sign(self) -> float:
-        """Sign of the column in the cost, which is minimised."""
+        """Sign of the column in the cost; the cost is minimised."""
         return -1.0 if self.largest else 1.0
 
 
 class Constraint(NamedTuple):
-    """Limit of a column: a lower one if ``below``, else an upper one."""
+    """Constraint of a tuning: a lower limit of a column if ``below``, else an upper limit."""
 
     column: str
     below: bool
     bound: float
 
     def violation(self, value: float) -> float:
-        """Return how far a value is beyond the limit, relative to it; up to 0 if the value is within."""
+        """Return the violation relative to the limit; 0 or negative if the value is within the limit."""
         beyond = self.bound - value if self.below else value - self.bound
         return beyond / (abs(self.bound) or 1.0)
 
@@ -55,9 +55,9 @@ class Score(NamedTuple):
     """Score of the cells of a trial.
 
     Attributes:
-        costs: costs of the goals, less is better; infinite where a cell that counts has no value.
-        violations: violations of "the cell runs to its end" and of the constraints; up to 0 where they are met.
-        margin: margin (see `lathe_rc.sweep.row`) of the cell that counts; NaN: no cell learns.
+        costs: costs of the goals, to be minimised; infinite where a cell that counts has no value.
+        violations: violations of "the cell runs to its end" and of the constraints; 0 or negative where they are met.
+        margin: margin (see `lathe_rc.sweep.row`) of the cell that counts; NaN without a learning cell.
     """
 
     costs: tuple[float, ...]
@@ -75,10 +75,10 @@ class Objectives:
     """Objectives of a tuning.
 
     Attributes:
-        goals: one goal, or several to be traded off.
+        goals: one goal, or several for a Pareto front.
         constraints: limits that the trials have to meet.
         percentile: percentile of the cells that counts; 100: the worst.
-        measures: columns of goals and constraints beside those of all rows.
+        measures: further columns used by goals and constraints.
     """
 
     goals: Sequence[Goal]
@@ -88,7 +88,7 @@ class Objectives:
 
     @property
     def columns(self) -> list[str]:
-        """Columns from which a score is computed."""
+        """Columns needed to compute a score."""
         named = [goal.column for goal in self.goals] + [limit.column for limit in self.constraints]
         return list(dict.fromkeys(["status", "margin", *named]))
 
@@ -96,7 +96,7 @@ class Objectives:
         """Return the score of the cells of a trial.
 
         Args:
-            rows: rows of the cells with `columns`, one or more.
+            rows: rows of the trial's cells with `columns`, at least one.
         """
         cells = list(rows)
         costs = [self._counts(_cost(cell, goal) for cell in cells) for goal in self.goals]
@@ -107,7 +107,7 @@ class Objectives:
         return Score(tuple(costs), tuple(violations), margin)
 
     def _counts(self, values: Iterable[float]) -> float:
-        """Return the percentile of the cells' values, of which less is better."""
+        """Return the percentile of the cells' values, where smaller values are better."""
         # The inverted distribution returns one of the values: an interpolation between infinite ones would be NaN.
         return float(np.percentile(list(values), self.percentile, method="inverted_cdf"))
 
@@ -122,7 +122,7 @@ def _cost(cell: Mapping[str, Any], goal: Goal) -> float:
 
 
 def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
-    """Return how far a cell is from its end with a value of each goal: a refused cell by its negative margin."""
+    """Return the violation of completing the run with all goals; for an unstable refused cell, its negative margin."""
     if cell["status"] == row.DONE:
         return 0.0 if all(_known(cell[goal.column]) for goal in goals) else 1.0
     margin = cell["margin"]
@@ -130,7 +130,10 @@ def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
 
 
 def _violation(cell: Mapping[str, Any], limit: Constraint) -> float:
-    """Return the violation of a cell; a refused one may have a margin, and `_stops` judges the values that it lacks."""
+    """Return the violation of a constraint by one cell.
+
+    A refused cell may have a margin; other missing values of an incomplete cell are already covered by `_stops`.
+    """
     value = cell[limit.column]
     if _known(value):
         return limit.violation(value)
@@ -145,7 +148,7 @@ def objectives(
     measures: Sequence[str] = (),
     percentile: float = 100.0,
 ) -> Objectives:
-    """Parse the objectives.
+    """Parse the goals and constraints of a tuning.
 
     Args:
         scenario: scenario to be tuned.
@@ -155,7 +158,7 @@ def objectives(
         percentile: see `Objectives`.
 
     Raises:
-        InputError: no goal, no such column, or no limit.
+        InputError: there is no goal, a column is unknown, or a limit is missing.
     """
     if not goals:
         raise InputError(f"no goal; allowed: --goal COLUMN, of {', '.join(NUMBERS)} or TOPIC.FIELD:STATISTIC")

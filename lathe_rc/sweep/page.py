@@ -43,11 +43,11 @@ _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
 
 @dataclass(frozen=True)
 class Written:
-    """Files that `write` has written.
+    """Paths of the files written by `write`.
 
     Attributes:
-        page: the HTML file.
-        figures: the PNGs.
+        page: path of the HTML file.
+        figures: paths of the PNGs.
     """
 
     page: Path
@@ -55,14 +55,14 @@ class Written:
 
 
 def write(folder: Folder, goal: str = GOAL) -> Written:
-    """Write the page of a sweep into its folder, and its figures as PNGs; older ones are replaced.
+    """Write the page of a sweep into its folder, and its figures as PNGs; existing files are replaced.
 
     Args:
-        folder: folder of the sweep; the page shows the cells that are computed so far.
-        goal: column by which the cells are judged.
+        folder: folder of the sweep; the page shows the cells computed so far.
+        goal: column by which the cells are ranked.
 
     Raises:
-        InputError: no such goal.
+        InputError: there is no such goal.
         LatheError: the files cannot be written.
     """
     seen = PageData(folder, goal)
@@ -108,7 +108,7 @@ def _text(seen: PageData, drawn: Charts) -> str:
 
 
 def _nothing(seen: PageData) -> str:
-    """Return why nothing can be drawn; empty: something can."""
+    """Return the reason why nothing can be plotted; empty if there are results."""
     if not len(seen.cells):
         return "No cell is computed yet."
     if seen.goal.order.size:
@@ -120,7 +120,7 @@ def _nothing(seen: PageData) -> str:
 
 
 def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
-    """Yield the figures at the top of the page: name, value and mood."""
+    """Yield the key figures at the top of the page: name, value and CSS class."""
     yield "cells", str(len(seen.cells)), ""
     for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED):
         if count := seen.statuses[status]:
@@ -136,7 +136,7 @@ def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
 
 
 def _outcomes(seen: PageData) -> list[list[str]]:
-    """Return the outcomes of the cells: status, number, share, and the reason of the first such cell as an example."""
+    """Return one row per outcome of the cells: status, number, share, and the reason of one cell as an example."""
     # Reasons that differ only in their numbers are one outcome.
     groups: dict[tuple[str, str], list[int]] = {}
     statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
@@ -153,13 +153,13 @@ def _outcomes(seen: PageData) -> list[list[str]]:
 
 
 def _limits(seen: PageData) -> str:
-    """List the nodes that came to a limit, with the number of cells."""
+    """List the nodes that reached a limit, with the number of cells."""
     counts = Counter(name for text in seen.table.column("limits").to_pylist() if text for name in text.split(", "))
     return ", ".join(f"{name} in {count} cells" for name, count in counts.most_common())
 
 
 def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
-    """Return the template's sections for cells that have a goal, and add their figures."""
+    """Return the template's sections for cells with a goal value, and add their figures."""
     weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
     axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
     effects = {goal.name: _effects_on(goal, axes) for goal in seen.goals}
@@ -200,7 +200,7 @@ def _effects_on(goal: Goal, axes: Sequence[Axis]) -> list[Effect]:
 
 
 def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
-    """Sort key of parameters: largest effect first, tied parameters last."""
+    """Return the sort key of a parameter: largest effect first, derived parameters last."""
     share = -math.inf if found.share is None else found.share
     return axis.tied, -share, -abs(found.rank or 0.0)
 
@@ -211,7 +211,7 @@ def _told(found: Effect) -> str:
 
 
 def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
-    """Add maps and lines of the parameters with the largest effects; return which cells and values are in them."""
+    """Add heat maps and line plots of the parameters with the largest effects; return a note on cells and binning."""
     some = list(axes[:_MOST_AXES])
     free = [axis for axis in axes if not axis.tied]
     pairs = max(math.comb(len(some), 2), 1)
@@ -238,7 +238,7 @@ def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
 
 
 def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
-    """Add the parallel coordinates; return which cells are in them."""
+    """Add the parallel coordinates; return a note on the number of plotted cells."""
     some = list(axes[:_MOST_LINES])
     margin = next((goal for goal in seen.goals if goal.name == "margin" and goal is not seen.goal), None)
     if margin is not None and np.unique(margin.values[seen.goal.order]).size > 1:
@@ -268,7 +268,7 @@ def _best(seen: PageData) -> dict[str, Any]:
 
 
 def _yields(seen: PageData, done: Yield) -> Iterator[str]:
-    """Yield the sentences about the share of cells within limits."""
+    """Yield sentences about the share of cells within limits."""
     points = {share: done.point(share) for share in (0.95, 0.99)}
     for share, limit in points.items():
         if limit is not None:

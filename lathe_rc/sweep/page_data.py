@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data of a sweep's page: its parameters as axes, its goals, and the results of the cells."""
+"""Data for the page of a sweep: parameters as axes, goals, and the results of the cells."""
 
 from collections import Counter
 from functools import cached_property
@@ -28,18 +28,18 @@ class PageData:
 
     Args:
         folder: folder of the sweep.
-        goal: column by which the cells are judged.
+        goal: column by which the cells are ranked.
 
     Attributes:
         folder: see above.
-        goals: possible goals: columns that have a value in some cell.
+        goals: possible goals: columns with a value in at least one cell.
         goal: the chosen goal.
         axes: parameters that differ between the cells.
-        cells: numbers of the cells.
-        table: the rows, without the columns of all revolutions.
+        cells: numbers of the computed cells.
+        table: the rows, without the columns of values by revolution.
 
     Raises:
-        InputError: no such goal.
+        InputError: there is no such goal.
     """
 
     def __init__(self, folder: Folder, goal: str = GOAL) -> None:
@@ -86,7 +86,7 @@ class PageData:
         return Axis(target, target, values, texts=names, tied=tied)
 
     def _told(self, target: str) -> list[str]:
-        """Return how each space varies a target, in the words of the request."""
+        """Return the variation of a target in each space, in the notation of the request."""
         found: list[str] = []
         for space in self.folder.spaces:
             if (axis := space.grid.get(target)) is not None:
@@ -100,7 +100,7 @@ class PageData:
         return list(dict.fromkeys(found))
 
     def asked(self) -> list[list[str]]:
-        """Return a row for each target: label, request, lowest, highest, number of values, and the scenario's value."""
+        """Return one row per target: label, request, lowest, highest, number of values, and the scenario's value."""
         found = []
         axes = {axis.name: axis for axis in self.axes}
         for target in self.folder.targets:
@@ -125,12 +125,12 @@ class PageData:
 
     @property
     def is_sampled(self) -> bool:
-        """Whether all cells are points of a sample, so that their shares estimate those of the population."""
+        """Whether all cells are sample points, so that their shares are estimates for the population."""
         return all(space.sample and not space.grid and not space.given for space in self.folder.spaces)
 
     @property
     def tolerance(self) -> float | None:
-        """Tolerance of the form, in the unit of the goal; None: none is set, it is varied, or the goal is another."""
+        """Tolerance of the form error, in the unit of the goal; None: not set, varied, or of another goal."""
         scenario = self.folder.scenario
         if self.goal.name != GOAL or any(target.endswith(".tolerance") for target in self.folder.targets):
             return None
@@ -139,7 +139,7 @@ class PageData:
 
 
 def text_of(value: object) -> str:
-    """Format a value for the page."""
+    """Format a parameter value for the page."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

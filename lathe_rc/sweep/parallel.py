@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parallel coordinates as a Vega specification: a line for each cell, an axis with a brush for each parameter.
+"""Parallel coordinates as a Vega specification: one line per cell, and one axis with a brush per parameter.
 
-The axes lie one above the other, so that their names can be read on a narrow screen.
+The axes are stacked vertically, so that their names are legible on a narrow screen.
 """
 
 import json
@@ -28,11 +28,11 @@ _DECADES = 2.5  # length up to which a logarithmic axis has ticks within its dec
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """The figure, and the number of cells in it.
+    """Parallel-coordinates figure, and the number of cells in it.
 
     Attributes:
         spec: Vega specification.
-        lines: number of drawn cells.
+        lines: number of plotted cells.
         cells: number of cells with a value on every axis.
     """
 
@@ -42,9 +42,9 @@ class Drawn:
 
 
 def chosen(axes: Sequence[Axis], goal: Goal) -> tuple[NDArray[np.int64], int]:
-    """Return the cells to draw, best last, so that they lie on top, and the number of cells that could be drawn.
+    """Return the indices of the cells to plot, best last and thus on top, and the number of plottable cells.
 
-    Of too many cells the best are drawn, and others by lot.
+    If there are too many cells, the best ones and a random selection of the others are plotted.
     """
     whole = np.all([np.isfinite(axis.values) for axis in axes], axis=0)
     order = goal.order
@@ -57,7 +57,7 @@ def chosen(axes: Sequence[Axis], goal: Goal) -> tuple[NDArray[np.int64], int]:
 
 
 def _scaled(axis: Axis) -> tuple[Samples, float, float]:
-    """Return the values as they lie on the axis, and the ends of the axis."""
+    """Return the values in the scale of the axis, and the ends of the axis."""
     values = np.log10(axis.values) if axis.log else axis.values
     known = values[np.isfinite(values)]
     low, high = float(known.min()), float(known.max())
@@ -67,7 +67,7 @@ def _scaled(axis: Axis) -> tuple[Samples, float, float]:
 
 
 def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
-    """Return the ticks of an axis: places from 0 to 1, and labels."""
+    """Return the ticks of an axis: positions from 0 to 1, and labels."""
     if axis.texts:
         return [((place - low) / (high - low), text) for place, text in enumerate(axis.texts)]
     few = axis.distinct
@@ -82,9 +82,9 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
 
 
 def _brush(place: int) -> Spec:
-    """Return the signal of the brushed part of an axis, from 0 to 1; null: all of it.
+    """Return the Vega signal for the brushed interval of an axis, from 0 to 1; null for the entire axis.
 
-    The events are those of the view near the axis, not of a mark: a finger touches down without moving over a mark.
+    The signal uses events of the view near the axis, since touch events start without a pointer movement over a mark.
     """
     at, held = "clamp(x() / width, 0, 1)", f"brush_{place}"
     near = [f"abs(y() - {place * _GAP}) <= {_REACH}"]
@@ -104,7 +104,10 @@ def _brush(place: int) -> Spec:
 
 
 def _mark(kind: str, *, style: str = "", data: str = "", interactive: bool = False, **channels: object) -> Spec:
-    """Return a mark. In its channels a text after = is an expression, a mapping is Vega's, the rest is constant."""
+    """Return a Vega mark with the given channels.
+
+    A string that begins with = is an expression, a mapping is passed on to Vega, and other values are constants.
+    """
     encoded = {
         name: value
         if isinstance(value, dict)
@@ -118,7 +121,7 @@ def _mark(kind: str, *, style: str = "", data: str = "", interactive: bool = Fal
 
 
 def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
-    """Return the marks of an axis."""
+    """Return the Vega marks of an axis."""
     height, held, data = place * _GAP, f"brush_{place}", f"ticks_{place}"
     across = "=datum.u * width"
     label: dict[str, Any] = {"x": across, "y": height + 17, "align": "center", "text": {"field": "t"}}
@@ -143,7 +146,7 @@ def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> Dr
 
     Args:
         axes: axes from top to bottom.
-        goal: goal that colours the lines.
+        goal: goal that sets the colour of the lines.
         numbers: numbers of the cells, shape (n,).
     """
     cells, known = chosen(axes, goal)

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Row of a cell in the table of a sweep.
+"""Table row of one cell of a sweep.
 
 | column | content |
 |---|---|
 | cell | number within the sweep |
-| key | identity of the cell: a hash of the whole scenario and of the measures |
-| status, reason | done; refused by the check before the start; diverged; failed during the run: and why |
+| key | identity of the cell: a hash of the scenario and of the measures |
+| status, reason | done; refused by the check before the start; diverged; failed during the run; and the reason |
 | NODE.PARAM | parameters that differ between the cells |
 | tool.max_error, tool.rms_error | largest and RMS form error of the last revolution [m] |
-| tool.first_max_error, tool.first_rms_error | those of the first [m] |
-| tool.max_errors, tool.rms_errors | those of each revolution [m] |
-| tool.in_tolerance_from | first revolution from which on the largest error is within `tool.tolerance`; none if never |
+| tool.first_max_error, tool.first_rms_error | largest and RMS form error of the first revolution [m] |
+| tool.max_errors, tool.rms_errors | largest and RMS form error of each revolution [m] |
+| tool.in_tolerance_from | first revolution from which the largest error stays within `tool.tolerance`, or none |
 | margin | 1 less the largest factor of a cycle over all frequencies (sup|Q - γZ|): below 0 learning diverges |
-| limits | nodes that came to a limit of a command or a stroke |
+| limits | nodes that reached a limit of a command or a stroke |
 | TOPIC.FIELD:STATISTIC | a measure of the last revolution |
 | revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
 | seed, version, digest | seed of the random parts; version of lathe_rc; see `digest` |
@@ -77,7 +77,7 @@ _TAIL = {
 
 
 class Measure(NamedTuple):
-    """Statistic of a field of a topic over the last revolution."""
+    """Measure of a run: a statistic of a topic's field over the last revolution."""
 
     topic: str
     field: str
@@ -85,7 +85,7 @@ class Measure(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the column."""
+        """Name of the measure's column."""
         return f"{self.topic}.{self.field}:{self.statistic}"
 
 
@@ -93,7 +93,7 @@ def measure(text: str, scenario: Scenario) -> Measure:
     """Parse a measure ``TOPIC.FIELD:STATISTIC``.
 
     Raises:
-        InputError: the scenario has no such topic, the topic no such field, or there is no such statistic.
+        InputError: the topic, the field or the statistic is unknown.
     """
     place, colon, statistic = text.partition(":")
     topic, dot, field = place.removeprefix("/").rpartition(".")
@@ -111,7 +111,7 @@ def measure(text: str, scenario: Scenario) -> Measure:
 
 
 def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
-    """Return the columns of the rows of a sweep."""
+    """Return the Arrow schema of the rows of a sweep."""
     columns = dict(HEAD)
     for target in targets:
         row = scenario.parameter(target)
@@ -121,7 +121,7 @@ def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measur
 
 
 class _Keeper(Errors):
-    """Keeps the form error, the nodes that came to a limit, and the measured signals of a run."""
+    """Sink that collects the form error, the limited nodes, and the measured signals of a run."""
 
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         super().__init__(cell, samples)
@@ -135,7 +135,7 @@ class _Keeper(Errors):
         self._hash = xxhash.xxh3_128()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a chunk of samples from the engine (`lathe_rc.cell.engine.Sink`)."""
+        """Collect a chunk of samples (implements `lathe_rc.cell.engine.Sink`)."""
         super().chunk(first, samples, dense, sparse)
         for topic, said in sparse.items():
             if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
@@ -149,7 +149,7 @@ class _Keeper(Errors):
             kept[first : first + samples] = dense[asked.topic][asked.field]
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
-        """Return the columns of a cell that ran to its end."""
+        """Return the result columns of a completed run."""
         starts = (errors if self._tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
         found: dict[str, Any] = {
@@ -168,10 +168,10 @@ class _Keeper(Errors):
 
 
 def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
-    """Return the digest of a recording, which equals that of the cell's row if the bits are equal.
+    """Return the digest of a recording; it equals the digest in the cell's row for bit-identical results.
 
-    XXH3 (128 bits) of all samples of the form error, little-endian; of a cell without a tool, of the measured signals;
-    None where there is neither. It takes a twentieth of the time of SHA-256.
+    It is XXH3 (128 bits) of all samples of the form error, little-endian; for a cell without a tool, of the measured
+    signals; None if there are neither. It takes 5 % of the time of SHA-256.
     """
     if messages.TOOL in (recording.types[topic] for topic in recording.dense):
         return _digest([recording.of_type(messages.TOOL)["error"]])
@@ -200,14 +200,14 @@ def compute(
     measures: Sequence[Measure],
     bench: CellRunner | None = None,
 ) -> dict[str, Any]:
-    """Run a cell and return its row without number and key; an error of the cell becomes its status and reason.
+    """Run a cell and return its row without number and key; an error is stored as the row's status and reason.
 
     Args:
         base: the varied scenario.
         values: the cell's values, by target.
-        targets: targets that are columns.
+        targets: varied parameters that have columns.
         measures: further columns.
-        bench: runner that cells of one kind share; None: a new one.
+        bench: runner shared by similar cells; None: a new one.
     """
     start = time.perf_counter()
     row: dict[str, Any] = {"status": DONE, "version": revision()}
@@ -235,9 +235,9 @@ def compute(
 
 @cache
 def revision() -> str:
-    """Return version and, in a checkout, commit of lathe_rc.
+    """Return the version and, in a checkout, the commit of lathe_rc, such as ``0.1.0`` or ``0.1.0+93c5a79``.
 
-    Such as ``0.1.0`` or ``0.1.0+93c5a79``; ``-dirty`` follows where files differ from the commit.
+    The suffix ``-dirty`` marks files that differ from the commit.
     """
     folder = Path(__file__).parents[2]
     if (folder / ".git").exists():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search space of a tuning: ranges and lists of parameters, as distributions of Optuna."""
+"""Search space of a tuning: parameter ranges and lists as Optuna distributions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
@@ -14,11 +14,11 @@ from lathe_rc.sweep.space import axis, canonical, number
 
 
 class Dimension(NamedTuple):
-    """A free parameter of a search.
+    """Free parameter of a search.
 
     Attributes:
-        distribution: distribution of Optuna.
-        choices: values of a list, by the texts that stand for them in Optuna; None: a range.
+        distribution: Optuna distribution.
+        choices: values of a list, by their string representations in Optuna; None for a range.
     """
 
     distribution: CategoricalDistribution | FloatDistribution | IntDistribution
@@ -32,7 +32,7 @@ class Dimension(NamedTuple):
         return [self.distribution.low, self.distribution.high]
 
     def value(self, encoded: Any) -> Value:
-        """Decode a value that Optuna has drawn."""
+        """Decode a value drawn by Optuna."""
         return cast("Value", encoded) if self.choices is None else self.choices[encoded]
 
     def encoded(self, value: Value) -> Any:
@@ -40,7 +40,7 @@ class Dimension(NamedTuple):
         return value if self.choices is None else _text(value)
 
     def suggest(self, trial: Trial, target: str) -> None:
-        """Draw a value for a trial that has none yet."""
+        """Draw the parameter's value for a trial, unless it has one already."""
         found = self.distribution
         if isinstance(found, CategoricalDistribution):
             trial.suggest_categorical(target, found.choices)
@@ -50,7 +50,7 @@ class Dimension(NamedTuple):
             trial.suggest_float(target, found.low, found.high, log=found.log)
 
     def contains(self, value: Value) -> bool:
-        """Whether a value is in the range or list."""
+        """Return whether a value is in the range or list."""
         if self.choices is not None:
             return _text(value) in self.choices
         low, high = cast("list[float]", self.ends)
@@ -62,14 +62,14 @@ def _text(value: Value) -> str:
 
 
 def search_space(scenario: Scenario, free: Mapping[str, str | Sequence[Value]]) -> dict[str, Dimension]:
-    """Parse the free parameters of a scenario, by target.
+    """Parse the free parameters of a scenario into dimensions, by target.
 
     Args:
-        scenario: scenario whose own values are the start.
+        scenario: scenario whose own values are the start of the search.
         free: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
 
     Raises:
-        InputError: a range or list is none of this parameter, or does not contain the start.
+        InputError: a range or list is invalid for its parameter, or does not contain the start.
     """
     if not free:
         raise InputError("nothing is free; allowed: --free NODE.PARAM=LOW:HIGH, =LOW:HIGH:log or =A,B,C, once or more")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Variations of a cell: grids, lists, samples, ties and seeds.
+"""Variations of a cell: grids, lists, samples, derived parameters and seeds.
 
     space = Space(
         grid={"learning_controller.lead_time": "1.3e-3:1.5e-3:9"},
@@ -9,9 +9,9 @@
     for values in space.cells(scenario):
         ...
 
-The cells are the product of the given cells, the grids, the points of the sample and the seeds, in this order: the
-seeds change first, then the points, then the values of the last grid. Each is given as text, as on the command line,
-or as values: see `Space`.
+The cells are the product of the given cells, the grids, the sample points and the seeds, in this order: the seeds
+vary fastest, then the points, then the values of the last grid. Each is given as a string, as on the command line, or
+as values, see `Space`.
 """
 
 import csv
@@ -43,7 +43,7 @@ _LONG = 40  # characters of an axis that a message quotes
 
 
 class Drawn(NamedTuple):
-    """Law of a drawn value.
+    """Probability distribution of a sampled parameter.
 
     Attributes:
         law: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
@@ -100,11 +100,11 @@ class Space:
     sample_seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the arguments of an equal space, for ``Space(**arguments)``."""
+        """Return the arguments for ``Space(**arguments)`` that reproduce this space."""
         return cast("dict[str, Any]", json.loads(json.dumps(asdict(self), default=list)))
 
     def targets(self) -> list[str]:
-        """Return the parameters that differ between the cells, in the order of the columns."""
+        """Return the parameters that differ between the cells, in column order."""
         seed = ["seed"] if self.seeds > 1 else []
         named = [name for cell in self.given for name in cell]
         return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))
@@ -115,10 +115,10 @@ class Space:
         return math.prod(axes) * max(self._points(), 1) * max(len(self.given), 1) * self.seeds
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse a space that does not suit a scenario, before anything is computed.
+        """Check before any computation that the space is valid for a scenario.
 
         Raises:
-            InputError: the space does not suit; the message names the target, the value and the allowed ones.
+            InputError: the space is invalid; the message names the target, the value and the allowed values.
         """
         twice = [target for target in self.grid if target in self.sampled or target in self.ties]
         twice += [target for target in self.sampled if target in self.ties]
@@ -144,7 +144,7 @@ class Space:
         next(self.cells(scenario))  # the formulas are evaluated once: most errors show in the first cell
 
     def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
-        """Yield the values of each cell, by target."""
+        """Yield the varied values of each cell, by target."""
         axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
@@ -159,7 +159,7 @@ class Space:
                         yield formulas.add_to(values)
 
     def _points(self) -> int:
-        """Return the number of points of the sample; 0 without a sample."""
+        """Return the number of sample points; 0 without a sample."""
         if not self.sample:
             return 0
         name, _, number = self.sample.partition(":")
@@ -169,7 +169,7 @@ class Space:
         return count
 
     def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
-        """Yield the values of each point of the sample, by target."""
+        """Yield the sampled values of each point, by target."""
         if not self.sampled:
             yield {}
             return
@@ -181,7 +181,7 @@ class Space:
 
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
-    """Yield points in the unit cube, shape (n, dimensions); a larger sample begins with the points of a smaller one."""
+    """Yield points in the unit cube, shape (n, dimensions); a larger sample starts with the points of a smaller one."""
     if name == "latin":  # all points at once; those of another count are others
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
@@ -199,7 +199,7 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
 
 
 def number(scenario: Scenario, target: str, text: str) -> float:
-    """Parse a number, or a part in % of the scenario's value."""
+    """Parse a number or a percentage of the scenario's value."""
     plain = text.strip()
     found = ros_yaml.scalar(plain.removesuffix("%"))
     if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
@@ -215,10 +215,10 @@ def number(scenario: Scenario, target: str, text: str) -> float:
 
 
 def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
-    """Return the values of a grid, each once.
+    """Return the distinct values of a grid axis.
 
     Raises:
-        InputError: a text cannot be parsed, or a value is none of the parameter.
+        InputError: a string cannot be parsed, or a value is invalid for the parameter.
     """
     row = scenario.parameter(target)
     if isinstance(told, str):
@@ -256,7 +256,7 @@ def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
 
 
 def _split(text: str) -> list[str]:
-    """Split at commas outside of brackets and quotes."""
+    """Split a string at commas outside of brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         quote = ("" if letter == quote else quote) if quote else (letter if letter in "'\"" else "")
@@ -278,7 +278,7 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
 
 
 def _check_type(target: str, row: Row, value: Value) -> None:
-    """Refuse a value of a wrong type; one out of range is refused by its cell, in its row."""
+    """Reject a value of a wrong type; a value out of range becomes an error in its cell's row."""
     kinds = (int, float) if row.type is float else row.type
     items = value if isinstance(value, list) else [value]
     wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
@@ -288,7 +288,7 @@ def _check_type(target: str, row: Row, value: Value) -> None:
 
 
 def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
-    """Parse the law of a drawn value."""
+    """Parse the distribution of a sampled parameter."""
     row = scenario.parameter(target)
     if row.is_list or row.type is not float:
         raise InputError(f"{target}: drawn, and is {row.allowed()}; allowed: parameters that are one real number")
@@ -316,7 +316,7 @@ def given(path: Path) -> list[dict[str, Value]]:
     """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
 
     Raises:
-        InputError: the file cannot be read, or is neither.
+        InputError: the file cannot be read, or has neither format.
     """
     try:
         text = files.contents(path).decode()
@@ -338,5 +338,5 @@ def given(path: Path) -> list[dict[str, Value]]:
 
 
 def canonical(values: Mapping[str, Value]) -> str:
-    """Return a text that is the same for the same values in any order."""
+    """Return a canonical string of values, independent of their order."""
     return json.dumps(dict(values), sort_keys=True)

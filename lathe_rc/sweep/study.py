@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tuning on disk: Optuna's study, and the results of the cells of its trials.
+"""Tuning on disk: Optuna's study, and the results of its trials' cells.
 
-Trials are drawn a batch at a time, each with a random generator of its own, seeded by the seed and the trial's number.
-The results of a batch are reported to Optuna in the order of the numbers. So the search depends neither on the
-processes that compute it nor on their timing.
+Trials are drawn in batches. Each trial has its own random generator, seeded by the search's seed and the trial's
+number. The results of a batch are reported to Optuna in the order of the trial numbers. So the search depends neither
+on the number of processes nor on their timing.
 """
 
 import hashlib
@@ -47,10 +47,10 @@ _BY, _SCORE = "by", "score"  # attributes of a trial: the process that computes 
 
 
 class _Journal(BaseJournalBackend):
-    """Optuna's journal with a checksum in each line; lines of older versions have none.
+    """Optuna journal with a checksum in each line; lines of older versions have none.
 
-    Optuna's own class takes a damaged last line for one that is being written, and skips it. Here only a process that
-    holds the lock of the folder writes.
+    Optuna's own class takes a damaged last line for an unfinished one, and skips it. Here only a process that holds the
+    lock of the folder writes, so every damaged line is an error.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,7 +61,7 @@ class _Journal(BaseJournalBackend):
             print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
 
     def _cut(self) -> bool:
-        """Remove an incomplete last line: the next line would be appended to it, and both would be lost."""
+        """Remove an incomplete last line: the next line would be appended to it, and both would be unreadable."""
         with open(self._path, "rb+", opener=open_file) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 1, 0))
@@ -72,7 +72,7 @@ class _Journal(BaseJournalBackend):
         return True
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append lines and flush them to the disk."""
+        """Append lines to the journal and flush them to the disk."""
         self._cut()
         lines = (json.dumps(log | {_CHECKSUM: _checksum(log)}, separators=(",", ":")) + "\n" for log in logs)
         with open(self._path, "ab", opener=open_file) as file:
@@ -81,7 +81,7 @@ class _Journal(BaseJournalBackend):
             os.fsync(file.fileno())
 
     def read_logs(self, log_number_from: int) -> Generator[dict[str, Any]]:
-        """Yield the lines from a number on.
+        """Yield the journal's lines, starting at line number ``log_number_from``.
 
         Raises:
             InputError: a line is damaged.
@@ -104,7 +104,7 @@ class _Journal(BaseJournalBackend):
                 yield log
 
     def refusal(self, reason: object) -> InputError:
-        """Return the error for the line that was read last."""
+        """Return the error for the line read last."""
         return InputError(
             f"{self._path}, line {self.line}: no journal of Optuna, or damaged ({shown(reason)}); "
             "allowed: as it was written, or a new folder"
@@ -117,7 +117,7 @@ def _checksum(log: Mapping[str, Any]) -> str:
 
 
 def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
-    """Open a journal and the study in it.
+    """Open a journal and its study.
 
     Raises:
         InputError: the journal cannot be read.
@@ -139,10 +139,10 @@ def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
 
 
 class Study:
-    """A tuning on disk: Optuna's study, and the rows of its trials.
+    """Tuning on disk: Optuna's study, and the rows of its trials.
 
     Attributes:
-        count: number of cells of a trial.
+        count: number of cells per trial.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -176,7 +176,7 @@ class Study:
 
     @contextmanager
     def present(self) -> Iterator[str]:
-        """Hold a lock by which other processes see that this one computes; yield its name."""
+        """Hold a lock that marks this process as computing; yield its name."""
         place, me = self._folder.path / "running", uuid.uuid4().hex
         with writing(self._folder.path):
             place.mkdir(exist_ok=True)
@@ -187,7 +187,7 @@ class Study:
                 (place / me).unlink(missing_ok=True)
 
     def _is_left(self, trial: FrozenTrial, me: str) -> bool:
-        """Whether the process that was to compute a trial has ended: its lock is free."""
+        """Return whether the process assigned to a trial has ended: its lock is free."""
         by = str(trial.user_attrs.get(_BY))
         path = self._folder.path / "running" / by
         with suppress(filelock.Timeout):
@@ -198,11 +198,11 @@ class Study:
         return False
 
     def count_trials(self, state: TrialState, most: int = sys.maxsize) -> int:
-        """Return how many of the first ``most`` trials are in a state, those of other processes included."""
+        """Return the number of the first ``most`` trials in a state, including trials of other processes."""
         return sum(trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(state,)))
 
     def ask(self, me: str, most: int) -> list[FrozenTrial]:
-        """Return the next batch: trials of processes that have ended, and new ones up to ``most`` in all."""
+        """Return the next batch: abandoned trials of ended processes, and new ones up to a total of ``most``."""
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             there = self._study.get_trials(deepcopy=False)
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
@@ -228,7 +228,7 @@ class Study:
         return optuna.Trial(self._study, self._storage.get_trial_id_from_study_id_trial_number(study, number))
 
     def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
-        """Return a sampler for one trial, with a seed of its own."""
+        """Return a sampler for one trial, with a separate seed."""
         seed = int(np.random.SeedSequence([self._asked.seed, number]).generate_state(1)[0])
         if self._asked.sampler == "cmaes":
             return optuna.samplers.CmaEsSampler(x0=self._start, seed=seed)
@@ -237,7 +237,7 @@ class Study:
         return optuna.samplers.TPESampler(multivariate=True, seed=seed)
 
     def compute(self, crew: distributed.Client, asked: Sequence[FrozenTrial], watch: Watch) -> None:
-        """Compute the cells of a batch, and report the scores to Optuna."""
+        """Compute the cells of a batch and report the scores to Optuna."""
         jobs = {trial.number: self._jobs(trial) for trial in asked}
         missing = {job.key: job for each in jobs.values() for job in each if job.key not in self._known}
         keep(self._folder, rows(crew, order_of(self._folder), missing.values(), len(missing)), watch, self._take)
@@ -277,7 +277,7 @@ class Study:
         self._study.tell(number, known)
 
     def tuning(self) -> Tuning:
-        """Return the tuning so far."""
+        """Return the tuning with its trials so far."""
         found = []
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             if _SCORE not in trial.user_attrs or not trial.params.keys() >= self._space.keys():
@@ -292,7 +292,7 @@ class Study:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress Optuna's warnings of experimental features."""
+    """Suppress Optuna's warnings about experimental features."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

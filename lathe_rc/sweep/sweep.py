@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweep from its space to its table of results."""
+"""Execution of a sweep, from its space to the table of results."""
 
 import hashlib
 import os
@@ -44,12 +44,12 @@ class Sweep:
     folder: Folder
 
     def __repr__(self) -> str:
-        """The scenario, and the numbers of cells by outcome."""
+        """Return the scenario and the numbers of cells by status as a string."""
         told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
         return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
     def table(self) -> pa.Table:
-        """Return the rows, in the order of the cells; see `lathe_rc.sweep.row`."""
+        """Return the table of rows in cell order (columns: `lathe_rc.sweep.row`)."""
         return self.folder.table()
 
     def frame(self) -> "pd.DataFrame":
@@ -61,20 +61,20 @@ class Sweep:
         return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
 
     def row(self, number: int) -> dict[str, Any]:
-        """Return the row of a cell, by column; raises as `scenario` does."""
+        """Return the row of a cell, by column; raises the same errors as `scenario`."""
         return self.folder.row(number)
 
     def scenario(self, number: int) -> Scenario:
-        """Return the scenario of a cell, to run it again.
+        """Return the scenario of a cell, for example to run it again.
 
         Raises:
-            InputError: there is no such cell, it is not computed, or it was refused.
+            InputError: the cell does not exist, is not computed yet, or was refused.
         """
         return self.folder.scenario.varied(self.folder.values(number))
 
 
 def ignore(event: Mapping[str, Any]) -> None:
-    """Ignore the events of a sweep."""
+    """Ignore an event of a sweep (default of ``watch``)."""
 
 
 def run_sweep(
@@ -89,24 +89,25 @@ def run_sweep(
     client: distributed.Client | None = None,
     watch: Watch = ignore,
 ) -> Sweep:
-    """Compute the cells of a space that are not in the folder yet.
+    """Compute all cells of a space that are not in the folder yet.
 
     Args:
-        scenario: the varied cell; it needs a number of revolutions.
-        space: its variations.
-        folder: folder of the results; a stopped sweep is continued, and further spaces are added.
+        scenario: the cell to vary; it must have a number of revolutions.
+        space: variations of the cell.
+        folder: folder of the results; an interrupted sweep is continued, and further spaces are added.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
-        models: drive models of controllers, where the scenario does not give them: ``follow`` the varied drives, or
-            stay ``nominal``, as when one controller has to serve many drives.
-        scheduler: address of a scheduler of Dask; None: workers of this machine.
-        workers: number of worker processes of this machine; None: one for each core.
-        client: client of Dask, in place of both.
-        watch: called with the events ``began`` (cells; computed: number of those that exist already), ``compiling``
-            (nodes), ``ready`` (dashboard: address of Dask's) and ``rows`` (statuses: numbers of cells by status).
+        models: drive models of controllers, if the scenario does not set them: ``follow`` the varied drives, or
+            stay ``nominal``, as for one controller design for many drives.
+        scheduler: address of a Dask scheduler; None: workers of this machine.
+        workers: number of worker processes of this machine; None: one per core.
+        client: client of Dask, in place of ``scheduler`` and ``workers``.
+        watch: called with the events ``began`` (cells; computed: number of existing ones), ``compiling``
+            (nodes), ``ready`` (dashboard: address of Dask's dashboard) and ``rows`` (statuses: numbers of cells by
+            status).
 
     Raises:
-        InputError: no space of this scenario, the folder holds something else, or no scheduler is at the address.
-        LatheError: workers died, or the disk is full; the computed rows are kept.
+        InputError: the space is invalid, the folder has other contents, or there is no scheduler at the address.
+        LatheError: workers died, or the disk is full; the computed rows are saved.
 
     Example:
         >>> import lathe_rc
@@ -135,7 +136,7 @@ def run_sweep(
 def crew_for(
     scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
 ) -> Iterator[distributed.Client]:
-    """Yield the workers for cells of a scenario; arguments and events as in `run_sweep`."""
+    """Compile the kernels of a scenario, and yield a Dask client; arguments and events as in `run_sweep`."""
     # Kernels are compiled here once, into the cache of all processes, instead of in every worker at the same time.
     for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
         watch({"event": "compiling", "nodes": stages})
@@ -145,7 +146,7 @@ def crew_for(
 
 
 def order_of(folder: Folder) -> Order:
-    """Return the order that all jobs of a folder share."""
+    """Return the common data of all jobs of a folder."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
@@ -156,13 +157,14 @@ def order_of(folder: Folder) -> Order:
 def keep(
     folder: Folder, found: Generator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
 ) -> None:
-    """Write rows as they arrive, one file every few seconds, and the last ones also after an interruption.
+    """Write rows as they arrive, one file every few seconds; after an interruption the remaining ones are written, too.
 
     Args:
         folder: folder of the rows.
-        found: tables of rows, see `lathe_rc.sweep.workers.rows`; closing it cancels the cells not yet computed.
+        found: tables of rows, see `lathe_rc.sweep.workers.rows`; the generator is closed at the end, which cancels the
+            remaining cells.
         watch: see `run_sweep`.
-        take: called with the rows before they are written.
+        take: called with each table before it is written.
     """
     waiting: list[pa.Table] = []
     written = time.monotonic()
@@ -183,7 +185,7 @@ def keep(
 
 
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
-    """Yield the cells of a space, numbered through all spaces of the folder in the order of their requests."""
+    """Yield the cells of a space as jobs, numbered across all spaces of the folder in the order of their requests."""
     key = Key(folder)
     # Of the only space no cell occurs twice: its cells need no table of keys, which may be millions.
     if folder.spaces == [space]:
@@ -200,7 +202,7 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
 
 
 class Key:
-    """Identities of cells: hashes of the scenario, the measures, and the values that differ from the scenario's own."""
+    """Hash function for cells: of the scenario, the measures, and the values that differ from the scenario's own."""
 
     def __init__(self, folder: Folder) -> None:
         scenario = folder.scenario
@@ -210,7 +212,7 @@ class Key:
         self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())
 
     def of(self, values: Mapping[str, Value]) -> str:
-        """Return the identity of a cell in hexadecimal digits."""
+        """Return the hash of a cell in hexadecimal digits."""
         own = {target: value for target, value in values.items() if value != self._base[target]}
         # A file is identified by its content, not by its path.
         for target in self._files & own.keys():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning: a search for parameters of a cell by Optuna, whose trials the workers of a sweep compute.
+"""Tuning: a parameter search by Optuna, whose trials are computed by the workers of a sweep.
 
 DIR/trials.log       Optuna's journal: the trials and their scores
-DIR/running/         a lock for each process that computes; a free lock is that of a process that has ended
+DIR/running/         one lock file per computing process; the lock is free when the process has ended
 DIR/best.yaml        the cell with the best trial's parameters
 DIR/front/           for several goals, the cells of the Pareto front
 DIR, other files     see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
@@ -53,32 +53,32 @@ def tune(
     client: distributed.Client | None = None,
     watch: Watch = ignore,
 ) -> Tuning:
-    """Search for parameters of a cell; trials that the folder has already are not computed again.
+    """Search for parameters of a cell; existing trials in the folder are not computed again.
 
     Args:
-        scenario: the cell; its own parameters are the start, trial 0. It needs a number of revolutions.
+        scenario: the cell; its own parameters are the start, trial 0. It must have a number of revolutions.
         free: search space by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
-        goals: columns of a row, see `lathe_rc.sweep.objectives`; several are traded off.
-        folder: folder of the results. Several processes, also on other machines, may compute into it at a time.
-        subjects: constraints.
-        over: plants and spindles, of which the worst or a percentile counts; None: the scenario's own.
-        percentile: see `over`; 100: the worst.
+        goals: columns of a row to be minimised, see `lathe_rc.sweep.objectives`; several yield a Pareto front.
+        folder: folder of the results. Several processes, also on other machines, may compute into it simultaneously.
+        subjects: constraints, ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
+        over: uncertain plants and spindles; each goal is their worst value or a percentile; None: only the scenario's.
+        percentile: percentile of ``over`` that counts; 100: the worst.
         trials: total number of trials, including existing ones.
-        sampler: ``tpe``; ``cmaes`` for one goal and ranges alone; ``nsga2`` for several goals and many trials.
-        seed: seed of the search.
-        batch: number of trials that are drawn before the first of them has a score.
-        ask_formulas: whether trial 1 has the values of `lathe_rc.sweep.formulas`, if they are within the ranges.
+        sampler: ``tpe``; ``cmaes`` for one goal and only ranges; ``nsga2`` for several goals and many trials.
+        seed: random seed of the search.
+        batch: number of trials that are drawn at a time, before any of them has a score.
+        ask_formulas: whether trial 1 uses the values of `lathe_rc.sweep.formulas`, if they are within the ranges.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
-        scheduler: see `lathe_rc.run_sweep`, as the next two.
-        workers: number of worker processes of this machine.
-        client: client of Dask, in place of both.
+        scheduler: address of a Dask scheduler; None: workers of this machine.
+        workers: number of worker processes of this machine; None: one per core.
+        client: client of Dask, in place of ``scheduler`` and ``workers``.
         watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the number of existing trials, and with
             ``told`` (tuning: all trials so far) after each batch, and ``waiting``, repeatedly, while other processes
             compute the last trials.
 
     Raises:
-        InputError: the request is impossible, or the folder holds something else.
-        LatheError: workers died, or the disk is full; the computed rows are kept.
+        InputError: the arguments are invalid, or the folder has other contents.
+        LatheError: workers died, or the disk is full; the computed rows are saved.
 
     Example:
         >>> import lathe_rc
@@ -151,10 +151,10 @@ def _check_sampler(name: str, wanted: Objectives, found: Mapping[str, Dimension]
 
 
 def load(path: Path) -> Tuning:
-    """Load the tuning of a folder.
+    """Load the tuning in a folder.
 
     Raises:
-        InputError: the folder holds none.
+        InputError: the folder has no tuning.
     """
     folder = Folder(path)
     if folder.tuning is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Result of a tuning: its trials, the best of them, and the values by formulas."""
+"""Result of a tuning: its trials, the best trial, and the values given by formulas."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,9 +24,9 @@ class Trial(NamedTuple):
     """Trial of a tuning.
 
     Attributes:
-        number: number of the trial; 0 is the start, the scenario's own parameters.
-        values: values of the free parameters.
-        score: score of its cells.
+        number: number of the trial; trial 0 has the scenario's own parameters.
+        values: values of the free parameters, by target.
+        score: score of the trial's cells.
     """
 
     number: int
@@ -35,7 +35,7 @@ class Trial(NamedTuple):
 
 
 def unit(column: str) -> tuple[float, str]:
-    """Return the unit in which a column is shown: the factor from SI units, and the unit's name."""
+    """Return the display unit of a column: the factor from SI units, and the unit's name."""
     return (1e6, "µm") if column.endswith("_error") else (1.0, "")
 
 
@@ -46,9 +46,9 @@ class Tuning:
     Attributes:
         folder: folder of the tuning.
         objectives: goals and constraints.
-        over: plants and spindles of each trial.
+        over: plants and spindles of each trial, as a space.
         trials: computed trials, in order.
-        formulas: values by formulas, for the free parameters that have one.
+        formulas: values given by formulas, for free parameters that have a formula.
     """
 
     folder: Folder
@@ -58,7 +58,7 @@ class Tuning:
     formulas: Mapping[str, Found] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """The scenario and its best trial."""
+        """Return the scenario and its best trial as a string."""
         told = "nothing feasible"
         if best := self.best:
             told = ", ".join(f"{column} = {value:.4g}" for column, value in self.goals(best).items())
@@ -67,12 +67,12 @@ class Tuning:
 
     @property
     def sweep(self) -> Sweep:
-        """All cells of all trials."""
+        """Sweep with all cells of all trials."""
         return Sweep(self.folder)
 
     @property
     def cells(self) -> int:
-        """Number of cells of a trial."""
+        """Number of cells per trial."""
         return self.over.count(self.folder.scenario)
 
     @property
@@ -87,7 +87,7 @@ class Tuning:
 
     @property
     def by_formula(self) -> Trial | None:
-        """Trial with the values by formulas; None: there are none, or they are outside of the ranges."""
+        """Trial with the values given by formulas; None if there are none, or if they are outside of the ranges."""
         given = {target: found.value for target, found in self.formulas.items()}
         scenario = self.folder.scenario
 
@@ -98,7 +98,7 @@ class Tuning:
 
     @property
     def improvements(self) -> list[Trial]:
-        """Trials that were better in the first goal than all before."""
+        """Successive improvements: trials with a better first goal than all earlier ones."""
         found: list[Trial] = []
         for trial in self.feasible:
             if not found or trial.score.costs[0] < found[-1].score.costs[0]:
@@ -107,7 +107,7 @@ class Tuning:
 
     @property
     def front(self) -> list[Trial]:
-        """Pareto front of the feasible trials, in the order of the first goal; for one goal, the best trial."""
+        """Pareto front of the feasible trials, sorted by the first goal; for one goal, only the best trial."""
         found: list[Trial] = []
         # In this order only a trial that is there already can be as good in all goals.
         for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
@@ -117,7 +117,7 @@ class Tuning:
 
     @property
     def best(self) -> Trial | None:
-        """Best trial; for several goals the one of the front nearest to the best of each. None: none is feasible."""
+        """Best trial; for several goals, the trial on the front nearest to the best of each; None: none is feasible."""
         front = self.front
         if not front:
             return None
@@ -128,12 +128,12 @@ class Tuning:
         return front[int(np.argmin(distance))]
 
     def goals(self, trial: Trial) -> dict[str, float]:
-        """Return the goals of a trial, by column [SI units]; infinite where a goal has no value."""
+        """Return the goal values of a trial, by column [SI units]; infinite for missing values."""
         pairs = zip(self.objectives.goals, trial.score.costs, strict=True)
         return {goal.column: goal.sign * cost for goal, cost in pairs}
 
     def goals_shown(self, trial: Trial) -> dict[str, str]:
-        """Format the goals of a trial with their units, by column."""
+        """Format the goal values of a trial with their units, by column."""
         found = {}
         for column, value in self.goals(trial).items():
             factor, name = unit(column)
@@ -141,14 +141,14 @@ class Tuning:
         return found
 
     def scenario(self, trial: Trial) -> Scenario:
-        """Return the cell with a trial's parameters, on its own plant and spindle."""
+        """Return the scenario with a trial's parameters, with its nominal plant and spindle."""
         return self.folder.scenario.varied(trial.values)
 
     def trial(self, number: int) -> Trial:
         """Return a trial by its number.
 
         Raises:
-            InputError: there is no such trial, or it is not computed.
+            InputError: the trial does not exist, or is not computed yet.
         """
         known = {trial.number: trial for trial in self.trials}
         if number not in known:
@@ -157,7 +157,7 @@ class Tuning:
         return known[number]
 
     def write(self, trial: Trial, path: Path) -> None:
-        """Write the cell with a trial's parameters as a parameter file that ``lathe run`` takes.
+        """Write the cell with a trial's parameters as a parameter file for ``lathe run``.
 
         Raises:
             LatheError: the file cannot be written.

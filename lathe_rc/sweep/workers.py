@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of a sweep on Dask's workers, in tasks of a few seconds.
+"""Computation of a sweep's cells on Dask workers, in tasks of a few seconds.
 
-Dask schedules, retries and moves data. This module decides how many cells a task has: after the first tasks, which
-compile missing kernels, as many as take `TASK` seconds.
+Dask schedules, retries and moves data. This module sets the number of cells per task: the first tasks, which compile
+missing kernels, are small, and later ones are sized to take `TASK` seconds.
 """
 
 import logging
@@ -51,12 +51,12 @@ _SETTINGS = {  # of this machine's workers
 
 
 class Job(NamedTuple):
-    """Cell to be computed.
+    """Cell to be computed by a worker.
 
     Attributes:
         number: number within the sweep.
         key: identity of the cell.
-        values: values that the cell sets, by target.
+        values: values of the varied parameters, by target.
     """
 
     number: int
@@ -65,12 +65,12 @@ class Job(NamedTuple):
 
 
 class Order(NamedTuple):
-    """Data that all jobs share, and that travel to the workers with them.
+    """Common data of all jobs of a sweep, sent to the workers with each task.
 
     Attributes:
         name: name of the scenario.
-        text: the scenario as a parameter file; a worker reads it once.
-        identity: identity of the scenario, which a worker has to arrive at as well.
+        text: the scenario as a parameter file; a worker parses it once.
+        identity: identity of the scenario, which the worker verifies.
         targets: columns of the varied parameters.
         measures: further columns.
         schema: schema of the rows.
@@ -88,7 +88,7 @@ class Order(NamedTuple):
 
 @dataclass(frozen=True)
 class Share:
-    """Jobs of a task. Dask searches all lists and tuples among its arguments for other tasks, but not this class."""
+    """Jobs of one task; a class, since Dask searches lists and tuples in its arguments for other tasks."""
 
     order: Order
     jobs: Sequence[Job]
@@ -96,10 +96,10 @@ class Share:
 
 @lru_cache(maxsize=4)
 def _scenario(name: str, text: str, identity: str) -> Scenario:
-    """Return the scenario at a worker.
+    """Return the scenario on a worker.
 
     Raises:
-        InputError: its identity differs there.
+        InputError: its identity differs from that of the client's scenario.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
@@ -113,7 +113,7 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 
 
 def compute(share: Share) -> pa.Table:
-    """Return the rows of some cells: a task of Dask."""
+    """Compute the rows of several cells (task function for Dask)."""
     order = share.order
     allowed_code.taken_from(order.code)
     base, bench = _scenario(order.name, order.text, order.identity), CellRunner()
@@ -126,14 +126,14 @@ def compute(share: Share) -> pa.Table:
 
 @contextmanager
 def client_of(scheduler: str | None, workers: int | None) -> Iterator[distributed.Client]:
-    """Yield a client of a scheduler, or of workers on this machine that end with the block.
+    """Yield a Dask client of a scheduler, or of local workers that end with the block.
 
     Args:
         scheduler: address, such as ``tcp://host:8786``; None: this machine.
-        workers: number of worker processes of this machine; None: one for each core.
+        workers: number of worker processes of this machine; None: one per core.
 
     Raises:
-        InputError: no scheduler is at the address.
+        InputError: there is no scheduler at the address.
     """
     if scheduler is not None:
         try:
@@ -151,7 +151,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Keep the current folder off the import path of Python processes that are started within the block."""
+    """Exclude the current folder from the import path of Python processes started within the block."""
     before = os.environ.get("PYTHONSAFEPATH", "")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
@@ -180,12 +180,12 @@ def _cluster(workers: int | None) -> distributed.LocalCluster:
 
 
 def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
-    """Compute cells, and yield their rows as they arrive.
+    """Compute cells and yield their rows as they arrive.
 
     Args:
-        client: client whose workers compute.
-        order: data that the jobs share.
-        jobs: cells, taken from the iterator as workers become free.
+        client: client whose workers compute the cells.
+        order: common data of the jobs.
+        jobs: cells, taken from the iterator when workers become free.
         count: number of jobs.
 
     Raises:
@@ -230,7 +230,7 @@ def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Tab
 
 
 def _next(size: int, found: pa.Table) -> int:
-    """Return the number of cells of the next task."""
+    """Return the number of cells of the next task, from the computing times of the last one."""
     took: float = sum(found.column("seconds").to_pylist())
     fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
     grown: int = _GROWTH * max(size, found.num_rows)
