@@ -16,12 +16,12 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# The matrices here are small. Threads of BLAS that wait for the next one keep the cores busy that other nodes need.
+# The matrices are small, and waiting BLAS threads keep cores busy that other nodes need.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def __getattr__(name: str) -> Any:
-    public = importlib.import_module("lathe_rc.public")  # only then, so that to import lathe_rc stays quick
+    public = importlib.import_module("lathe_rc.public")  # on demand, so that importing lathe_rc is fast
     return public.attribute(__name__, name)
 
 

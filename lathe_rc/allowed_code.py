@@ -46,7 +46,7 @@ class _Call:
     named: Callable[[], Collection[str]] = tuple
 
 
-_calls = [_Call(own=True)]  # the first is a Python program's own
+_calls = [_Call(own=True)]  # the first entry is for Python programs outside of a command
 
 
 class _CurrentFolder(MetaPathFinder):
@@ -56,7 +56,7 @@ class _CurrentFolder(MetaPathFinder):
     count as that of an installed package, and a ``sitecustomize.py`` would run in child processes.
     """
 
-    importing = False  #: an allowed package is being imported: modules beside it are found as well
+    importing = False  #: whether an allowed package is being imported, so that modules beside it may be imported, too
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -172,7 +172,7 @@ def bag_around(folder: Path) -> Path | None:
             return here
         return next((each for each in (here, *here.parents) if _is_bag(each / _METADATA)), None)
     except OSError:
-        return None  # reading what is in it tells why it cannot be
+        return None  # the error is reported when the folder is read
 
 
 def _is_bag(metadata: Path) -> bool:

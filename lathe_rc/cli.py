@@ -39,11 +39,11 @@ class Group(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an error of lathe_rc is printed as one line and sets the exit code."""
-        # SIGTERM ends a command as Ctrl-C does: children are ended and bags closed on the way out.
+        # SIGTERM ends a command like Ctrl-C: children are terminated and bags are closed.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="replace")  # where an encoding has no µ
+                stream.reconfigure(errors="replace")  # for encodings without µ
         try:
             with extras.named(), allowed_code.call():
                 return super().invoke(ctx)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, cast
 
 from lathe_rc.extras import load
 
-if TYPE_CHECKING:  # the first ./lathe --help lists the commands before any package is installed
+if TYPE_CHECKING:  # the first ./lathe --help runs before any package is installed
     import click
 
 COMMANDS = {
@@ -31,7 +31,7 @@ COMMANDS = {
     "tune": "Search the parameters of a scenario that meet goals best.",
     "view": "Show a bag in Rerun.",
 }  #: their summaries
-_BESIDES = {"container": "node"}  # commands in the module of another one
+_BESIDES = {"container": "node"}  # commands in the module of another command
 
 
 def imported(name: str) -> "click.Command":

@@ -10,7 +10,7 @@ from lathe_rc.safety.state_machine import Reaction, State
 
 _STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
 
-#: Of each monitor: the unit of what it finds, by how much that is to be multiplied; those of others have their own.
+#: Unit and factor for the values of each built-in monitor; third-party monitors define their own.
 UNITS = {
     "speed": ("rad/s", 1.0),
     "acceleration": ("rad/s²", 1.0),
@@ -20,7 +20,7 @@ UNITS = {
     "force_low": ("N", 1.0),
     **dict.fromkeys(("error", "following", "stroke", "slide"), ("µm", 1e6)),
 }
-LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: types of messages that say so
+LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: message types of the event log
 
 
 @dataclass(frozen=True)

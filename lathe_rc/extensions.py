@@ -178,7 +178,7 @@ def _attribute(module: str, attribute: str, what: str) -> Any:
     try:
         with allowed_code.importing(module):
             found = importlib.import_module(module)
-    except Exception as error:  # whatever a module of others does when it is imported
+    except Exception as error:  # importing a third-party module can raise anything
         told = f"{what} cannot be imported: {type(error).__name__}: {shown(error)}"
         if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
             told += (
@@ -267,7 +267,7 @@ def source_hash(module: str, *, imports: bool = False) -> str:
 
 
 _INSTALLED = sysconfig.get_path("purelib")
-#: modules whose versions do not change within a set-up; the first two have a hash of their own
+#: packages whose versions do not change within an installation; the first two have a separate hash
 COMMON = {
     *("lathe_rc", "lathe_papers", "numpy", "scipy", "numba", "annotated_types", "pydantic"),
     *sys.stdlib_module_names,

@@ -17,11 +17,11 @@ from typing import BinaryIO, cast
 
 from lathe_rc.errors import InputError
 
-MOST = 2**26  #: longest file that is read whole [B]
+MOST = 2**26  #: maximum length of a file that is read at once [B]
 _PIECE = 2**20  # [B]
 _NO_FILE = "not a file"
 _MARK, _DIGITS = b"lathe_rc checksum ", 32
-ROOM = _MARK + _DIGITS * b"0"  #: for a checksum
+ROOM = _MARK + _DIGITS * b"0"  #: placeholder of a checksum
 
 
 class DamagedError(ValueError):
@@ -36,10 +36,10 @@ def contents(path: Path, most: int = MOST) -> bytes:
     """
     found = bytearray()
     with open(path, "rb", opener=open_file) as stream:
-        # Python takes memory for all that a single read may give.
+        # Python allocates memory for the maximum length of a single read.
         while piece := stream.read(min(_PIECE, most + 1 - len(found))):
             found += piece
-    if piece is None:  # it would have had to wait
+    if piece is None:  # the read would block
         raise OSError(errno.EINVAL, _NO_FILE)
     if len(found) > most:
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
@@ -120,7 +120,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         beside = None
         folder = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # the new name itself
+            os.fsync(folder)  # makes the rename durable
         finally:
             os.close(folder)
     finally:

@@ -32,7 +32,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _MOST = 2**30  # longest file of the cache [B]
-_ROOM = 2**22  # that the code of a cell takes, about [B]
+_ROOM = 2**22  # approximate size of the code of a cell [B]
 _PACKAGE = Path(__file__).parent
 _KERNELS = (
     "arrays.py",

@@ -32,7 +32,7 @@ SAFETY_STATUS = f"{PACKAGE}/msg/SafetyStatus"
 MEMBER = f"{PACKAGE}/msg/Member"
 CELL_STATE = f"{PACKAGE}/msg/CellState"
 JOINTS = "sensor_msgs/msg/JointState"
-ALIVE = "alive"  #: topic of each node without messages: only its liveliness counts
+ALIVE = "alive"  #: topic of each node without messages, used for its liveliness
 
 START_NS = 1_000_000_000  #: simulated time of sample 0 [ns]; a stamp of 0 means "not set" in ROS
 MAX_BLOCK = 8192  #: bound of the arrays of a block [sample]; the .msg files say the same

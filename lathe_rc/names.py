@@ -9,7 +9,7 @@ from lathe_rc.errors import InputError, shown
 
 _NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MOST_CLOSE = 3
-_MOST_LISTED = 16  # names that a message lists; more of them are looked up elsewhere
+_MOST_LISTED = 16  # maximum number of names that a message lists
 
 
 def _in(name: str, other: str) -> bool:

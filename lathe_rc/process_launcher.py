@@ -24,7 +24,7 @@ from typing import Literal
 from lathe_rc import allowed_code, extras
 from lathe_rc.errors import LatheError
 
-Start = Literal["fork", "spawn"]  #: of a process: as a copy of one that has imported everything, or from nothing
+Start = Literal["fork", "spawn"]  #: start of a process: as a fork of one with all imports, or as a new interpreter
 
 _MOST = 2**16  # [B] of an answer
 
@@ -84,7 +84,7 @@ class ForkServer:
         LatheError: ROS 2 is not installed.
 
     Attributes:
-        lost: whether the server has ended prematurely.
+        lost: whether the server has ended.
     """
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class ForkServer:
         """Stop the server."""
         with contextlib.suppress(OSError):
             self._line.shutdown(socket.SHUT_RDWR)
-        self._process.terminate()  # it may be busy with compiling what nobody wants any more
+        self._process.terminate()  # it may still be compiling kernels that are no longer needed
         self._process.wait()
 
 

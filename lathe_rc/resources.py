@@ -24,7 +24,7 @@ def scenario(path: Path) -> Path:
         a
             scenario of this name.
     """
-    # A folder of that name, such as one of lathe new, is no scenario.
+    # A folder of that name, such as a package of lathe new, is no scenario.
     folder = path.is_dir() and bool(path.name.strip(".")) and find(path.with_suffix(".yaml")).exists()
     if not path.suffix and (folder or not path.exists()):
         path = path.with_suffix(".yaml")
@@ -33,7 +33,7 @@ def scenario(path: Path) -> Path:
             raise InputError(f"{path.stem}: {path} here, or {ours}; name the file, with its ending")
     found, folders = find(path), config_folders()
     if found.exists() or path.name != str(path) or not folders:
-        return found  # who reads it says what is wrong
+        return found  # the error is reported when the file is read
     known = sorted(file.stem for file in folders[0].glob("*.yaml"))
     raise InputError(f"{path}: no such file or scenario; {instead(path.stem, known, listing=f'ls {folders[0]}')}")
 

@@ -21,7 +21,7 @@ from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.rerun_signals import is_drawn
 
-OPERATOR = "operator"  #: people with the tools of ROS: they read everything and call every service
+OPERATOR = "operator"  #: operator with the ROS command-line tools, who may read every topic and call every service
 
 _LOG, _PARAMETER_EVENTS, _CLOCK = "/rosout", "/parameter_events", "/clock"
 _PARAMETERS = (
@@ -40,9 +40,9 @@ _LIFECYCLE = (
     "get_state",
     "get_transition_graph",
 )
-_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # of one kind of node alone
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # of single kinds of nodes
 _RECORDED = ("/diagnostics", "cell_state")  # host topics that a bag holds
-_COMMAND_LINE = "/_ros2cli_*/get_type_description"  # that the nodes of ros2 topic, ros2 service and so on serve
+_COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes of ros2 topic, ros2 service and so on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +157,7 @@ _BESIDE: Mapping[str, Callable[[_Maker], Profile]] = {
     RERUN_BRIDGE: _Maker.rerun_bridge,
     TOPIC_RECORDER: _Maker.topic_recorder,
 }
-BESIDE = tuple(_BESIDE)  #: who may be let in beside the members of a cell
+BESIDE = tuple(_BESIDE)  #: tools that may be admitted beside the members of a cell
 
 
 def policy(
@@ -182,7 +182,7 @@ def policy(
         InputError: the scenario cannot be wired, ``groups`` has an unknown node, or the namespace is not valid.
     """
     checked_namespace(namespace)
-    # The bag's folder is no matter of policy.
+    # The bag's folder does not affect the policy.
     complete = harness.with_recorder(scenario, Path(RECORDER), keep=True)
     maker = _Maker(complete, namespace)
     made = {

@@ -90,10 +90,10 @@ def comparison(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
     for number, column in enumerate(columns):
         table.add_column(Text(column), justify="right" if number else "left")
     for row in rows:
-        # as Text: rich would take a unit in brackets for markup
+        # as Text: rich would interpret a unit in brackets as markup
         table.add_row(*(Text(cell) for cell in row))
     return table
 
 
-#: by name: those of the papers, in `lathe_papers`, and those of other packages, by their entry points
+#: studies by name: of the papers, in `lathe_papers`, and of other packages, by their entry points
 STUDIES: Objects[Study[Any]] = Objects("study", Study, {}, "lathe_rc.studies")

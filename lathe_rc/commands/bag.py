@@ -22,8 +22,8 @@ from lathe_rc.commands import options, tables
 from lathe_rc.errors import LossyRunError
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)
-_LOSSY = LossyRunError.exit_code  # where something is missing
-_SIMULATED = 10**17  # [ns] that simulated time does not reach: three years; other clocks have passed it in 1973
+_LOSSY = LossyRunError.exit_code  # if messages are missing
+_SIMULATED = 10**17  # [ns] upper bound of simulated time: three years; the system clock passed it in 1973
 
 
 @click.group()

@@ -57,7 +57,7 @@ def targets(ctx: click.Context, _param: click.Parameter, incomplete: str) -> lis
     known = known or {kind: kind for kind in TABLES}
     if not dot:
         return beginning((f"{name}." for name in known), incomplete)
-    with contextlib.suppress(KeyError, InputError, ImportError):  # no such kind here: the command will say so
+    with contextlib.suppress(KeyError, InputError, ImportError):  # unknown kind: the command will report it
         return beginning((f"{node}.{name}=" for name in TABLES[known[node]].rows()), incomplete)
     return []
 
@@ -66,7 +66,7 @@ def _kinds_by_node(ctx: click.Context) -> dict[str, str]:
     """Return the kinds of the nodes in the command line's scenario; empty if no scenario can be read."""
     import yaml
 
-    # Click gives up at an option without a value, such as the one that is being typed, and leaves arguments aside.
+    # Click stops parsing at an option without a value, such as the one being typed, and skips the arguments.
     named = ctx.params.get("scenario") or next(iter(ctx.args), "")
     found: dict[str, str] = {}
     with contextlib.suppress(OSError, ValueError, yaml.YAMLError, AttributeError):

@@ -67,7 +67,7 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
     NAME is piston (one channel, the default), two_channel (a piezo channel learns what the coarse one leaves) or
     interrupted (a keyway, force on the drive and a wandering speed, by the disturbance controller and by its peer).
     """
-    process_launcher.server().preload({})  # it imports while this process does
+    process_launcher.server().preload({})  # the server imports concurrently with this process
     _show(DEMOS[name], revolutions, folder)
 
 

@@ -15,8 +15,8 @@ from lathe_rc.analysis.metrology import Lay
 from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.commands import plot, tables
 
-_MOST_EVENTS = 12  # printed of a run
-_ALIKE = 4  # of them that follow one another: those in between are left out
+_MOST_EVENTS = 12  # rows of the event table
+_ALIKE = 4  # length of a series of similar events from which its inner events are left out
 
 
 def table(result: harness.Result) -> Table:

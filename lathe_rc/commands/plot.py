@@ -30,7 +30,7 @@ def drawn(result: harness.Result, width: int) -> Text | None:
         result: result of the run.
         width: width of the plot [characters].
     """
-    import plotext  # takes a while, and many look at no plot
+    import plotext  # slow to import, and not needed without a plot
 
     rms, largest = np.asarray(result.errors.rms) * 1e6, np.asarray(result.errors.largest) * 1e6
     if rms.size < 2 or not (np.isfinite(largest).all() and rms.all()):
@@ -43,7 +43,7 @@ def drawn(result: harness.Result, width: int) -> Text | None:
     if result.verdict:
         limit = result.verdict.tolerance * 1e6
         curves.insert(0, (f"tolerance {limit:.4g} µm", "orange+", np.full(rms.size, limit)))
-    plotext.clear_figure()  # its figure is global
+    plotext.clear_figure()  # the figure is global
     plotext.limit_size(False, False)  # noqa: FBT003 - so it is called
     plotext.plot_size(width, _HEIGHT)
     for part in (plotext.canvas_color, plotext.axes_color, plotext.ticks_color):

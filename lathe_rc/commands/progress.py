@@ -69,10 +69,10 @@ class Watch:
             return
         if kind in ("progress", "cycle"):
             if now < self._due[kind]:
-                return  # nobody reads faster, and drawing would slow an offline run down
+                return  # more frequent updates are not readable, and would slow an offline run down
             self._due[kind] = now + _REFRESH
         if kind == "checked":
-            # Not before: a refusal is one line and nothing else.
+            # Not before: the output of a rejected scenario is only one line.
             self._step = event["step"]
             update(self._task, total=event["samples"])
             self._bar.start()

@@ -21,7 +21,7 @@ from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
 from lathe_rc.commands import completers, options, tables
 from lathe_rc.errors import InputError
 
-_DIFFERENT = 1  # exit code if an unchanged run does not come out as recorded
+_DIFFERENT = 1  # exit code if the results of an unchanged run differ from the recording
 _UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # and factor for it
 
 

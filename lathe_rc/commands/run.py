@@ -34,7 +34,7 @@ def run(mode: "Mode", start: "Start | None", **asked: Any) -> None:
     """Run a SCENARIO, a ROS 2 parameter file, to its end."""
     allowed_code.allow_own_code()
     if mode != "offline" and start != "spawn":
-        process_launcher.server().preload({})  # it imports while this process does
+        process_launcher.server().preload({})  # the server imports concurrently with this process
     from lathe_rc.commands import running
 
     running.run(mode=mode, start=start, **asked)

@@ -147,7 +147,7 @@ class _Studies(click.Group):
 
 
 def _summary(name: str) -> str:
-    """Return the summary of a study, with its package if it is third-party; errors of its import are shown instead."""
+    """Return the summary of a study, with its package if it is third-party; an import error is returned as text."""
     by = STUDIES.offered_by(name)
     try:
         about = STUDIES[name].doc

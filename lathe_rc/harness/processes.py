@@ -33,12 +33,12 @@ _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag c
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
-_NO_SIGN_OF_LIFE = {"stall", "foreign_message", "waits"}  # events of a cell that stands
-_LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has nothing more to do
-_LOOK = 0.05  # [s] between looks at what a process has written
+_NO_SIGN_OF_LIFE = {"stall", "foreign_message", "waits"}  # events of a stalled cell
+_LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has finished or given up
+_LOOK = 0.05  # [s] between reads of a process's log
 _DOMAINS = 100  # domain_coordinator reserves 1 to 100
-# Each cell gets the next one, and each process begins elsewhere: in the domain of a cell that has just ended, a process
-# that was killed or orphaned may not have left yet.
+# Each cell uses the next number, and each process starts at another one: a killed or orphaned process may still be in
+# the domain of a cell that has just ended.
 _numbers = itertools.count(os.getpid() * 37)
 
 
@@ -65,7 +65,7 @@ def free_domain(number: int | None = None) -> Iterator[int]:
 
     if number is not None:
         with socket.socket() as reservation:
-            with contextlib.suppress(OSError):  # several cells may share a domain that is asked for
+            with contextlib.suppress(OSError):  # several cells may share a given domain
                 reservation.bind(("", PORT_BASE + number))
             yield number
         return
@@ -131,10 +131,10 @@ class Processes:
         self._threads: list[threading.Thread] = []
         self._abandoned: set[str] = set()
         self._ended: set[str] = set()
-        self._left: set[str] = set()  # nodes that have nothing more to do
+        self._left: set[str] = set()  # nodes that have finished or given up
         self._newest: dict[str, Event] = {}
-        self._lost: list[tuple[str, str]] = []  # nodes that the cell goes to its safe state without, and why
-        self._dead: set[str] = set()  # members whose process has ended, as the time master has noticed
+        self._lost: list[tuple[str, str]] = []  # nodes lost before the safe state, and the reasons
+        self._dead: set[str] = set()  # members whose end the time master has reported
         self._restarts: Counter[str] = Counter()
         self.pids: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
@@ -225,7 +225,7 @@ class Processes:
                 if leaves and self._running:
                     self._end_the_silent()
                     continue
-                tails = self._tails()  # before the processes write where they are
+                tails = self._tails()  # read before the processes append their stack traces
                 running = ", ".join(f"{name}{self._place(name)}" for name in self._running)
                 raise LatheError(
                     self._with_the_lost(
@@ -339,9 +339,9 @@ class Processes:
             self._lose(node, event["message"], kinds.get(event["exit_code"], LatheError))
             self._is_no_cause(node)
         if event["event"] == "exit" and event["code"] < 0 and self._complete:
-            return  # a library crashed while it left; whoever watches has been told
+            return  # a library crashed at exit, after the run; `watch` has received the event
         if event["event"] == "exit" and event["code"] > 0 and "safe" in self._newest:
-            return  # all say so whose cell went there
+            return  # all nodes of a cell in its safe state exit with an error
         if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
             self._lose(node, self._end_of(node, event["code"]))
 

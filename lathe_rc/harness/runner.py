@@ -70,7 +70,7 @@ def run(
         lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
     if mode != "offline" and start == "fork":
-        process_launcher.server()  # it imports while the cell is checked
+        process_launcher.server()  # the server imports while the cell is checked
     cell = Cell(scenario.nodes)
     cell.check()
     check_room(cell)
@@ -150,7 +150,7 @@ def _lateness(events: Mapping[str, Event]) -> Lateness | None:
     if "pace" not in events:
         return None
     told = events["pace"]
-    within = {int(percent): seconds for percent, seconds in told["within"].items()}  # JSON has no other keys than texts
+    within = {int(percent): seconds for percent, seconds in told["within"].items()}  # JSON keys are strings
     return Lateness(told["blocks"], told["late"], told["worst"], within, told["slipped"])
 
 

@@ -22,7 +22,7 @@ def _names(formula: str) -> set[str]:
         tree = ast.parse(formula.strip(), mode="eval")
     except SyntaxError:
         raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
-    # NODE.PARAM parses as an attribute of a name: only the whole of it is a target, neither its NODE nor a function.
+    # NODE.PARAM parses as an attribute of a name: only the full attribute is a target, neither NODE nor a function.
     inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
     named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
@@ -60,13 +60,13 @@ class Formulas:
         """Add the derived values to the values of a cell, in place, and return them.
 
         Raises:
-            InputError: a formula has no finite value.
+            InputError: a formula cannot be evaluated.
         """
         for target, formula in self._ties.items():
             known: dict[str, Any] = {"pi": math.pi}
             for name in self._named[target]:
                 node, dot, of = name.partition(".")
-                # The cell's values come first: they hold the tied targets that this one depends on.
+                # The cell's values take precedence: they contain the derived targets that this one depends on.
                 found = values.get(name, self._scenario.value(name))
                 if isinstance(found, list):
                     found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])

@@ -6,11 +6,11 @@ With y the goal of the n cells that have one and the parameter's values in m bin
     between = Σ n_b·(mean_b(y) - mean(y))²      within = Σ_b Σ (y - mean_b(y))²      total = between + within
     share   = (between - (m - 1)·within/(n - m)) / total
 
-is the part of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935). The part that m
-bins of pure chance would explain is subtracted, so that the share may fall a little below 0. In a complete grid nothing
-is chance, and share = between/total with one bin for each value is exact: the main effect. SALib's measures for given
-samples support neither texts nor grids, and are no more accurate: of Ishigami's function with 64, 256 and 1024 points
-(Sobol) the RMS error of the shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 by RBD-FAST and 0.20, 0.13, 0.08 by
+is the share of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935). The share that m
+random bins would explain is subtracted, so that the result may be slightly negative. A complete grid has no random
+part, and share = between/total with one bin per value is exact: the main effect. SALib's measures for given samples
+support neither strings nor grids, and are no more accurate: for Ishigami's function with 64, 256 and 1024 points
+(Sobol) the RMS error of the shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 with RBD-FAST and 0.20, 0.13, 0.08 with
 DELTA.
 """
 

@@ -137,7 +137,7 @@ class Folder:
                 raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
         if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
-        # scenario.yaml is written first: where there is a sweep.json, the folder is complete.
+        # scenario.yaml is written first: a folder with a sweep.json is complete.
         told = asdict(_Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning))
         with writing(path):
             (path / "rows").mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ class Folder:
         """
         found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
         for target in self.targets:
-            # A cell that was computed before a target was first varied has the scenario's own value of it.
+            # Cells computed before a target was first varied have the scenario's value of it.
             if target in found.column_names and found.column(target).null_count:
                 field = found.schema.field(target)
                 filled = pyarrow.compute.coalesce(
@@ -242,7 +242,7 @@ class Folder:
             LatheError: the file cannot be written; existing rows are preserved.
         """
         place = self.path / "rows"
-        # Several processes may compute a tuning: without the lock two could take the same number for their files.
+        # Several processes may compute a tuning: without the lock two files could get the same number.
         with locked(self.path / _WRITING), writing(self.path):
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:

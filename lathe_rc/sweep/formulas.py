@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of a cell by closed-form rules, as a reference for a search.
 
-For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as they run:
+For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as implemented:
 
 - ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
-- ``q_time``: the shortest with sup|Q - γZ| <= 1 - margin, since the remaining error grows with it:
+- ``q_time``: the shortest time with sup|Q - γZ| <= 1 - margin, since the remaining error grows with it:
   (1 - Q)/(γZ + 1 - Q);
-- ``q_pass``, ``q_stop``, ``q_ripple`` of a flat Q (fir): the widest one with that margin;
-- ``lead_time``: the lag of the drive at low frequencies, which delays no slow change of the form; where no Q keeps the
-  margin with it, the lead that allows the shortest ``q_time``; where Q is not free, the lead with the least
+- ``q_pass``, ``q_stop``, ``q_ripple`` of a flat Q (fir): the widest band with this margin;
+- ``lead_time``: the lag of the drive at low frequencies, so that slow changes of the form are not delayed; if no Q has
+  the margin with it, the lead that allows the shortest ``q_time``; if Q is not free, the lead with the smallest
   sup|Q - γZ|.
 
-For a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that keeps 60° and 6 dB. Its
-plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), where v0 is the
-velocity that makes F0. It includes the feedback delay, but neither limits nor elasticity nor keyways.
+For a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that has margins of 60° and
+6 dB. Its plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), where
+v0 is the velocity that causes F0. It includes the feedback delay, but neither limits nor elasticity nor keyways.
 """
 
 import math

@@ -108,7 +108,7 @@ class Objectives:
 
     def _counts(self, values: Iterable[float]) -> float:
         """Return the percentile of the cells' values, where smaller values are better."""
-        # The inverted distribution returns one of the values: an interpolation between infinite ones would be NaN.
+        # The inverted distribution returns one of the values: interpolation between infinite values would give NaN.
         return float(np.percentile(list(values), self.percentile, method="inverted_cdf"))
 
 

@@ -69,7 +69,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
-    # All is drawn before anything is written: an error in a figure leaves the old page with its old pictures.
+    # All figures are drawn before any file is written: after an error the old page still matches its figures.
     pngs = {place / f"{name}.png": drawn.png(name, _SCALE) for name in drawn.specs}
     try:
         place.mkdir(exist_ok=True)
@@ -137,7 +137,7 @@ def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
 
 def _outcomes(seen: PageData) -> list[list[str]]:
     """Return one row per outcome of the cells: status, number, share, and the reason of one cell as an example."""
-    # Reasons that differ only in their numbers are one outcome.
+    # Reasons that differ only in numbers count as one outcome.
     groups: dict[tuple[str, str], list[int]] = {}
     statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
     for place, (status, reason) in enumerate(zip(statuses, reasons, strict=True)):
@@ -215,7 +215,7 @@ def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
     some = list(axes[:_MOST_AXES])
     free = [axis for axis in axes if not axis.tied]
     pairs = max(math.comb(len(some), 2), 1)
-    # Values are shown one by one only as far as the data sets of all pairs stay within the size of a page.
+    # Individual values are shown only if the data sets of all pairs do not exceed the size limit of a page.
     exact = min(int(math.sqrt(_MOST_FIELDS / pairs)), len(seen.cells) // 2)
     exact = _MOST_ALONE if len(free) == 1 and pairs == 1 else exact
     most = int(np.clip(math.sqrt(len(seen.cells) / _FIELD), 4, _MOST_BINS))

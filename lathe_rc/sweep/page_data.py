@@ -20,7 +20,7 @@ from lathe_rc.sweep.folder import Folder
 GOAL = "tool.max_error"
 _LARGE = ("margin",)  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
-_MOST_TEXTS = 24  # texts of an axis with a colour of their own; the rest share one
+_MOST_TEXTS = 24  # strings of an axis with separate colours; the others share one
 
 
 class PageData:

@@ -221,7 +221,7 @@ def compute(
         cell = bench.cell(scenario)
         cell.check(cures=False)
         keeper = _Keeper(cell, cell.samples, measures)
-        started = True  # from here on an InputError is a failure of the run, no refusal
+        started = True  # from here on an InputError is a failure of the run, not of the check
         row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples}
     except LatheError as error:
         refused = isinstance(error, InputError) and not started

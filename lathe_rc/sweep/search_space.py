@@ -95,7 +95,7 @@ def _dimension(scenario: Scenario, target: str, told: str | Sequence[Value]) -> 
         values = axis(scenario, target, told)
         if row.type is float and not row.is_list:
             values = [float(cast("float", value)) for value in values]
-        # Optuna's choices are scalars alone: texts stand for them, so that a choice may be a list.
+        # Optuna's choices must be scalars: strings represent the values, so that a value may be a list.
         choices = {_text(value): value for value in values}
         if len(choices) < 2:
             raise InputError(

@@ -46,7 +46,7 @@ class Drawn(NamedTuple):
     """Probability distribution of a sampled parameter.
 
     Attributes:
-        law: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
+        law: distribution: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
         first, second: ends of the range, or mean and standard deviation.
     """
 
@@ -69,19 +69,19 @@ class Space:
     """Variations of a cell.
 
     Targets are ``NODE.PARAM``, ``NODE.PARAM[K]`` for an element of a list, or ``PARAM`` for a shared parameter. A
-    number that ends in ``%`` is that part of the scenario's value.
+    number that ends in ``%`` is a percentage of the scenario's value.
 
     Attributes:
-        grid: values by target: a list, or a text: ``LOW:HIGH:COUNT`` (ends included), ``LOW:HIGH:COUNT:log``, or
-            values between commas.
-        sampled: laws by target, one value a point of the sample: ``LOW:HIGH``, ``LOW:HIGH:log``,
+        grid: values by target: a list, or a string: ``LOW:HIGH:COUNT`` (ends included), ``LOW:HIGH:COUNT:log``, or
+            values separated by commas.
+        sampled: distributions by target, with one value per sample point: ``LOW:HIGH``, ``LOW:HIGH:log``,
             ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, or ``normal:DEVIATION`` about the scenario's value.
-        ties: formulas by target, such as ``fine_controller.q_time * 1.1``; names are targets, with + - * / **,
-            brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
+        ties: formulas of derived parameters by target, such as ``fine_controller.q_time * 1.1``: targets with
+            + - * / **, brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
         sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; empty if nothing is sampled.
-        seeds: cells that differ in their seed alone, from that of the scenario on, for each of the others.
-        given: cells one by one, values by target.
-        sample_seed: of the sample itself.
+        seeds: number of seeds per combination of the other values, starting at the scenario's seed.
+        given: individual cells, each as values by target.
+        sample_seed: random seed of the sample.
 
     Example:
         >>> import lathe_rc
@@ -182,7 +182,7 @@ class Space:
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
     """Yield points in the unit cube, shape (n, dimensions); a larger sample starts with the points of a smaller one."""
-    if name == "latin":  # all points at once; those of another count are others
+    if name == "latin":  # all points at once, since they depend on the count
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
     generator = np.random.default_rng(seed)

@@ -208,7 +208,7 @@ class Study:
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
             left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._is_left(trial, me)]
             number, batch = len(asked), self._asked.batch
-            # Batches end at multiples of their size, also after a stop: a trial knows the results of the same others.
+            # Batches end at multiples of their size, also after a restart: each trial uses the same results.
             missing = batch - number % batch if number % batch or not left else 0
             for _ in range(max(0, min(missing, most - number))):
                 self._study.sampler = self._sampler(number)
@@ -219,7 +219,7 @@ class Study:
                 self._study.sampler = self._sampler(each)
                 trial = self._trial(each)
                 trial.set_user_attr(_BY, me)
-                for target, dimension in self._space.items():  # a process that was stopped may have left some out
+                for target, dimension in self._space.items():  # a stopped process may not have drawn all
                     dimension.suggest(trial, target)
             return [trial for trial in self._study.get_trials() if trial.number in left]
 
@@ -245,7 +245,7 @@ class Study:
             for number, each in jobs.items():
                 self._tell(number, self._objectives.score(self._known[job.key] for job in each))
             tuning = self.tuning()
-            # Within the lock: a process that knows fewer trials could write its best one over this one.
+            # Within the lock: a process with fewer trials could overwrite this best trial with an older one.
             if best := tuning.best:
                 tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})
@@ -270,7 +270,7 @@ class Study:
         for place, violation in enumerate(score.violations):
             trial.set_constraint(str(place), violation)
         known = [min(cost, _UNKNOWN) for cost in score.costs]
-        # CMA-ES knows no constraints: an infeasible trial costs more than all others, and the less the nearer it is.
+        # CMA-ES has no constraints: an infeasible trial costs more than all others, increasing with its violation.
         if self._asked.sampler == "cmaes" and not score.feasible:
             known = [_UNKNOWN * (1.0 + sum(max(violation, 0.0) for violation in score.violations))]
         self._study.sampler = self._sampler(number)

@@ -137,7 +137,7 @@ def crew_for(
     scenario: Scenario, client: distributed.Client | None, scheduler: str | None, workers: int | None, watch: Watch
 ) -> Iterator[distributed.Client]:
     """Compile the kernels of a scenario, and yield a Dask client; arguments and events as in `run_sweep`."""
-    # Kernels are compiled here once, into the cache of all processes, instead of in every worker at the same time.
+    # Kernels are compiled once here, into the shared cache, instead of in every worker at the same time.
     for stages in compile_ahead(Cell(scenario.nodes).stages.values()):
         watch({"event": "compiling", "nodes": stages})
     with nullcontext(client) if client else client_of(scheduler, workers) as crew:
@@ -187,7 +187,7 @@ def keep(
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
     """Yield the cells of a space as jobs, numbered across all spaces of the folder in the order of their requests."""
     key = Key(folder)
-    # Of the only space no cell occurs twice: its cells need no table of keys, which may be millions.
+    # A single space has no duplicate cells: no table of keys is needed, which could have millions of entries.
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
             yield Job(number, key.of(values), values)

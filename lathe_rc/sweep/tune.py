@@ -74,7 +74,7 @@ def tune(
         client: client of Dask, in place of ``scheduler`` and ``workers``.
         watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the number of existing trials, and with
             ``told`` (tuning: all trials so far) after each batch, and ``waiting``, repeatedly, while other processes
-            compute the last trials.
+            compute the remaining trials.
 
     Raises:
         InputError: the arguments are invalid, or the folder has other contents.

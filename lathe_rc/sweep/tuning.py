@@ -109,7 +109,7 @@ class Tuning:
     def front(self) -> list[Trial]:
         """Pareto front of the feasible trials, sorted by the first goal; for one goal, only the best trial."""
         found: list[Trial] = []
-        # In this order only a trial that is there already can be as good in all goals.
+        # In this order, only a trial already on the front can be as good in all goals.
         for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
             if not any(np.less_equal(other.score.costs, trial.score.costs).all() for other in found):
                 found.append(trial)

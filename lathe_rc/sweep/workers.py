@@ -32,17 +32,17 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.sweep import row
 from lathe_rc.sweep.row import Measure
 
-TASK = 2.0  #: [s] of a task
+TASK = 2.0  #: aimed duration of a task [s]
 _GROWTH = 4  # largest ratio of a task's cells to those of the one before
 _MOST = 4096  # most cells of a task
-_LEAST = 8  # towards the end tasks get shorter, down to this fraction of the others
-_AHEAD = 2  # tasks for each thread of the workers: one runs, and the next one is ready at the scheduler
+_LEAST = 8  # towards the end tasks get shorter, down to the fraction 1/8 of the others
+_AHEAD = 2  # tasks per worker thread: one runs, and the next one is ready at the scheduler
 _CONNECT = 5  # [s] to reach a scheduler
 _SETTINGS = {  # of this machine's workers
-    # Dask blames the death of a worker on every task that it holds: so it holds only the one that runs.
+    # Dask counts the death of a worker against every task assigned to it: so only the running task is assigned.
     "distributed.scheduler.worker-saturation": 1.0,
     # By default Dask profiles a worker every 10 ms, checks its event loop every 20 ms and its memory every 100 ms:
-    # that takes a tenth of the time of short cells.
+    # that takes 10 % of the time of short cells.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "200ms",
     "distributed.worker.memory.monitor-interval": "1s",
