@@ -29,7 +29,7 @@ def scenarios(_ctx: click.Context, _param: click.Parameter | None, incomplete: s
 
 
 def kinds(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete a kind of node."""
+    """Complete the name of a kind of node."""
     from lathe_rc.cell.scenario import TABLES
 
     return beginning(TABLES, incomplete)

@@ -114,7 +114,7 @@ class Result:
 
     @property
     def simulated_s(self) -> float:
-        """Simulated time [s]."""
+        """Simulated time of the run [s]."""
         return self.samples * self.scenario.shared.step
 
     @property
@@ -156,12 +156,12 @@ class Result:
 
     @cached_property
     def digest(self) -> dict[str, str]:
-        """Digest of each signal topic."""
+        """Digest of each signal topic, by topic name."""
         return self.recording.digests()
 
     @cached_property
     def event_log(self) -> list[LogEntry]:
-        """Events, alarms and reactions, in order."""
+        """Log of the run's events, alarms and reactions, in order."""
         return entries(self.recording)
 
     def summary(self) -> dict[str, object]:

@@ -71,7 +71,7 @@ class Bins:
 
     @property
     def count(self) -> int:
-        """Number of bins."""
+        """Number of bins of the axis."""
         return self.mid.size
 
 

@@ -102,14 +102,14 @@ def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: In
 
 
 def pair(first: Bins, second: Bins, goal: Samples) -> Rows:
-    """Return the data set of a pair of axes."""
+    """Return the data set of a pair of axes: statistics of the goal in each pair of bins."""
     group = np.where((first.index < 0) | (second.index < 0), -1, first.index * second.count + second.index)
     a, b = np.divmod(np.arange(first.count * second.count), second.count)
     return _grouped(group, a.size, goal, "msl", a=a, b=b)
 
 
 def one(place: Bins, goal: Samples) -> Rows:
-    """Return the data set of one axis."""
+    """Return the data set of one axis: statistics of the goal in each bin."""
     return _grouped(place.index, place.count, goal, "mslpq", a=np.arange(place.count))
 
 

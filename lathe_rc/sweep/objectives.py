@@ -66,7 +66,7 @@ class Score(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether all constraints are met."""
+        """Whether the trial meets all constraints."""
         return all(violation <= 0.0 for violation in self.violations)
 
 

@@ -253,7 +253,7 @@ def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
 
 
 def _best(seen: PageData) -> dict[str, Any]:
-    """Return the table of the best cells."""
+    """Return the table of the best cells, with their parameters and goals."""
     places = seen.goal.order[:_BEST].tolist()
     others = [goal for goal in seen.goals if goal is not seen.goal and goal.name in ("tool.rms_error", "margin")]
     goals = [seen.goal, *others]

@@ -120,7 +120,7 @@ class PageData:
 
     @cached_property
     def seeds(self) -> int:
-        """Number of different seeds."""
+        """Number of different seeds in the cells."""
         return len(set(self.table.column("seed").to_pylist()) - {None})
 
     @property

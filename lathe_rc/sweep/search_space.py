@@ -26,7 +26,7 @@ class Dimension(NamedTuple):
 
     @property
     def ends(self) -> list[Value]:
-        """Ends of the range, or all values of the list."""
+        """Ends of the parameter's range, or all values of its list."""
         if isinstance(self.distribution, CategoricalDistribution):
             return list((self.choices or {}).values())
         return [self.distribution.low, self.distribution.high]
@@ -36,7 +36,7 @@ class Dimension(NamedTuple):
         return cast("Value", encoded) if self.choices is None else self.choices[encoded]
 
     def encoded(self, value: Value) -> Any:
-        """Encode a value for Optuna."""
+        """Encode a parameter value for Optuna."""
         return value if self.choices is None else _text(value)
 
     def suggest(self, trial: Trial, target: str) -> None:

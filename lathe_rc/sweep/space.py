@@ -55,7 +55,7 @@ class Drawn(NamedTuple):
     second: float
 
     def at(self, quantile: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values at quantiles between 0 and 1, shape (n,)."""
+        """Return the values of the distribution at quantiles between 0 and 1, shape (n,)."""
         if self.law == "normal":
             return np.asarray(scipy.stats.norm.ppf(quantile, self.first, self.second))
         if self.law == "log":
@@ -110,7 +110,7 @@ class Space:
         return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))
 
     def count(self, scenario: Scenario) -> int:
-        """Return the number of cells."""
+        """Return the number of cells that the space has for a scenario."""
         axes = [len(axis(scenario, target, told)) for target, told in self.grid.items()]
         return math.prod(axes) * max(self._points(), 1) * max(len(self.given), 1) * self.seeds
 

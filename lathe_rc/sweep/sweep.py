@@ -53,7 +53,7 @@ class Sweep:
         return self.folder.table()
 
     def frame(self) -> "pd.DataFrame":
-        """Return the rows as a pandas data frame."""
+        """Return the rows of the sweep as a pandas data frame."""
         return self.table().to_pandas()
 
     def statuses(self) -> dict[str, int]:

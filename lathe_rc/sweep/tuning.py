@@ -77,7 +77,7 @@ class Tuning:
 
     @property
     def feasible(self) -> list[Trial]:
-        """Trials that meet all constraints."""
+        """Feasible trials: they meet all constraints."""
         return [trial for trial in self.trials if trial.score.feasible]
 
     @property
