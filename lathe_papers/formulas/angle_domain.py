@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plant in the angle domain: differential equations over the spindle angle φ, with coefficients that the speed sets.
+"""Plant in the angle domain: differential equations in the spindle angle φ with speed-dependent coefficients.
 
     Σ a_i·pⁱ X(t) = Σ b_k·pᵏ Y(t)            p = d/dt      (paper 000, eq. 6)
     Σ A_i(φ)·sⁱ X(φ) = Σ B_k(φ)·sᵏ Y(φ)      s = d/dφ      (eq. 7)
 
-p = Ω·s, but p² = Ω²·s² + (dΩ/dt)·s and so on: a power of p holds all lower powers of s as well. Three sets of
-coefficients:
+p = Ω·s, but p² = Ω²·s² + (dΩ/dt)·s and so on: a power of p contains all lower powers of s as well. Three sets of
+coefficients are available:
 
 - exact: pⁱ = Σ_k P_ik·sᵏ with the Bell polynomials P_ik of Ω, dΩ/dt, ... (Faà di Bruno's formula);
 - quasi-static, A_i = a_i·Ωⁱ (eq. 9): exact for first order and for constant speed;
@@ -33,10 +33,10 @@ _LONGEST_STEP = 0.2  # of the integration, in time constants of the fastest pole
 
 
 def speed_derivatives(law: SpeedLaw, time: Array, count: int) -> Array:
-    """Ω, dΩ/dt, d²Ω/dt², ... at ``time`` [s], shape (count, n) [rad/s, rad/s², ...].
+    """Return Ω, dΩ/dt, d²Ω/dt², ... at ``time`` [s], shape (count, n) [rad/s, rad/s², ...].
 
     Raises:
-        InputError: more than two are wanted of a tachogram, whose dΩ/dt has jumps.
+        InputError: ``count`` exceeds 2 for a tachogram, whose dΩ/dt has jumps.
     """
     if law.tachogram.size and count > 2:
         raise InputError("a tachogram has no second derivative; use harmonic deviations for plants above second order")
@@ -54,14 +54,14 @@ def speed_derivatives(law: SpeedLaw, time: Array, count: int) -> Array:
 
 
 def operator_powers(derivatives: Array, order: int) -> Array:
-    """P with pⁱ = Σ_k P[i, k]·sᵏ, for i and k from 0 to ``order``.
+    """Return the matrix P with pⁱ = Σ_k P[i, k]·sᵏ, for i and k from 0 to ``order``.
 
     Args:
-        derivatives: Ω, dΩ/dt, ..., at least ``order`` of them, shape (order, n).
+        derivatives: Ω, dΩ/dt, ..., at least ``order`` rows, shape (order, n).
         order: highest power.
 
     Returns:
-        Shape (order + 1, order + 1, n) [1/sⁱ].
+        P, shape (order + 1, order + 1, n) [1/sⁱ].
     """
     powers = np.zeros((order + 1, order + 1, derivatives.shape[1]))
     powers[0, 0] = 1.0
@@ -74,37 +74,46 @@ def operator_powers(derivatives: Array, order: int) -> Array:
 
 
 def exact(polynomial: Array, derivatives: Array) -> Array:
-    """A_k = Σ_i a_i·P_ik from a_0, a_1, ... and Ω, dΩ/dt, ...; shapes (m,), (≥ m - 1, n), result (m, n)."""
+    """Return the exact coefficients A_k = Σ_i a_i·P_ik from a_0, a_1, ... and Ω, dΩ/dt, ...
+
+    Shapes: polynomial (m,), derivatives (≥ m - 1, n), result (m, n).
+    """
     return np.asarray(np.einsum("i,ikn->kn", polynomial, operator_powers(derivatives, polynomial.size - 1)))
 
 
 def quasi_static(polynomial: Array, speed: Array) -> Array:
-    """A_i = a_i·Ωⁱ (paper 000, eq. 9); shapes (m,), (n,) [rad/s], result (m, n)."""
+    """Return the quasi-static coefficients A_i = a_i·Ωⁱ (paper 000, eq. 9).
+
+    Shapes: polynomial (m,), speed (n,) [rad/s], result (m, n).
+    """
     return np.asarray(polynomial[:, None] * speed ** np.arange(polynomial.size)[:, None])
 
 
 def linearised(polynomial: Array, nominal: float, speed: Array) -> Array:
-    """A_i = a_i·(Ω0ⁱ + i·Ω0ⁱ⁻¹·ΔΩ) (paper 000, eq. 12); shapes (m,), (n,) [rad/s], result (m, n)."""
+    """Return the linearised coefficients A_i = a_i·(Ω0ⁱ + i·Ω0ⁱ⁻¹·ΔΩ) (paper 000, eq. 12).
+
+    Shapes: polynomial (m,), speed (n,) [rad/s], result (m, n).
+    """
     power = np.arange(polynomial.size)[:, None]
     return np.asarray(polynomial[:, None] * nominal**power * (1.0 + power * (speed / nominal - 1.0)))
 
 
 class Signal(Protocol):
-    """Y(φ) and its derivatives, called as SciPy's splines are."""
+    """Input Y(φ) and its derivatives, with the call signature of SciPy's splines."""
 
     def __call__(self, angle: Array, derivative: int, /) -> Array:
-        """The ``derivative``-th derivative at ``angle`` [rad], shape (n,)."""
+        """Return the ``derivative``-th derivative at ``angle`` [rad], shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Harmonic:
-    """sin(order·φ + phase); ``phase`` in rad."""
+    """Harmonic input sin(order·φ + phase); ``phase`` in rad."""
 
     order: float
     phase: float = 0.0
 
     def __call__(self, angle: Array, derivative: int, /) -> Array:
-        """The ``derivative``-th derivative at ``angle`` [rad], shape (n,)."""
+        """Return the ``derivative``-th derivative at ``angle`` [rad], shape (n,)."""
         return np.asarray(
             self.order**derivative * np.sin(self.order * angle + self.phase + derivative * np.pi / 2),
         )
@@ -112,9 +121,9 @@ class Harmonic:
 
 @kernel
 def _integrate(lower: Array, forcing: Array, steps: Array) -> Array:
-    """x, x', ..., x⁽ᵐ⁻¹⁾ of x⁽ᵐ⁾ = f - Σ c_i·x⁽ⁱ⁾ from rest, by Runge-Kutta steps of fourth order.
+    """Integrate x⁽ᵐ⁾ = f - Σ c_i·x⁽ⁱ⁾ from rest with the fourth-order Runge-Kutta method; return x, x', ..., x⁽ᵐ⁻¹⁾.
 
-    ``lower`` (m, 2n + 1) and ``forcing`` (2n + 1,) hold c and f at the ends and the middles of the ``steps`` (n,).
+    ``lower`` (m, 2n + 1) and ``forcing`` (2n + 1,) contain c and f at the ends and midpoints of the ``steps`` (n,).
     """
     order = lower.shape[0]
     out = np.zeros((order, steps.size + 1))
@@ -139,19 +148,19 @@ def _integrate(lower: Array, forcing: Array, steps: Array) -> Array:
 
 @dataclass(frozen=True)
 class AngleDomain:
-    """A plant and a spindle, simulated over the angle and, for the truth, over time.
+    """Plant and spindle, simulated in the angle domain and, as the reference solution, in the time domain.
 
-    Both start from rest at angle 0. Where the numerator differentiates, the jump of Y at the start moves the plant at
-    once over time but not over the angle: compare them after the start is forgotten.
+    Both simulations start from rest at angle 0. If the numerator differentiates, the jump of Y at the start moves the
+    plant immediately in the time domain, but not in the angle domain: compare them after this transient has decayed.
 
     Args:
-        denominator: a_0, a_1, ..., a_n of eq. 6, n from 1 [sⁱ].
-        numerator: b_0, b_1, ..., b_m of eq. 6, m at most n [sᵏ].
+        denominator: coefficients a_0, a_1, ..., a_n of eq. 6, n >= 1 [sⁱ].
+        numerator: coefficients b_0, b_1, ..., b_m of eq. 6, m <= n [sᵏ].
         law: spindle speed, above 0.
-        angle: places at which the response is wanted [rad], increasing from 0, shape (points,).
+        angle: angles at which the response is computed [rad], increasing from 0, shape (points,).
 
     Raises:
-        InputError: no such plant, angle or speed.
+        InputError: invalid plant, angle or speed.
     """
 
     denominator: Array
@@ -173,7 +182,7 @@ class AngleDomain:
 
     @cached_property
     def _parts(self) -> int:
-        """Steps of the integration in each interval of ``angle``."""
+        """Number of integration steps in each interval of ``angle``."""
         poles = np.roots(self.denominator[::-1])
         fastest = max(np.abs(poles).max(), self.law.lines[1].max(initial=0.0))
         widest = np.diff(self.angle).max() * fastest / self.law.speed_range()[0]
@@ -181,17 +190,17 @@ class AngleDomain:
 
     @cached_property
     def _nodes(self) -> Array:
-        """Angles at the ends and middles of all steps [rad]."""
+        """Angles at the ends and midpoints of all integration steps [rad]."""
         place = np.arange((self.angle.size - 1) * 2 * self._parts + 1) / (2 * self._parts)
         return np.interp(place, np.arange(self.angle.size), self.angle)
 
     @cached_property
     def _time(self) -> Array:
-        """When the spindle is there [s], by Newton's method from a table."""
+        """Times at which the spindle reaches these angles [s], computed by Newton's method from a table."""
         step = float(np.diff(self._nodes).max()) / self.law.nominal
         table = np.arange(self.law.samples_until(float(self.angle[-1]), step) + 2) * step
         time = np.interp(self._nodes, self.law.at(table)[0], table)
-        for _ in range(4):  # each doubles the digits; the table is good to a few, four times leave only rounding
+        for _ in range(4):  # each doubles the correct digits; the table has a few, so four leave only rounding
             angle, speed, _ = self.law.at(time)
             time -= (angle - self._nodes) / speed
         return np.asarray(time)
@@ -208,14 +217,14 @@ class AngleDomain:
         return linearised(polynomial, self.law.nominal, self._derivatives[0])
 
     def response(self, signal: Signal, coefficients: Coefficients) -> Array:
-        """X(φ) of eq. 7 at ``angle``, shape (points,), in the unit of Y.
+        """Return X(φ) of eq. 7 at ``angle``, shape (points,), in the unit of Y.
 
         Args:
-            signal: Y(φ), smooth between two of the places ``angle``.
-            coefficients: which set.
+            signal: Y(φ), smooth between consecutive values of ``angle``.
+            coefficients: name of the coefficient set.
 
         Raises:
-            InputError: the linearised A_n is not above 0 everywhere, so that its equation has no solution.
+            InputError: the linearised A_n is not positive everywhere, so that its equation has no solution.
         """
         left, right = self._set(self.denominator, coefficients), self._set(self.numerator, coefficients)
         if np.any(left[-1] / self.denominator[-1] <= 0.0):
@@ -230,13 +239,13 @@ class AngleDomain:
         return np.asarray(_integrate(left[:-1] / left[-1], forcing / left[-1], steps)[0, :: self._parts])
 
     def truth(self, signal: Signal) -> Array:
-        """X(t) of eq. 6 at the times when the spindle is at ``angle``, shape (points,).
+        """Return X(t) of eq. 6 at the times when the spindle is at ``angle``, shape (points,).
 
-        The equation is solved over time with its constant coefficients and needs no derivative of Y: with
-        Σ a_i·pⁱ w = Y it is X = Σ b_k·pᵏ w.
+        The equation is solved in time with its constant coefficients and needs no derivative of Y: with
+        Σ a_i·pⁱ w = Y, the response is X = Σ b_k·pᵏ w.
         """
         ends = self._time[::2]
-        # The middle of a step in time is not at the middle of the step in angle: Runge-Kutta needs its own.
+        # The midpoint of a step in time is not the midpoint of the step in angle: Runge-Kutta needs its own.
         time = np.empty_like(self._time)
         time[::2], time[1::2] = ends, (ends[1:] + ends[:-1]) / 2.0
         forcing = signal(self.law.at(time)[0], 0) / self.denominator[-1]
@@ -248,7 +257,10 @@ class AngleDomain:
 
 
 def harmonic_errors(domain: AngleDomain, order: float, settled: float) -> dict[Coefficients, float]:
-    """Largest error of X by set, for Y = sin(order·φ + ψ) over all phases ψ and angles from ``settled`` [rad] on."""
+    """Return the largest error of X per coefficient set, over all phases ψ and all angles from ``settled`` [rad] on.
+
+    The input is Y = sin(order·φ + ψ).
+    """
     signals = Harmonic(order), Harmonic(order, np.pi / 2)
     truth = [domain.truth(signal) for signal in signals]
     # A phase mixes the errors of sine and cosine; the worst phase at an angle gives their root sum of squares.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The coupled force and position loops of paper 004 as one linear system.
+"""Coupled force and position loops of paper 004 as one linear system.
 
     F = W1·v1 + W4·x + n,  x = W2·v2,  y = x + W3·F
     v1 = u1 - K1·u2,  v2 = u2 - K2·u1,  u1 = C1·(F_set - F·e^{-pτ}),  u2 = C2·(y_set - y·e^{-pτ})
 
-Its poles say whether the loops are stable together; a limit or a converter is not in it (see
+Its poles show whether the coupled loops are stable. Limits and converters are not modelled here (see
 `lathe_papers.formulas.coupled_simulation`).
 """
 
@@ -24,12 +24,12 @@ from lathe_rc.transfer import TransferFunction
 Complex = npt.NDArray[np.complex128]
 
 CONNECTIONS = {"none": (False, False), "k1": (True, False), "k2": (False, True), "both": (True, True)}
-#: which of K1 and K2 are on, by name
+#: active compensators (K1, K2), by name
 
 
 def plant(channels: Channels) -> Lti:
-    """The plant: inputs v1, v2 [1] and n [N], outputs F [N] and y [m]."""
-    # Inputs of the parts: v1, v2, F, x; outputs: W1, W2, W3, W4.
+    """Return the plant with inputs v1, v2 [1] and n [N] and outputs F [N] and y [m]."""
+    # Inputs of the subsystems: v1, v2, F, x; outputs: W1, W2, W3, W4.
     parts = control.append(*(state_space(part) for part in (channels.w1, channels.w2, channels.w3, channels.w4)))
     inside = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 1], [0, 1, 0, 0]], dtype=np.float64)
     into = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], dtype=np.float64)
@@ -39,22 +39,25 @@ def plant(channels: Channels) -> Lti:
 
 
 def _connected(parts: Lti, inside: npt.NDArray[np.float64], *around: npt.NDArray[np.float64]) -> Lti:
-    """Parts with inputs inside·outputs + into·w and outputs out·outputs + through·w; ``around``: into, out, through."""
+    """Connect subsystems: inputs are inside·outputs + into·w, outputs are out·outputs + through·w.
+
+    ``around`` is (into, out, through).
+    """
     into, out, through = around
-    # A static system as the feedback solves the algebra of all connections at once, loops without a lag included.
+    # A static system as feedback solves all connections at once, algebraic loops included.
     closed = control.feedback(parts, control.ss([], [], [], inside), sign=1)
     return out * closed * into + control.ss([], [], [], through)
 
 
 @dataclass(frozen=True)
 class CoupledLoops:
-    """Plant, controllers and compensators.
+    """Closed force and position loops: plant, controllers and compensators.
 
     Args:
-        channels: the plant as it is.
-        k1, k2: compensators; None for one that is off.
-        force, position: the controllers.
-        wait: τ, from a measurement to the command made of it [s].
+        channels: channels W1 to W4 of the actual plant.
+        k1, k2: compensators; None if switched off.
+        force, position: controllers of the two loops.
+        wait: delay τ from a measurement to the command computed from it [s].
     """
 
     channels: Channels
@@ -65,14 +68,14 @@ class CoupledLoops:
     wait: float = 0.0
 
     def system(self) -> Lti:
-        """The closed loops: inputs F_set [N], y_set [m] and n [N], outputs F [N], y [m], u1 and u2 [1]."""
+        """Return the closed loops with inputs F_set [N], y_set [m], n [N] and outputs F [N], y [m], u1, u2 [1]."""
         nothing = control.ss([], [], [], [[0.0]])
         k1, k2 = (state_space(k) if k else nothing for k in (self.k1, self.k2))
         parts = control.append(
             state_space(self.force.transfer), state_space(self.position.transfer), k1, k2, plant(self.channels),
             delay(self.wait), delay(self.wait),
         )  # fmt: skip
-        # Outputs of the parts in this order, inputs likewise: e1, e2, u2, u1, v1, v2, n, F, y.
+        # Outputs and inputs of the subsystems, in this order: e1, e2, u2, u1, v1, v2, n, F, y.
         u1, u2, w1, w2, force, position, late_force, late_position = np.eye(8)
         none = np.zeros(8)
         inside = np.stack((-late_force, -late_position, u2, u1, u1 - w1, u2 - w2, none, force, position))
@@ -81,27 +84,27 @@ class CoupledLoops:
         return _connected(parts, inside, into, np.stack((force, position, u1, u2)), np.zeros((4, 3)))
 
     def poles(self) -> Complex:
-        """Poles of the closed loops [rad/s], those of compensators that are on included."""
+        """Return the poles of the closed loops [rad/s], including those of active compensators."""
         return np.asarray(self.system().poles(), dtype=np.complex128)
 
     def growth(self) -> float:
-        """Largest real part of the poles [1/s]; the loops are stable together where it is negative."""
+        """Return the largest real part of the poles [1/s]; the coupled loops are stable if it is negative."""
         return float(self.poles().real.max())
 
 
 def loops(
     preset: str = "paper", force_plant: str = "approximate", connection: str = "both", wait: float = 0.0
 ) -> CoupledLoops:
-    """The loops of paper 004, with compensators of the approximate plant as there.
+    """Return the loops of paper 004, with compensators of its approximate plant.
 
     Args:
         preset: ``paper`` or ``realistic``, see `lathe_rc.control.decoupler.PRESETS`.
-        force_plant: ``approximate``: the W1 that is printed; ``full``: the one that Fig. 12 belongs to.
+        force_plant: ``approximate``: W1 as printed; ``full``: the W1 that underlies Fig. 12.
         connection: ``none``, ``k1``, ``k2`` or ``both``.
-        wait: see `CoupledLoops` [s].
+        wait: delay τ from a measurement to its command [s], as in `CoupledLoops`.
 
     Raises:
-        InputError: a name that is not among these.
+        InputError: unknown name.
     """
     plants = {"approximate": None, "full": FULL_W1}
     for what, name, known in (
@@ -116,7 +119,7 @@ def loops(
 
 
 def faster(transfer: TransferFunction, factor: float) -> TransferFunction:
-    """Return the system with all its frequencies ``factor`` times as high."""
+    """Return the transfer function with all its frequencies multiplied by ``factor``."""
 
     def scaled(part: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(np.array(part) / factor ** np.arange(len(part))[::-1])
@@ -125,10 +128,10 @@ def faster(transfer: TransferFunction, factor: float) -> TransferFunction:
 
 
 def with_errors(known: CoupledLoops, factors: tuple[float, ...] = (0.5, 1.5)) -> Iterator[tuple[str, CoupledLoops]]:
-    """The loops with one parameter of the plant off by each factor, the compensators as they are.
+    """Yield the loops with one plant parameter off by each factor and the compensators unchanged.
 
     Yields:
-        A name such as ``w3_frequency x 0.5``, and the loops.
+        A name such as ``w3_frequency x 0.5``, and the loops with this error.
     """
     true = known.channels
     for factor in factors:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The coupled force and position loops of paper 004, sample by sample.
+"""Sample-by-sample simulation of the coupled force and position loops of paper 004.
 
-What the linear system of `lathe_papers.formulas.coupled_loops` leaves out: limits at the controllers and again at the
-drives, converters, set points that rise smoothly, and a delay of whole samples from a measurement to its command. The
-arithmetic of controllers and compensators is that of the cell. The plant is exact for commands and noise that are held
-between samples.
+It adds the effects that the linear system of `lathe_papers.formulas.coupled_loops` omits: limits at the controllers and
+at the drives, converters, smooth set points, and a delay of whole samples from a measurement to its command.
+Controllers and compensators use the same arithmetic as the cell. The plant is discretised exactly with a zero-order
+hold of commands and noise.
 """
 
 from typing import NamedTuple
@@ -23,19 +23,19 @@ from lathe_rc.transfer import System
 
 Array = npt.NDArray[np.float64]
 
-STEP = 50e-6  #: of the simulation in paper 004 [s]
+STEP = 50e-6  #: sampling step of the simulation in paper 004 [s]
 
 
 class PlantTable(NamedTuple):
-    """x[n+1] = Φ·x[n] + Γ·(v1, v2, noise)[n]; (F, y)[n] = c·x[n] + d·noise[n].
+    """Discrete plant x[n+1] = Φ·x[n] + Γ·(v1, v2, noise)[n]; (F, y)[n] = c·x[n] + d·noise[n].
 
     Attributes:
-        transition: Φ, shape (m, m).
-        weights: Γ, shape (m, 3).
-        output: c, shape (2, m).
-        through: d, shape (2,).
-        delay: samples from a measurement to its command.
-        limit: of v1 and v2.
+        transition: state transition matrix Φ, shape (m, m).
+        weights: input matrix Γ, shape (m, 3).
+        output: output matrix c, shape (2, m).
+        through: feedthrough d of the noise, shape (2,).
+        delay: delay from a measurement to its command [samples].
+        limit: limit of v1 and v2.
     """
 
     transition: Array
@@ -68,9 +68,9 @@ def _advance(
     v1: Array,
     v2: Array,
 ) -> int:
-    """Step through a block; returns how many commands the drives have cut off.
+    """Simulate one block and return the number of commands limited by the drives.
 
-    ``state`` is x and room for the next x; ``line`` is a ring of F and y, sample n at n modulo its length.
+    ``state`` holds x and space for the next x; ``line`` is a ring buffer of F and y: sample n at n modulo its length.
     """
     order, size = table.transition.shape[0], line.shape[1]
     cut = 0
@@ -94,30 +94,30 @@ def _advance(
             for column in range(order):
                 value += table.transition[row, column] * state[column]
             state[order + row] = value
-        # Only now: every row of the next x is made of the whole old one.
+        # Only now: every row of the next x depends on the complete old x.
         for row in range(order):
             state[row] = state[order + row]
     return cut
 
 
 class CoupledSimulation:
-    """Both loops, at rest at 0 before sample 0.
+    """Simulation of the coupled force and position loops, at rest at 0 before sample 0.
 
     Args:
-        loops: plant, gains and compensators; their ``wait`` is the number of samples of delay.
+        loops: plant, gains and compensators; their ``wait`` gives the delay in samples.
         step: sampling step [s].
-        limit: of u1, u2, v1 and v2; infinite for none.
-        adc: steps of the converters of force [N] and position [m]; 0 for none.
-        dac: step of both converters of the commands [1]; 0 for none.
-        ramp: fastest change of the force's set point [N/s]; 0 for any.
-        smoothing: time constant with which it is approached [s]; 0 for at once.
+        limit: limit of u1, u2, v1 and v2; infinite for none.
+        adc: quantisation steps of the force [N] and position [m] converters; 0 for none.
+        dac: quantisation step of both command converters [1]; 0 for none.
+        ramp: maximum rate of the force set point [N/s]; 0 for no limit.
+        smoothing: time constant of the smoothed force set point [s]; 0 for none.
 
     Attributes:
-        force_pid, position_pid: the controllers, with their counts.
-        cut: commands so far that the drives have cut off.
+        force_pid, position_pid: the controllers, with their counters.
+        cut: number of commands limited by the drives so far.
 
     Raises:
-        InputError: a delay that is no whole number of samples, or a plant that answers within a sample.
+        InputError: the delay is not a whole number of samples, or the plant responds within the same sample.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class CoupledSimulation:
                 "allowed: a whole number of samples"
             )
         continuous = plant(loops.channels)
-        # The kernel measures before it commands, so no command may reach the measurement of its own sample.
+        # The kernel measures before it commands, so no command may affect the measurement of its own sample.
         if np.any(continuous.D[:, :2]):
             raise InputError("coupled loops: a command acts on a measurement at once; allowed: W1 and W2 with a lag")
         system = control.c2d(continuous, step, "zoh")
@@ -164,17 +164,17 @@ class CoupledSimulation:
         v1: Array,
         v2: Array,
     ) -> None:
-        """Step from sample ``first`` on; arrays of shape (n,), the last four filled.
+        """Simulate one block starting at sample ``first``; arrays of shape (n,), the last four are outputs.
 
         Args:
             first: index of the first sample.
-            force_set: [N].
-            position_set: [m].
-            noise: n, force that the loops do not make [N].
-            force: F [N].
-            position: y [m].
-            v1: command of the longitudinal feed [1].
-            v2: command of the cross feed [1].
+            force_set: set point of the force [N].
+            position_set: set point of the position [m].
+            noise: n, disturbance force from outside the loops [N].
+            force: filled with the force F [N].
+            position: filled with the position y [m].
+            v1: filled with the command of the longitudinal feed [1].
+            v2: filled with the command of the cross feed [1].
         """
         pid1, pid2, both = self.force_pid, self.position_pid, self._decoupler
         self.cut += _advance(

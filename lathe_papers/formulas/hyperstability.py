@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conditions of hyperstability of the periodic law over the box of drives (paper 002, eqs 1 and 12-15).
 
-A drive is a row K, a1, a2, a3, a4 of eq. 1, so that several have the shape (m, 5). With the filter on y it is
+A drive is a row K, a1, a2, a3, a4 of eq. 1; an array of m drives has the shape (m, 5). With the filter on y it is
 
     G(p) = K·(T·p + 1)³/((p⁴ + a4·p³ + a3·p² + a2·p + a1)·(T*·p + 1)³)
 
 and closed by χ* it is G/(1 + χ*·G), the linear part of eq. 13. Its real part has the sign of Re(1/G) + χ*. At any
-frequency Re(1/G) is linear in a1 ... a4 and in 1/K: its least value over the box is at a corner.
+frequency Re(1/G) is linear in a1 ... a4 and in 1/K, so its minimum over the box is at a corner.
 
-The paper neglects T*, which makes G of first order at high frequencies. With T* it is of fourth order.
+The paper neglects T*, so that G is of first order at high frequencies. With T* it is of fourth order.
 """
 
 import itertools
@@ -27,24 +27,27 @@ Complex = npt.NDArray[np.complex128]
 
 NAMES = ("K", "a1", "a2", "a3", "a4")
 NOMINAL = np.array([19.0, 21.5, 48.0, 46.9, 10.2])  #: eq. 19
-BOX = np.array([[18.6, 19.5], [18.4, 23.5], [41.4, 64.0], [45.7, 50.0], [8.5, 16.5]])  #: least and largest, eq. 1
+BOX = np.array([[18.6, 19.5], [18.4, 23.5], [41.4, 64.0], [45.7, 50.0], [8.5, 16.5]])  #: minimum and maximum, eq. 1
 
 _FREQUENCIES = np.geomspace(1e-2, 1e5, 7001)  # [rad/s]
 _LEVELS = np.linspace(0.0, 1.0, 11)  # of sat(y_F)
 
 
 def corners() -> Array:
-    """The 32 corners of the box, shape (32, 5)."""
+    """Return the 32 corners of the box, shape (32, 5)."""
     return np.array(list(itertools.product(*BOX)))
 
 
 def plant(drive: Array) -> TransferFunction:
-    """Eq. 1 for one drive, shape (5,)."""
+    """Return the transfer function of eq. 1 for one drive, shape (5,)."""
     return fourth_order(*map(float, drive))
 
 
 def inverse_response(drives: Array, lead: float, lag: float, frequency: Array) -> Complex:
-    """1/G at ``frequency`` [rad/s], shape (n,), of each drive; shape (m, n). T and T* in s."""
+    """Return 1/G of each drive at ``frequency`` [rad/s], shape (m, n).
+
+    ``frequency`` has the shape (n,); ``lead`` T and ``lag`` T* are in s.
+    """
     p = 1j * frequency
     gain, a1, a2, a3, a4 = drives.T[:, :, None]
     return np.asarray(
@@ -54,13 +57,13 @@ def inverse_response(drives: Array, lead: float, lag: float, frequency: Array) -
 
 @dataclass(frozen=True)
 class Positivity:
-    """The condition of eq. 14 on χ*.
+    """Positivity condition of eq. 14 on χ*.
 
     Attributes:
-        least_gain: χ* from which on Re(1/G) + χ* > 0 for all drives and frequencies [1].
-        drive: that needs it, shape (5,).
-        frequency: at which it does [rad/s]; infinite if only the limit does.
-        hurwitz_gain: χ* up to which A* is Hurwitz for all drives [1].
+        least_gain: smallest χ* with Re(1/G) + χ* > 0 for all drives and frequencies [1].
+        drive: drive that requires ``least_gain``, shape (5,).
+        frequency: frequency that requires it [rad/s]; infinite if only the high-frequency limit does.
+        hurwitz_gain: largest χ* up to which A* is Hurwitz for all drives [1].
     """
 
     least_gain: float
@@ -70,12 +73,12 @@ class Positivity:
 
     @property
     def possible(self) -> bool:
-        """Whether any χ* meets eq. 14."""
+        """Whether any χ* satisfies eq. 14."""
         return self.least_gain < self.hurwitz_gain
 
 
 def _largest_hurwitz_gain(drive: Array, lead: float, lag: float) -> float:
-    """χ* from which on A* has a pole on the right; infinite if none does."""
+    """Return χ* from which on A* has a pole in the right half-plane; infinite if there is none."""
     gain, a1, a2, a3, a4 = drive
     bottom = np.polymul([1.0, a4, a3, a2, a1], np.poly([-1.0 / lag] * 3) * lag**3 if lag else [1.0])
     loop = control.TransferFunction(gain * lead**3 * np.poly([-1.0 / lead] * 3), bottom)
@@ -85,12 +88,12 @@ def _largest_hurwitz_gain(drive: Array, lead: float, lag: float) -> float:
 
 
 def positivity(drives: Array, lead: float, lag: float) -> Positivity:
-    """Eq. 14 for several drives, shape (m, 5).
+    """Evaluate eq. 14 for several drives, shape (m, 5).
 
     Args:
-        drives: rows of K, a1 ... a4; the corners stand for the box.
-        lead: T [s].
-        lag: T* [s]; 0 as the paper takes it.
+        drives: rows of K, a1 ... a4; the corners represent the box.
+        lead: time constant T [s].
+        lag: time constant T* [s]; the paper assumes 0.
     """
     real = inverse_response(drives, lead, lag, _FREQUENCIES).real
     frequency = _FREQUENCIES
@@ -104,15 +107,15 @@ def positivity(drives: Array, lead: float, lag: float) -> Positivity:
 
 
 def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Array:
-    """u°, the input that keeps y at r: (r'''' + a4·r''' + a3·r'' + a2·r' + a1·r)/K - f (eq. 5).
+    """Return u°, the input that keeps y at r: (r'''' + a4·r''' + a3·r'' + a2·r' + a1·r)/K - f (eq. 5).
 
     Args:
-        drives: shape (m, 5).
+        drives: rows of K, a1 ... a4, shape (m, 5).
         derivatives: r and its first four derivatives, shape (5, n) [1, 1/s, …].
-        disturbance: f, shape (n,).
+        disturbance: disturbance f, shape (n,).
 
     Returns:
-        Shape (m, n).
+                Array of shape (m, n).
     """
     # a1 ... a4 belong to r ... r''', and the fourth derivative has the factor 1.
     weights = np.column_stack((drives[:, 1:], np.ones(len(drives)))) / drives[:, :1]
@@ -120,34 +123,35 @@ def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Arr
 
 
 def popov_bound(gains: PeriodicGains, reference_gain: float, theta: Array, step_s: float) -> float:
-    """-η0 of eq. 15 for a switch that stays at 1 [s].
+    """Return -η0 of eq. 15 for a switch that stays at 1 [s].
 
     With w = u1 - θ the memory gives ∫w·v = (∫w² over the last period - ∫θ² over one)/(2·h0) + h0/2·∫v², and the
-    adaptive gain ∫(h11·I + χ*) dI ≥ -χ*²/(2·h11); the other parts are not negative.
+    adaptive gain ∫(h11·I + χ*) dI ≥ -χ*²/(2·h11); the other terms are not negative.
 
     Args:
-        gains: h0 and h11.
-        reference_gain: χ*.
+        gains: gains of the law, of which h0 and h11 are used.
+        reference_gain: reference gain χ*.
         theta: θ = χ*·r̂ + u° over a period, shape (n,).
-        step_s: between its samples [s].
+        step_s: sampling step of ``theta`` [s].
     """
     return float(-np.sum(theta**2) * step_s / (2.0 * gains.h0) - reference_gain**2 / (2.0 * gains.h11))
 
 
 def learning_factor(drives: Array, gains: PeriodicGains, level: float, memory_filter: float, frequency: Array) -> Array:
-    """By how much the memory's error changes in a period, |Q·(1 - h0·G/(1 + k·G))|, k = h0 + s²·(h12 + h11/p).
+    """Return the factor by which the memory error changes per period, |Q·(1 - h0·G/(1 + k·G))|.
 
-    Linear, for a y_F that stands still and δ̃ = 1; above 1 the memory grows at that frequency.
+    Here k = h0 + s²·(h12 + h11/p). The factor holds for the linear system with constant y_F and δ̃ = 1; where it
+    exceeds 1, the memory grows at that frequency.
 
     Args:
-        drives: shape (m, 5).
-        gains: of the law.
-        level: s = sat(y_F), 0 to 1.
+        drives: rows of K, a1 ... a4, shape (m, 5).
+        gains: gains of the law.
+        level: level s = sat(y_F), 0 to 1.
         memory_filter: σ of Q = exp(-(σω)²/2) [s]; 0 for none.
-        frequency: [rad/s], shape (n,).
+        frequency: frequencies [rad/s], shape (n,).
 
     Returns:
-        Shape (m, n).
+                Array of shape (m, n).
     """
     inner = gains.h0 + level**2 * (gains.h12 + gains.h11 / (1j * frequency))
     inverse = inverse_response(drives, gains.lead, gains.lag, frequency)
@@ -157,15 +161,15 @@ def learning_factor(drives: Array, gains: PeriodicGains, level: float, memory_fi
 
 @dataclass(frozen=True)
 class Learning:
-    """Where the memory learns, of all drives and all levels of y_F.
+    """Learning behaviour of the memory over all drives and all levels of y_F.
 
     Attributes:
-        grows_from: least and largest frequency from which on the memory without filter grows [rad/s]; each drive and
-            level has one.
-        largest: factor of a period with the filter [1].
-        drive: that has it, shape (5,).
-        level: sat(y_F) at which it does.
-        frequency: at which it does [rad/s].
+        grows_from: smallest and largest onset frequency over drives and levels [rad/s]; above it, the memory without
+            filter grows.
+        largest: largest factor per period with the filter [1].
+        drive: drive with the largest factor, shape (5,).
+        level: sat(y_F) of the largest factor.
+        frequency: frequency of the largest factor [rad/s].
     """
 
     grows_from: tuple[float, float]
@@ -176,9 +180,9 @@ class Learning:
 
 
 def learning(drives: Array, gains: PeriodicGains, memory_filter: float) -> Learning:
-    """Where the memory learns; see `learning_factor` for the arguments."""
+    """Evaluate the learning behaviour of the memory over all levels of y_F; arguments as in `learning_factor`."""
     bare = np.stack([learning_factor(drives, gains, level, 0.0, _FREQUENCIES) for level in _LEVELS])
-    # The factor nears 1 from above or below at high frequencies, where rounding would decide.
+    # The factor approaches 1 from above or below at high frequencies, where rounding would decide.
     above = bare > 1.0 + 1e-6
     first = _FREQUENCIES[np.argmax(above, axis=-1)][above.any(axis=-1)]
     factor = bare * np.exp(-0.5 * (memory_filter * _FREQUENCIES) ** 2)

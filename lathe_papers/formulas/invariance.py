@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correction that makes a first-order plant the same in the angle at any spindle speed.
+"""Correction that makes the response of a first-order plant over the angle independent of the spindle speed.
 
-The plant is 1/(1 + T0·p). Two elements stand before it, the substitute first (paper 000, eqs 13-17):
+The plant is 1/(1 + T0·p). Two elements precede it, the substitute first (paper 000, eqs 13-17):
 
-    Wk2:  (θ0/Ω)·dv/dt + v = Y          the plant that is wanted, 1/(1 + θ0·s) in the angle
-    Wk1:  u = v + T0·dv/dt              the inverse of the plant that there is
+    Wk2:  (θ0/Ω)·dv/dt + v = Y          the desired plant, 1/(1 + θ0·s) in the angle domain
+    Wk1:  u = v + T0·dv/dt              the inverse of the actual plant
 
-so that the plant's output is v itself, however the speed varies. dv/dt = (Ω/θ0)·(Y - v) is known from Wk2, so
+so that the output of the plant is v itself for any variation of the speed. dv/dt = (Ω/θ0)·(Y - v) is known from Wk2, so
 nothing is differentiated. Operators with varying parameters do not commute: Wk1 before Wk2 is not the same.
 """
 
@@ -30,9 +30,9 @@ def _advance(
     substitute: Array,
     command: Array,
 ) -> int:
-    """Step through a block; returns the sample at which the spindle turns back, or the number of samples.
+    """Compute one block; return the sample at which the spindle turns back, or the number of samples.
 
-    ``state`` holds v, and angle and Y of the sample before; the angle is NaN before the first.
+    ``state`` holds v and the angle and Y of the previous sample; the angle is NaN before the first sample.
     """
     v, last_angle, last = state[0], state[1], state[2]
     for k in range(angle.size):
@@ -40,7 +40,7 @@ def _advance(
         if h < 0.0:
             return k
         if h > 0.0:
-            # In the angle the equation has constant coefficients: exact for Y linear in the angle over the step.
+            # In the angle domain the equation has constant coefficients: exact for Y linear in the angle over the step.
             part = -np.expm1(-h)
             mean = part / h
             v += (last - v) * part + (desired[k] - last) * (1.0 - mean)
@@ -52,11 +52,11 @@ def _advance(
 
 
 class FirstOrderInvariance:
-    """Wk2 and Wk1 before a first-order plant; at rest before the first sample.
+    """Correction elements Wk2 and Wk1 of a first-order plant; at rest before the first sample.
 
     Args:
         time_constant: T0 of the plant [s].
-        angle_constant: θ0 of the substitute [rad]; T0·Ω0 makes it the plant at the nominal speed.
+        angle_constant: θ0 of the substitute [rad]; with T0·Ω0 it equals the plant at the nominal speed.
     """
 
     def __init__(self, time_constant: float, angle_constant: float) -> None:
@@ -64,17 +64,17 @@ class FirstOrderInvariance:
         self._state = np.array([0.0, np.nan, 0.0])
 
     def block(self, *, angle: Array, speed: Array, desired: Array, substitute: Array, command: Array) -> None:
-        """Step through a block; all arrays have the shape (n,).
+        """Compute one block; all arrays have the shape (n,).
 
         Args:
-            angle: spindle angle [rad], not falling.
+            angle: spindle angle [rad], non-decreasing.
             speed: spindle speed Ω [rad/s].
-            desired: Y, in any unit; linear in the angle between samples.
-            substitute: filled with v, the output of Wk2, which is what the plant will do.
+            desired: set point Y, in any unit; linear in the angle between samples.
+            substitute: filled with v, the output of Wk2, which is also the output of the plant.
             command: filled with u, the input of the plant.
 
         Raises:
-            LatheError: the angle falls.
+            LatheError: the angle decreases.
         """
         reached = _advance(
             self._time_constant, self._angle_constant, self._state, angle, speed, desired, substitute, command

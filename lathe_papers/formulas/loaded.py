@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tool drives give way to a force at the tool: x/F of `lathe_rc.plants.tool_drive` in continuous time.
+"""Compliance of the tool drives: x/F of `lathe_rc.plants.tool_drive` in continuous time.
 
-Its inverse is the dynamic stiffness, at p = 0 the static one. Times the radial part of the cutting force it is a
-deflection for `lathe_papers.formulas.regeneration`.
+Its inverse is the dynamic stiffness, and at p = 0 the static stiffness. Multiplied by the radial part of the cutting
+force, it is the deflection for `lathe_papers.formulas.regeneration`.
 """
 
 import numpy as np
@@ -19,20 +19,20 @@ def compliance(
     coil: Coil | None = None,
     force_constant: float = 0.0,
 ) -> TransferFunction:
-    """Tool over force of the electrodynamic drive alone [m/N].
+    """Return the compliance x/F of the electrodynamic drive alone [m/N].
 
-    With a current loop, whose sampling is left out,
+    With a current loop, whose sampling is neglected,
 
         m·p²·x = F - m·ωc·(ω² + 2ζω·p)·x/(p + ωc) - k²·p²·x/((L·p + R)·(p + ωc))
 
     where the last term is the back-EMF.
 
     Args:
-        natural_frequency: ω of the position loop [rad/s].
-        damping: its ζ.
-        moving_mass: m [kg].
-        coil: its current loop; None: an ideal one.
-        force_constant: k of the coil [N/A]; used where there is a current loop.
+        natural_frequency: natural frequency ω of the position loop [rad/s].
+        damping: damping ratio ζ of the position loop.
+        moving_mass: moving mass m [kg].
+        coil: current loop of the coil; None for an ideal coil.
+        force_constant: k of the coil [N/A]; used only with a current loop.
     """
     servo = np.array([2.0 * damping * natural_frequency, natural_frequency**2])
     if coil is None:
@@ -56,15 +56,15 @@ def compliance_in_series(
     tool_damping: float,
     mass_ratio: float,
 ) -> TransferFunction:
-    """Tool over force of both drives in series, with an ideal coil [m/N].
+    """Return the compliance x/F of both drives in series, with an ideal coil [m/N].
 
     Args:
-        natural_frequency: ω1 of the position loop of the carriage [rad/s].
-        damping: its ζ1.
-        moving_mass: M of the carriage [kg].
-        tool_frequency: ω2 of the tool on a blocked carriage [rad/s].
-        tool_damping: its ζ2.
-        mass_ratio: of the tool to the carriage.
+        natural_frequency: natural frequency ω1 of the position loop of the carriage [rad/s].
+        damping: damping ratio ζ1 of the position loop.
+        moving_mass: mass M of the carriage [kg].
+        tool_frequency: natural frequency ω2 of the tool on a blocked carriage [rad/s].
+        tool_damping: damping ratio ζ2 of the tool.
+        mass_ratio: mass of the tool over mass of the carriage.
     """
     tool = mass_ratio * moving_mass
     stack = tool * np.array([2.0 * tool_damping * tool_frequency, tool_frequency**2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of the example of paper 002: a drive of its box, from rest, period by period."""
+"""Simulation runs of the example of paper 002: one drive of its box, from rest, evaluated period by period."""
 
 from dataclasses import dataclass
 
@@ -16,35 +16,38 @@ Array = npt.NDArray[np.float64]
 
 SHOWN = 3  #: periods in the curves
 _POINTS = 250  # of each of them
-_SETTLING = 4  # periods in which the drive alone settles
+_SETTLING = 4  # periods until the drive alone settles
 
 
 def times(step: float) -> Array:
-    """Of the samples of the first period [s]; ``step`` in s.
+    """Return the sample times of the first period [s]; ``step`` in s.
 
     Raises:
-        InputError: the period is no whole number of steps.
+        InputError: the period is not a whole number of steps.
     """
     return np.asarray(np.arange(samples_in(PERIOD, step)) * step, dtype=np.float64)
 
 
 def ideal_input(drives: Array, time: Array) -> Array:
-    """u° of each drive, shape (m, 5), in a steady period, shape (m, n); ``time`` in s, shape (n,)."""
+    """Return u° of each drive in a steady period, shape (m, n).
+
+    ``drives`` has the shape (m, 5); ``time`` is in s, shape (n,).
+    """
     return required_input(drives, steady_derivatives(time), disturbance(time))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """The parameters that distinguish a run.
+    """Parameters of one run of the example.
 
     Attributes:
-        periods: to run.
-        step: [s].
-        s0: limit.
-        memory_filter: σ [s].
-        anti_windup: False for the paper's switch.
-        quantisation: of y and u; 0 for none.
-        gains: of the law.
+        periods: number of periods.
+        step: sampling step [s].
+        s0: limit of the input.
+        memory_filter: width σ of the memory filter [s].
+        anti_windup: False for the switch of the paper.
+        quantisation: quantisation step of y and u; 0 for none.
+        gains: gains of the law.
     """
 
     periods: int
@@ -58,13 +61,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run.
+    """Results of one run of the example.
 
     Attributes:
         period_max_error: largest |r - y| in each period, shape (periods,).
         period_integral: eq. 15 at the end of each period, shape (periods,) [s].
-        curves: time, r, y, S(u), f of the first periods, shape (5, points) [s, 1].
-        controller: after the last period.
+        curves: time, r, y, S(u) and f of the first periods, shape (5, points) [s, 1].
+        controller: controller state after the last period.
     """
 
     period_max_error: Array
@@ -74,14 +77,14 @@ class Outcome:
 
 
 def simulate(case: Case, drive: Array) -> Outcome:
-    """Run the example from rest.
+    """Simulate the example from rest.
 
     Args:
-        case: what to run.
+        case: parameters of the run.
         drive: K, a1 ... a4, shape (5,).
 
     Raises:
-        InputError: the period is no whole number of steps, or the law refuses a number.
+        InputError: the period is not a whole number of steps, or the law rejects a parameter.
     """
     time = times(case.step)
     controller = PeriodicController(
@@ -96,7 +99,7 @@ def simulate(case: Case, drive: Array) -> Outcome:
         ideal=ideal_input(drive[None], time)[0],
     )
     loop = PeriodicLoop(controller, plant(drive))
-    # The load acts from a sample to the next, so its value in the middle is its mean to second order.
+    # The load acts from one sample to the next, so its midpoint value equals its mean to second order.
     steady, load = steady_derivatives(time)[0], disturbance(time + case.step / 2.0)
     errors, integrals = np.empty((2, case.periods))
     output, command = np.empty((2, time.size))
@@ -114,7 +117,7 @@ def simulate(case: Case, drive: Array) -> Outcome:
 
 
 def limited_ideal_error(drive: Array, limit: float, step: float) -> float:
-    """Largest steady |r - y| of a drive that gets u°, limited to ±``limit``; ``step`` in s."""
+    """Return the largest steady |r - y| of a drive with input u° limited to ±``limit``; ``step`` in s."""
     time = times(step)
     load, wanted = disturbance(time), steady_derivatives(time)[0]
     machine, output = LinearSystem(plant(drive), step), np.empty(time.size)

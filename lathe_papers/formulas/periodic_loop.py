@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The example of paper 002 as `lathe_rc.signals.example_002` has it: parts, derivatives, the loop without a delay."""
+"""Example of paper 002, as in `lathe_rc.signals.example_002`: its terms, their derivatives, the loop without delay."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,20 +13,20 @@ Array = npt.NDArray[np.float64]
 
 
 def transient(time: Array) -> Array:
-    """The decaying part of eq. 17; ``time`` in s, any shape."""
+    """Return the decaying part of eq. 17; ``time`` in s, any shape."""
     return np.asarray(-0.1 * np.exp(-time))
 
 
 def disturbance(time: Array) -> Array:
-    """Eq. 18; ``time`` in s, any shape."""
+    """Return the disturbance of eq. 18; ``time`` in s, any shape."""
     return np.asarray(0.5 * np.sin(OMEGA * time) ** 2)
 
 
 def steady_derivatives(time: Array) -> Array:
-    """Eq. 17 without what decays, and its first four derivatives, shape (5, n); ``time`` in s, shape (n,).
+    """Return the steady part of eq. 17 and its first four derivatives, shape (5, n); ``time`` in s, shape (n,).
 
-    The third derivative jumps where the cosine is 0, by 12ω³ = 0.024 1/s³. The impulse that the fourth has there is
-    left out: no limited input makes it.
+    The third derivative jumps where the cosine is 0, by 12ω³ = 0.024 1/s³. The impulse of the fourth derivative
+    there is omitted: no limited input can produce it.
     """
     cosine, sine = np.cos(OMEGA * time), np.sin(OMEGA * time)
     size, slope = np.abs(cosine), -OMEGA * sine * np.sign(cosine)
@@ -50,23 +50,23 @@ def _run(
     output: Array,
     command: Array,
 ) -> None:
-    """Fill output and command."""
+    """Simulate one block, filling output and command."""
     for k in range(wanted.size):
-        # The input acts from this sample to the next: the output, which it does not reach at once, is known first.
+        # The input acts from this sample to the next, so the output of this sample is known first.
         output[k] = step(plant, plant_state, 0.0)
         command[k] = advance(law, state, first + k, wanted[k], output[k])
         plant_state[plant.now.size] = command[k] + load[k]
 
 
 class PeriodicLoop:
-    """A controller at its first sample and a drive at rest.
+    """Closed loop of a controller at its first sample and a drive at rest.
 
     Args:
-        controller: of the law.
-        drive: strictly proper, from S(u) + f to y.
+        controller: controller of the law.
+        drive: strictly proper plant from S(u) + f to y.
 
     Attributes:
-        controller: see above.
+        controller: controller of the law, with its state.
     """
 
     def __init__(self, controller: PeriodicController, drive: TransferFunction) -> None:
@@ -75,12 +75,12 @@ class PeriodicLoop:
         self._state = rest(self._plant)
 
     def block(self, first: int, wanted: Array, load: Array, output: Array, command: Array) -> None:
-        """Step from sample ``first`` on; arrays of shape (n,) [1].
+        """Simulate one block starting at sample ``first``; arrays of shape (n,) [1].
 
         Args:
             first: absolute index of the first sample.
-            wanted: r.
-            load: f, as it is between a sample and the next.
+            wanted: reference r.
+            load: f between each sample and the next.
             output: filled with y.
             command: filled with S(u).
         """

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stability of regenerative cutting: the edge meets what it left a revolution ago.
+"""Stability of regenerative cutting: the edge cuts the surface that it left one revolution earlier.
 
-The force of a deviation of the chip is K·ap, and the deflection σ·G·F comes back at once and, µ of it, a revolution T
-later with the other sign:
+The force due to a chip deviation is K·ap. The deflection σ·G·F acts on the chip immediately and, scaled by µ, one
+revolution T later with the opposite sign:
 
     1 + σ·K·G(p)·(1 - µ·e^{-pT}) = 0,  G = W3/(1 + p·lag)
 
 At µ = 1 the largest K that is stable at every speed is Tlusty's -1/(2·min Re σG): 2k·ζ·(1 + ζ) for a spring-mass-damper
-of stiffness k that is pushed away, 2k·ζ·(1 - ζ) for one that is drawn in (ζ < 0.5). Source: spec/feed-and-force.md, by
-which it is about 24 N/mm for W3 of paper 004 as printed and 469 N/mm for the realistic one.
+of stiffness k that is pushed away, 2k·ζ·(1 - ζ) for one that is drawn in (ζ < 0.5). Source: spec/feed-and-force.md,
+which gives about 24 N/mm for W3 of paper 004 as printed and 469 N/mm for the realistic W3.
 """
 
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ _SPAN = 30.0  # of the grid to either side of the outermost poles
 
 @dataclass(frozen=True)
 class Limit:
-    """Where regenerative cutting becomes unstable.
+    """Stability limit of regenerative cutting.
 
     Attributes:
         stiffness: K, smallest force over depth of cut that is unstable [N/m]; inf if none is.
-        frequency: of the chatter [rad/s]; 0 if the edge is drawn in without swinging.
-        phase: by which the surface comes back late, ωT modulo a revolution of it [rad], from 0 to 2π.
+        frequency: chatter frequency [rad/s]; 0 if the edge is drawn in without oscillation.
+        phase: phase lag of the returning surface, ωT modulo 2π [rad], from 0 to 2π.
     """
 
     stiffness: float
@@ -42,7 +42,7 @@ class Limit:
     phase: float
 
     def period(self, waves: int) -> float:
-        """Revolution time [s] at which there are ``waves`` whole waves and the phase around the part."""
+        """Return the revolution time [s] with ``waves`` whole waves plus the phase around the part."""
         if self.frequency == 0.0:
             return np.inf
         return float((self.phase + 2.0 * np.pi * waves) / self.frequency)
@@ -50,15 +50,15 @@ class Limit:
 
 @dataclass(frozen=True)
 class Regeneration:
-    """A cut whose edge meets its own surface.
+    """Regenerative cut: deflection of the edge, direction of the force and overlap.
 
     Attributes:
-        deflection: G, deflection over the force that the chip asks for [m/N]: W3, times the lag of the force.
-        away: the force pushes the edge away from the part (σ = 1); False draws it in (σ = -1).
-        overlap: µ.
+        deflection: G, deflection over the static force of the chip [m/N]: W3 times the lag of the force.
+        away: True if the force pushes the edge away from the part (σ = 1); False if it draws it in (σ = -1).
+        overlap: overlap factor µ.
 
     Raises:
-        InputError: an overlap that is none, or a deflection that is no stable one.
+        InputError: the overlap is invalid, or the deflection is not stable.
     """
 
     deflection: TransferFunction
@@ -73,11 +73,11 @@ class Regeneration:
             raise InputError(f"regeneration: deflection {self.deflection}; allowed: stable, with inertia or lag")
 
     def _signed(self, frequency: npt.ArrayLike) -> Complex:
-        """σ·G."""
+        """Signed deflection response σ·G."""
         return self.deflection.response(frequency) * (1.0 if self.away else -1.0)
 
     def _grid(self) -> Array:
-        """Frequencies [rad/s] that leave out no resonance: even in their logarithm, and close around each mode."""
+        """Frequency grid [rad/s] that resolves all resonances: logarithmic spacing, and dense around each mode."""
         poles = self.deflection.poles
         sizes = np.abs(poles)
         grids = [np.geomspace(sizes.min() / _SPAN, sizes.max() * _SPAN, _POINTS)]
@@ -88,17 +88,17 @@ class Regeneration:
         return together[together > 0.0]
 
     def critical(self, frequency: npt.ArrayLike) -> Array:
-        """Smallest K [N/m] that swings at ``frequency`` [rad/s] at some speed; inf where none does."""
+        """Return the smallest K [N/m] that chatters at ``frequency`` [rad/s] at some speed; inf if there is none."""
         g = self._signed(frequency)
-        # |1/K + G| = µ·|G|: the surface may come back at any phase.
+        # |1/K + G| = µ·|G|: the surface may return at any phase.
         inside = g.real**2 - (1.0 - self.overlap**2) * np.abs(g) ** 2
         inverse = -g.real + np.sqrt(np.maximum(inside, 0.0))
         with np.errstate(divide="ignore"):
             return np.where((inside >= 0.0) & (inverse > 0.0), 1.0 / inverse, np.inf)
 
     def worst(self) -> Limit:
-        """The limit at the worst of all speeds: below it every speed is stable."""
-        grid = np.append(0.0, self._grid())  # 0: ever slower, at a spindle that nearly stands
+        """Return the limit at the worst of all speeds; below it, every speed is stable."""
+        grid = np.append(0.0, self._grid())  # 0: the limit of ever slower oscillation, at a nearly stationary spindle
         values = self.critical(grid)
         k = int(np.argmin(values))
         if not np.isfinite(values[k]):
@@ -116,7 +116,7 @@ class Regeneration:
         return Limit(stiffness, frequency, float(-np.angle(back) % (2.0 * np.pi)))
 
     def at(self, period: float) -> Limit:
-        """The limit at one speed, by the Nyquist criterion; ``period`` of a revolution in s."""
+        """Return the limit at one speed by the Nyquist criterion; ``period`` is the revolution time in s."""
         if not period > 0.0:
             raise InputError(f"regeneration: revolution of {period:g} s; allowed: above 0")
 
@@ -125,7 +125,7 @@ class Regeneration:
             return np.asarray(-self._signed(w) * (1.0 - self.overlap * np.exp(-1j * w * period)))
 
         grid = self._grid()
-        # Even steps as well: e^{-jωT} turns by π/32 at most in each, so that no crossing is stepped over.
+        # Uniform steps as well: e^{-jωT} turns by at most π/32 per step, so that no crossing is missed.
         grid = np.union1d(grid, np.arange(grid[0], grid[-1], min(np.pi / (32.0 * period), grid[-1] / _POINTS)))
         values = loop(grid)
         # K·loop passes 1 where it is real and positive.
@@ -142,10 +142,10 @@ class Regeneration:
         return best
 
     def root(self, stiffness: float, period: float, near: complex) -> complex:
-        """The characteristic root p [1/s] that Newton's method finds from ``near``; its real part is the growth.
+        """Return the characteristic root p [1/s] by Newton's method from ``near``; its real part is the growth rate.
 
         Raises:
-            InputError: it finds none from there.
+            InputError: the iteration does not converge from ``near``.
         """
         top, bottom = np.array(self.deflection.numerator), np.array(self.deflection.denominator)
         sign = stiffness * (1.0 if self.away else -1.0)
@@ -164,12 +164,12 @@ class Regeneration:
 
 
 def lobes(cut: Regeneration, waves: int, frequencies: Array) -> tuple[Array, Array]:
-    """One lobe of the stability chart: spindle speeds [rad/s] and K [N/m], shape (m,).
+    """Return one lobe of the stability chart: spindle speeds [rad/s] and K [N/m], shape (m,).
 
     Args:
-        cut: the cut.
-        waves: whole waves around the part.
-        frequencies: of the chatter [rad/s], shape (m,); those at which nothing swings are left out.
+        cut: regenerative cut.
+        waves: number of whole waves around the part.
+        frequencies: chatter frequencies [rad/s], shape (m,); frequencies without chatter are omitted from the result.
     """
     stiffness = cut.critical(frequencies)
     swings = np.isfinite(stiffness)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frequency responses of drives, corrections and filters in continuous time.
 
-These are the ideals that papers 000 and 001 calculate with. What a cell runs is discrete and has responses of its
-own (`lathe_rc.plants.linear.DiscretePlant.response`); the formulas of `lathe_papers.formulas.structures` take either.
+Papers 000 and 001 calculate with these ideal responses. A cell runs discrete systems, which have their own responses
+(`lathe_rc.plants.linear.DiscretePlant.response`); the formulas of `lathe_papers.formulas.structures` accept both.
 """
 
 from collections.abc import Callable
@@ -16,31 +16,31 @@ Response = Callable[[Array], Complex]  #: of frequencies [rad/s], shape (n,)
 
 
 def second_order(frequency: npt.ArrayLike, natural_frequency: float, damping: float, delay: float = 0.0) -> Complex:
-    """e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), a drive closed by its own loops (spec of papers 000 and 001).
+    """Return e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), a drive closed by its own loops (spec of papers 000 and 001).
 
     Args:
-        frequency: [rad/s], any shape; so is the result.
-        natural_frequency: ωn [rad/s].
-        damping: ζ [1].
-        delay: τ [s].
+        frequency: frequencies [rad/s], any shape; the result has the same shape.
+        natural_frequency: natural frequency ωn [rad/s].
+        damping: damping ratio ζ [1].
+        delay: delay τ [s].
     """
     p = 1j * np.asarray(frequency, dtype=np.float64)
     return np.asarray(np.exp(-p * delay) / (1.0 + 2.0 * damping * p / natural_frequency + (p / natural_frequency) ** 2))
 
 
 def lead(frequency: npt.ArrayLike, time: float) -> Complex:
-    """e^{pT0}, the read ahead by ``time`` [s] in the memory (paper 000, eq. 20) at ``frequency`` [rad/s]."""
+    """Return e^{pT0}, the lead by ``time`` [s] in the memory (paper 000, eq. 20), at ``frequency`` [rad/s]."""
     return np.asarray(np.exp(1j * np.asarray(frequency, dtype=np.float64) * time))
 
 
 def lead_lag(frequency: npt.ArrayLike, lead_time: float, lag_time: float) -> Complex:
-    """(1 + pT1)/(1 + pT2), a series correction with T1 and T2 in s, at ``frequency`` [rad/s]."""
+    """Return (1 + pT1)/(1 + pT2), a series correction with T1 and T2 in s, at ``frequency`` [rad/s]."""
     p = 1j * np.asarray(frequency, dtype=np.float64)
     return np.asarray((1.0 + p * lead_time) / (1.0 + p * lag_time))
 
 
 def smoothing(frequency: npt.ArrayLike, time: float) -> Array:
-    """Q = 1/(1 + (ω·time)²), the zero-phase filter of two-sided exponential kernel, at ``frequency`` [rad/s].
+    """Return Q = 1/(1 + (ω·time)²), the zero-phase filter with two-sided exponential kernel, at ``frequency`` [rad/s].
 
     Paper 001 writes Wф = Q - 1.
     """
@@ -56,10 +56,10 @@ def in_series(
     carriage_natural_frequency: float,
     carriage_damping: float,
 ) -> Complex:
-    """Tool motion over piezo command when the piezo stands on the coarse carriage (paper 001, Fig. 1b).
+    """Return tool motion over piezo command for a piezo mounted on the coarse carriage (paper 001, Fig. 1b).
 
-    The piezo pushes the tool of mass m off the carriage of mass M, whose own loops hold it like a spring and a
-    damper. With Δ the piezo's stroke, x1 the carriage, μ = m/M and u the command:
+    The piezo pushes the tool of mass m off the carriage of mass M. The position loops of the carriage act like a spring
+    and a damper. With Δ the piezo's stroke, x1 the carriage, μ = m/M and u the command:
 
         Δ'' + x1'' + 2ζωn·Δ' + ωn²·Δ = ωn²·u
         x1'' + 2ζ1ω1·x1' + ω1²·x1 = -μ·(Δ'' + x1'')
@@ -67,12 +67,12 @@ def in_series(
     The result is (Δ + x1)/u. With μ = 0 it is the parallel arrangement (Fig. 1a), the piezo alone.
 
     Args:
-        frequency: [rad/s], any shape; so is the result.
+        frequency: frequencies [rad/s], any shape; the result has the same shape.
         natural_frequency: ωn of the piezo with the tool, on a rigid base [rad/s].
-        damping: ζ of the same [1].
-        mass_ratio: μ [1].
+        damping: ζ of the piezo with the tool [1].
+        mass_ratio: mass ratio μ [1].
         carriage_natural_frequency: ω1 of the closed coarse drive [rad/s].
-        carriage_damping: ζ1 of the same [1].
+        carriage_damping: ζ1 of the closed coarse drive [1].
     """
     p = 1j * np.asarray(frequency, dtype=np.float64)
     held = p**2 + 2.0 * carriage_damping * carriage_natural_frequency * p + carriage_natural_frequency**2

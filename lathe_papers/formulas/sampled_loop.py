@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled position servo of paper 003: in z, in the pseudo-frequency, and as it really moves between samples.
+"""Sampled position servo of paper 003: in z, in the pseudo-frequency, and as a simulation between the samples.
 
     z = (1 + jλ·T/2)/(1 - jλ·T/2),   λ = (2/T)·tan(ωT/2)
 
@@ -21,23 +21,23 @@ from lathe_rc.plants.feed_models import sampled
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-_BAND = 0.05  # of the step: settled is what stays within
-STEPS = 400  #: of the simulation in a period, to see what happens in it
+_BAND = 0.05  # settling band, relative to the step
+STEPS = 400  #: of the simulation per period, to resolve the motion between samples
 _POINTS = 400  # of a Bode plot
-_SETTLED = 1e-5  # what may be left of the slowest pole at the end of a response
+_SETTLED = 1e-5  # allowed residue of the slowest pole at the end of a response
 _MOST_PERIODS = 2000
-_SAME = 1e-9  # roots that differ by less are one
+_SAME = 1e-9  # roots closer than this count as equal
 
 
 @dataclass(frozen=True)
 class PseudoFrequency:
-    """K·(1 - jλ·T/2)·(1 + jλ·T2)/(jλ·(1 + jλ·T3)) (paper 003, eqs 4-7).
+    """Transfer function K·(1 - jλ·T/2)·(1 + jλ·T2)/(jλ·(1 + jλ·T3)) in the pseudo-frequency (paper 003, eqs 4-7).
 
     Attributes:
-        gain: K [1/s].
-        half_period: T/2 [s].
-        zero: T2 [s].
-        pole: T3 [s].
+        gain: gain K [1/s].
+        half_period: half of the sampling period, T/2 [s].
+        zero: time constant T2 of the zero [s].
+        pole: time constant T3 of the pole [s].
     """
 
     gain: float
@@ -46,14 +46,14 @@ class PseudoFrequency:
     pole: float
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Response at the pseudo-frequency λ [rad/s], any shape."""
+        """Return the response at the pseudo-frequency λ [rad/s], any shape."""
         s = 1j * np.asarray(frequency, dtype=np.float64)
         return np.asarray(
             self.gain * (1.0 - s * self.half_period) * (1.0 + s * self.zero) / (s * (1.0 + s * self.pole))
         )
 
     def closed(self) -> tuple[Array, Array]:
-        """Numerator and denominator of the closed loop, falling powers of z."""
+        """Return numerator and denominator of the closed loop in falling powers of z."""
         half, two = self.half_period, np.array([1.0, -1.0])
         zero, pole = (np.array([1.0, 1.0]) + time / half * two for time in (self.zero, self.pole))
         top = 2.0 * self.gain * half * zero
@@ -61,40 +61,40 @@ class PseudoFrequency:
         return top / bottom[0], bottom / bottom[0]
 
     def as_continuous(self) -> tuple[Array, Array]:
-        """Numerator and denominator of the closed loop with jλ read as p, falling powers of p.
+        """Return numerator and denominator of the closed loop with jλ read as p, in falling powers of p.
 
-        This is what the table of the paper was computed from.
+        The table of the paper was computed from this function.
         """
         top = self.gain * np.polymul([-self.half_period, 1.0], [self.zero, 1.0])
         return np.asarray(top), np.asarray(np.polyadd(top, [self.pole, 1.0, 0.0]))
 
 
 def pseudo_frequency(drive: SampledDrive) -> PseudoFrequency:
-    """The drive behind its hold: T2 = (T/2)·(b1 - b0)/(b1 + b0), T3 = (T/2)·(1 + d)/(1 - d)."""
+    """Return the drive behind its hold: T2 = (T/2)·(b1 - b0)/(b1 + b0), T3 = (T/2)·(1 + d)/(1 - d)."""
     half = drive.period / 2.0
     zero = half * (drive.b1 - drive.b0) / (drive.b1 + drive.b0)
     return PseudoFrequency(drive.gain, half, zero, half * (1.0 + drive.d) / (1.0 - drive.d))
 
 
 def desired(drive: SampledDrive, ratio: float) -> PseudoFrequency:
-    """The desired function with Te = ratio·T/2, K·(1 - jλ·T/2)·(1 + jλ·Te)/(jλ·(1 + jλ·T/2))."""
+    """Return the desired function K·(1 - jλ·T/2)·(1 + jλ·Te)/(jλ·(1 + jλ·T/2)) with Te = ratio·T/2."""
     half = drive.period / 2.0
     return PseudoFrequency(drive.gain, half, ratio * half, half)
 
 
 def series(top: Array, bottom: Array, terms: int) -> Array:
-    """X[0], X[T], … of a unit step through a rational function of z, shape (terms,)."""
+    """Return X[0], X[T], … of the response of a rational function of z to a unit step, shape (terms,)."""
     system = control.tf(top, bottom, 1.0)
     return np.asarray(control.step_response(system, np.arange(terms, dtype=np.float64)).outputs)
 
 
 @dataclass(frozen=True)
 class Measures:
-    """Measures of a step response.
+    """Overshoot and settling time of a step response.
 
     Attributes:
-        overshoot: relative to the step, 0 for none.
-        settling: last entry into the band of ±5 % [s]; None if it is not there at the end.
+        overshoot: overshoot relative to the step; 0 for none.
+        settling: time of the last entry into the ±5 % band [s]; None if the response ends outside the band.
     """
 
     overshoot: float
@@ -102,8 +102,8 @@ class Measures:
 
 
 def measures(time: Array, response: Array) -> Measures:
-    """Overshoot and settling of the response to a unit step, shape (n,) each [s, 1]."""
-    # step_info wants a response that rises through 90 %.
+    """Return overshoot and settling time of the response to a unit step, shape (n,) each [s, 1]."""
+    # step_info requires a response that rises through 90 %.
     if response.max() < 0.9:
         return Measures(0.0, None)
     found = control.step_info(response, time, SettlingTimeThreshold=_BAND, yfinal=1.0)
@@ -112,8 +112,8 @@ def measures(time: Array, response: Array) -> Measures:
 
 
 def continuous_step(top: Array, bottom: Array, time: Array) -> Array | None:
-    """Response of a continuous system to a unit step, shape (n,); None where it is unstable."""
-    # A leading coefficient that changes its sign passes through a pole at infinity.
+    """Return the response of a continuous system to a unit step, shape (n,); None if it is unstable."""
+    # A sign change of the leading coefficient corresponds to a pole passing through infinity.
     if bottom[0] * bottom[-1] <= 0.0 or np.roots(bottom).real.max() >= 0.0:
         return None
     return np.asarray(control.step_response(control.tf(top, bottom), time).outputs)
@@ -132,7 +132,7 @@ def _simulate(
     motor: Array,
     load: Array,
 ) -> None:
-    """A unit step at sample 0; the command acts from the sample on whose measurement it comes from."""
+    """Simulate a unit step at sample 0; each command acts from the sample of its measurement on."""
     for n in range(command.size):
         move(drive, drive_state)
         motor[n], load[n] = motor_of(drive_state), load_of(drive_state)
@@ -148,12 +148,12 @@ def _simulate(
 
 @dataclass(frozen=True)
 class StepResponse:
-    """A servo's response to a unit step, with what happens between the samples; arrays of shape (n,).
+    """Response of a servo to a unit step, including the motion between the samples; arrays of shape (n,).
 
     Attributes:
-        time: [s].
-        command: of the link, relative to the step.
-        motor, load: relative to the step.
+        time: times [s].
+        command: output of the link, relative to the step.
+        motor, load: positions relative to the step.
     """
 
     time: Array
@@ -163,24 +163,24 @@ class StepResponse:
 
     @property
     def at_samples(self) -> tuple[Array, Array]:
-        """Time and position of the motor where the controller looks."""
+        """Times and motor positions at the sampling instants of the controller."""
         return self.time[::STEPS], self.motor[::STEPS]
 
     @property
     def reversals(self) -> int:
-        """How often the load is taken back: changes of the direction in which it moves."""
+        """Number of direction changes of the load."""
         moves = np.diff(self.load)
         direction = np.sign(moves[moves != 0.0])
         return int(np.count_nonzero(np.diff(direction)))
 
     @property
     def offset(self) -> float:
-        """The load's remaining error at the end, relative to the step."""
+        """Remaining error of the load at the end, relative to the step."""
         return float(1.0 - self.load[-1])
 
 
 def periods_to_settle(drive: SampledDrive, link: Link, delay: float = 0.0) -> int | None:
-    """Periods until a loop is at rest; None if it never is."""
+    """Return the number of periods until a loop is at rest; None if it is unstable."""
     slowest = largest_pole(drive, link, delay)  # 0 for a dead-beat loop: hence max() below
     if slowest >= 1.0:
         return None
@@ -196,15 +196,15 @@ def step_response(
     feedback: Feedback = "load",
     delay: float = 0.0,
 ) -> StepResponse:
-    """Simulate a unit step; between samples the drive is exact.
+    """Simulate the response to a unit step, with the exact response of the drive between samples.
 
     Args:
-        drive: the motor.
-        link: before it.
-        periods: how long.
-        backlash: after the motor, relative to the step.
-        feedback: what is measured.
-        delay: by which the measurement comes late [s], rounded to a 400th of the period.
+        drive: the drive.
+        link: link that precedes the drive.
+        periods: number of periods to simulate.
+        backlash: backlash after the motor, relative to the step.
+        feedback: measured position, motor or load.
+        delay: delay of the measurement [s], rounded to 1/400 of the period.
     """
     step = drive.period / STEPS
     machine = FeedDrive(sampled(drive.gain, drive.lag), step=step, divisor=STEPS, backlash=backlash)
@@ -219,18 +219,18 @@ def step_response(
 
 @dataclass(frozen=True)
 class DesignReport:
-    """A link and its loop on paper.
+    """Design report of a link and its loop, without simulation.
 
     Attributes:
-        drive: what the link is for.
-        link: its coefficients.
-        poles: of the closed loop, those that cancel a zero included.
-        stable: whether the closed loop is.
-        gain_margin: factor by which the gain may rise; infinite if by any, NaN where the loop is unstable.
-        phase_margin: [rad]; NaN where the loop is unstable.
-        crossover: pseudo-frequency at which it is taken, where the gain of the open loop is 1 [rad/s].
+        drive: drive for which the link is designed.
+        link: coefficients of the link.
+        poles: poles of the closed loop, including poles that cancel a zero.
+        stable: whether the closed loop is stable.
+        gain_margin: factor by which the gain may increase; infinite without a limit, NaN if the loop is unstable.
+        phase_margin: phase margin [rad]; NaN if the loop is unstable.
+        crossover: pseudo-frequency of the phase margin, where the gain of the open loop is 1 [rad/s].
         frequency: pseudo-frequencies λ of the Bode plot [rad/s], shape (n,).
-        response: of the open loop there, shape (n,).
+        response: open-loop response at these frequencies, shape (n,).
     """
 
     drive: SampledDrive
@@ -244,10 +244,10 @@ class DesignReport:
     response: Complex
 
     def text(self) -> str:
-        """W(z), W(jλ), D(z), poles and margins, a line each."""
+        """Return W(z), W(jλ), D(z), poles and margins as text, one per line."""
         drive, pseudo = self.drive, pseudo_frequency(self.drive)
         top, bottom = (" ".join(f"{c:.5g}" for c in part) for part in (self.link.numerator, self.link.denominator))
-        # A double pole at 0 is found to the root of the rounding only.
+        # A double pole at 0 is accurate only to the square root of the rounding error.
         rounded = np.round(self.poles, 4) + 0.0
         poles = ", ".join(f"{pole:g}" if pole.imag else f"{pole.real:g}" for pole in rounded)
         gain = f"(1 - {pseudo.half_period:g}jλ)(1 + {pseudo.zero:.4f}jλ)"
@@ -266,7 +266,7 @@ class DesignReport:
 
 
 def _cancel(zeros: npt.NDArray[Any], poles: npt.NDArray[Any]) -> tuple[list[complex], list[complex]]:
-    """Zeros and poles without those that are the same but for rounding."""
+    """Remove zeros and poles that coincide to within rounding."""
     left, kept = [complex(pole) for pole in poles], []
     for zero in zeros:
         near = min(left, key=lambda pole: abs(pole - zero), default=np.inf)
@@ -278,11 +278,11 @@ def _cancel(zeros: npt.NDArray[Any], poles: npt.NDArray[Any]) -> tuple[list[comp
 
 
 def open_loop(drive: SampledDrive, link: Link) -> control.TransferFunction:
-    """D·W as a rational function of jλ, in python-control's continuous form; what can be cancelled is."""
+    """Return D·W as a rational function of jλ, in python-control's continuous form, with common factors cancelled."""
     top = np.polymul(link.numerator, drive.numerator)
     zeros, poles = _cancel(np.roots(top), np.roots(np.polymul(link.denominator, drive.denominator)))
     half = drive.period / 2.0
-    # z = 1/r stands for the zeros at infinity, which go to jλ = 2/T.
+    # z = 1/r represents the zeros at infinity, which map to jλ = 2/T.
     places = [np.array([(root - 1.0) / (root + 1.0) / half for root in roots]) for roots in (zeros, poles)]
     places[0] = np.append(places[0], np.full(len(poles) - len(zeros), 1.0 / half))
     factor = float(np.real(top[0] * np.prod([root + 1.0 for root in zeros]) / np.prod([r + 1.0 for r in poles])))
@@ -290,7 +290,7 @@ def open_loop(drive: SampledDrive, link: Link) -> control.TransferFunction:
 
 
 def _gain_margin(loop: control.TransferFunction) -> float:
-    """How many times the gain may rise; infinite if by any."""
+    """Return the factor by which the gain may increase; infinite without a limit."""
     found, *_ = control.stability_margins(loop, returnall=True)
     # At an infinite pseudo-frequency, half the sampling rate, the response is real too.
     end = float(loop.num[0][0][0] / loop.den[0][0][0]) if loop.num[0][0].size == loop.den[0][0].size else 0.0
@@ -299,7 +299,7 @@ def _gain_margin(loop: control.TransferFunction) -> float:
 
 
 def report(drive: SampledDrive, link: Link) -> DesignReport:
-    """Poles, margins and Bode plot in the pseudo-frequency, of a loop without delay."""
+    """Compute poles, margins and Bode plot in the pseudo-frequency for a loop without delay."""
     loop = open_loop(drive, link)
     poles = np.asarray(np.roots(closed_loop(drive, link)), dtype=np.complex128)
     gain_margin, phase_margin, crossover = np.nan, np.nan, np.nan

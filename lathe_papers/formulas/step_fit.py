@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of a drive from its measured step response (paper 000, Fig. 4, eqs 18 and 19).
+"""Models of a drive fitted to its measured step response (paper 000, Fig. 4, eqs 18 and 19).
 
     first order                1/(1 + p·T0)                               (18)
     delay                      e^{-p·T0}                                  (19)
-    second order               1/(1 + 2ζp/ωn + p²/ωn²)                    what the paper recommends next
+    second order               1/(1 + 2ζp/ωn + p²/ωn²)                    the next step that the paper recommends
     second order with delay    e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²)
 
-All have Wi(0) = 1, as in the paper. A fit makes the mean square of the residual over time least.
+All have Wi(0) = 1, as in the paper. A fit minimises the mean square of the residual over time.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,14 +29,14 @@ Complex = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class StepResponse:
-    """A measured response to a step of 1 at time 0.
+    """Measured response to a step of 1 at time 0.
 
     Args:
-        time: increasing [s], shape (n,), n from 8.
-        response: relative to the step [1], shape (n,); ends near 1.
+        time: increasing times [s], shape (n,) with n >= 8.
+        response: response relative to the step [1], shape (n,); ends near 1.
 
     Raises:
-        InputError: it is no such response.
+        InputError: the data violate these conditions.
     """
 
     time: Array
@@ -61,67 +61,67 @@ class StepResponse:
             )
 
     def residual(self, model: "Model") -> Array:
-        """The model's residual, weighted so that its sum of squares is the mean square over time."""
+        """Return the residual of the model, weighted so that its sum of squares is the mean square over time."""
         between = np.diff(self.time)
         # Trapezoids: without them, parts of the response with many samples would count more.
         weight = (np.append(between, 0.0) + np.append(0.0, between)) / 2.0
         return np.asarray((model.step(self.time) - self.response) * np.sqrt(weight / weight.sum()))
 
     def rms(self, model: "Model") -> float:
-        """RMS over time of what the model misses [1]."""
+        """Return the RMS over time of the residual of the model [1]."""
         return float(np.sqrt(np.sum(self.residual(model) ** 2)))
 
 
 class Model(Protocol):
-    """A drive with Wi(0) = 1."""
+    """Model of a drive with Wi(0) = 1."""
 
     def step(self, time: Array) -> Array:
-        """Response to a unit step at time 0; ``time`` in s, shape (n,)."""
+        """Return the response to a unit step at time 0; ``time`` in s, shape (n,)."""
 
     def response(self, frequency: Array) -> Complex:
-        """Wi(jω); ``frequency`` in rad/s, shape (n,)."""
+        """Return the frequency response Wi(jω); ``frequency`` in rad/s, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """1/(1 + p·T0) (paper 000, eq. 18); ``time_constant`` in s."""
+    """First-order model 1/(1 + p·T0) (paper 000, eq. 18); ``time_constant`` T0 in s."""
 
     time_constant: float
 
     def step(self, time: Array) -> Array:
-        """Response to a unit step at time 0, shape (n,)."""
+        """Return the response to a unit step at time 0, shape (n,)."""
         return -np.expm1(-np.maximum(time, 0.0) / self.time_constant)
 
     def response(self, frequency: Array) -> Complex:
-        """Wi(jω), shape (n,)."""
+        """Return the frequency response Wi(jω), shape (n,)."""
         return np.asarray(1.0 / (1.0 + 1j * frequency * self.time_constant))
 
 
 @dataclass(frozen=True)
 class Delay:
-    """e^{-p·T0} (paper 000, eq. 19); ``delay`` T0 in s."""
+    """Delay model e^{-p·T0} (paper 000, eq. 19); ``delay`` T0 in s."""
 
     delay: float
 
     def step(self, time: Array) -> Array:
-        """Response to a unit step at time 0, shape (n,)."""
+        """Return the response to a unit step at time 0, shape (n,)."""
         return np.where(time >= self.delay, 1.0, 0.0)
 
     def response(self, frequency: Array) -> Complex:
-        """Wi(jω), shape (n,)."""
+        """Return the frequency response Wi(jω), shape (n,)."""
         return np.asarray(np.exp(-1j * frequency * self.delay))
 
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²); ωn in rad/s, τ in s."""
+    """Second-order model with delay e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²); ωn in rad/s, τ in s."""
 
     natural_frequency: float
     damping: float
     delay: float = 0.0
 
     def step(self, time: Array) -> Array:
-        """Response to a unit step at time 0, shape (n,); for any damping."""
+        """Return the response to a unit step at time 0, shape (n,), for any damping."""
         t = np.maximum(time - self.delay, 0.0) * self.natural_frequency
         # Poles -ζ ± d in units of ωn. At d = 0 the quotient below is 0/0; a d this small changes nothing.
         d = np.sqrt(complex(self.damping**2 - 1.0))
@@ -131,7 +131,7 @@ class SecondOrder:
         return np.asarray(1.0 - ((slow + fast) / 2.0 + self.damping * (slow - fast) / (2.0 * d)).real)
 
     def response(self, frequency: Array) -> Complex:
-        """Wi(jω), shape (n,)."""
+        """Return the frequency response Wi(jω), shape (n,)."""
         return second_order(frequency, self.natural_frequency, self.damping, self.delay)
 
 
@@ -139,7 +139,7 @@ M = TypeVar("M", bound=Model)
 
 
 def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high: Array, starts: Iterable[Array]) -> M:
-    """The best of least-squares fits of ``build(x)`` with ``x`` in bounds from several starts, shape (k,) each."""
+    """Return the best of several bounded least-squares fits of ``build(x)``, one per start, shape (k,) each."""
 
     def residual(x: Array) -> Array:
         return measured.residual(build(x))
@@ -152,26 +152,27 @@ def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high:
 
 
 def _half(measured: StepResponse) -> Array:
-    """When the response rises through 1/2 [s], at least once; straight between its points."""
+    """Return the times at which the response rises through 1/2 [s], at least one, by linear interpolation."""
     time, rest = np.append(0.0, measured.time), np.append(-0.5, measured.response - 0.5)
     at = np.flatnonzero((rest[:-1] < 0.0) & (rest[1:] >= 0.0))
     return np.asarray(time[at] - rest[at] * (time[at + 1] - time[at]) / (rest[at + 1] - rest[at]))
 
 
 def fit_delay(measured: StepResponse) -> Delay:
-    """Least-squares fit of eq. 19.
+    """Fit the delay model of eq. 19 by least squares.
 
-    The mean square changes with T0 as 2h(T0) - 1, so its least value is where the response rises through 1/2.
+    The derivative of the mean square with respect to T0 is 2h(T0) - 1, so its minimum lies where the response rises
+    through 1/2.
     """
     return min((Delay(float(time)) for time in _half(measured)), key=measured.rms)
 
 
 def fit_first_order(measured: StepResponse) -> FirstOrder:
-    """Least-squares fit of eq. 18."""
+    """Fit the first-order model of eq. 18 by least squares."""
     end, nearest = measured.time[-1], np.diff(measured.time).min()
     return _best(
         measured,
-        lambda x: FirstOrder(float(np.exp(x[0]))),  # the logarithm keeps it above 0 at any scale
+        lambda x: FirstOrder(float(np.exp(x[0]))),  # the logarithm keeps T0 positive at any scale
         np.log([nearest / 100.0]),
         np.log([end * 10.0]),
         [np.log([max(_half(measured)[0], nearest)])],
@@ -179,7 +180,7 @@ def fit_first_order(measured: StepResponse) -> FirstOrder:
 
 
 def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
-    """Least-squares fit of second order, with or without a delay."""
+    """Fit the second-order model by least squares, with or without a delay."""
     end, nearest = measured.time[-1], np.diff(measured.time).min()
     half = max(float(_half(measured)[0]), nearest)
 
@@ -189,7 +190,7 @@ def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
     size = 3 if delayed else 2
     low = np.array([np.log(0.1 / end), np.log(0.01), 0.0])[:size]
     high = np.array([np.log(100.0 / nearest), np.log(100.0), end / half])[:size]
-    # Several starts, because ωn and τ can stand in for each other and the fit has local minima.
+    # Several starts, because ωn and τ can compensate for each other and the fit has local minima.
     # Half of the step is reached at about (1 + 0.7ζ)/ωn after the delay.
     starts = [
         np.array([np.log((1.0 + 0.7 * damping) / (half * (1.0 - part))), np.log(damping), part])[:size]
@@ -202,10 +203,10 @@ def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
 def read_csv(path: Path) -> StepResponse:
     """Read a step response from a CSV file.
 
-    Columns ``time_ms`` [ms], from the step on, and ``response``, relative to the step.
+    The columns are ``time_ms`` [ms], starting at the step, and ``response``, relative to the step.
 
     Raises:
-        InputError: the file is missing or malformed, or holds no step response.
+        InputError: the file is missing or malformed, or does not contain a step response.
     """
     _, rows = read_table(path, [("time_ms", "response")], "step response")
     try:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steady errors and stability of the multi-channel structures of paper 001.
 
-Every formula is one of complex responses at the same frequencies: Q of the smoothing filter, Z = Wi/W0 of the drive
-with its correction, Wpk of the piezo. They may be ideals (`lathe_papers.formulas.responses`) or those of difference
-equations. Where paper 001 writes Wф, it is Q - 1.
+Every formula takes complex responses at the same frequencies: Q of the smoothing filter, Z = Wi/W0 of the drive with
+its correction, Wpk of the piezo. The responses may be ideal (`lathe_papers.formulas.responses`) or those of difference
+equations. Wф of paper 001 is Q - 1.
 
-In the iterative structure (Fig. 6) each channel's reference is the error of the channel before, and no channel
-sees those after it. So each converges by itself, and the slowest decides.
+In the iterative structure (Fig. 6) the reference of each channel is the error of the previous channel, and no channel
+depends on later channels. Each channel therefore converges by itself, and the slowest determines the overall rate.
 """
 
 import math
@@ -20,23 +20,23 @@ import scipy
 from lathe_papers.formulas.responses import Array, Complex, Response, lead, lead_lag, second_order, smoothing
 from lathe_rc.errors import InputError
 
-_GRID = 4097  # frequencies looked at before the worst is refined
+_GRID = 4097  # frequencies evaluated before the worst is refined
 
 
 def steady_error(q: npt.ArrayLike, z: npt.ArrayLike, gain: float = 1.0, cycle_phase: npt.ArrayLike = 0.0) -> Complex:
-    """δ/Xd of one self-learning channel after many cycles (paper 001, eqs 3 and 5, which have γ = 1).
+    """Return δ/Xd of one self-learning channel after many cycles (paper 001, eqs 3 and 5 for γ = 1).
 
-    With r = e^{-jνθ}, what a component turns by in a cycle, Y = r·(Q·Y + γ·δ), X = Z·Y and δ = Xd - X give
+    With r = e^{-jνθ}, the rotation of a component per cycle, Y = r·(Q·Y + γ·δ), X = Z·Y and δ = Xd - X give
 
         δ/Xd = (1 - r·Q)/(1 - r·Q + γ·r·Z)        and for r = 1   (1 - Q)/(γZ + 1 - Q)
 
     Args:
-        q: Q, shape (n,) or what broadcasts with the others; so is the result.
-        z: Z, the same.
-        gain: γ.
+        q: response Q, shape (n,) or broadcastable with the other arguments, like the result.
+        z: response Z, of a broadcastable shape.
+        gain: learning gain γ.
         cycle_phase: νθ [rad] of a component with ν waves per revolution and the cycle angle θ. Only its
-            remainder of 2π counts: 0 for a form that repeats in each cycle; something else for ν that are not
-            whole, as a form has that changes along the part.
+            value modulo 2π matters: 0 for a form that repeats in each cycle, nonzero for non-integer ν, as with a form
+            that changes along the part.
     """
     turn = np.exp(-1j * np.asarray(cycle_phase, dtype=np.float64))
     forgotten = 1.0 - turn * np.asarray(q)
@@ -44,20 +44,23 @@ def steady_error(q: npt.ArrayLike, z: npt.ArrayLike, gain: float = 1.0, cycle_ph
 
 
 def uncompensated(compensator: npt.ArrayLike) -> Complex:
-    """1 - Wpk: what direct compensation leaves of a vibration Δx (paper 001, eq. 6), shape as given."""
+    """Return 1 - Wpk, the remaining fraction of a vibration Δx under direct compensation (paper 001, eq. 6).
+
+    The result has the shape of the argument.
+    """
     return np.asarray(1.0 - np.asarray(compensator, dtype=np.complex128))
 
 
 def direct_compensation(coarse: npt.ArrayLike, compensator: npt.ArrayLike) -> Complex:
-    """E·(1 - Wpk), the steady error E of the coarse channel with a piezo commanded by it (paper 001, eq. 7)."""
+    """Return E·(1 - Wpk), the steady error with a piezo commanded by the coarse channel error E (paper 001, eq. 7)."""
     return np.asarray(np.asarray(coarse) * uncompensated(compensator))
 
 
 def iterative(*errors: npt.ArrayLike) -> Complex:
-    """E1·E2·…, the steady error of self-learning channels in the iterative structure (paper 001, eqs 11-13).
+    """Return E1·E2·…, the steady error of self-learning channels in the iterative structure (paper 001, eqs 11-13).
 
     Args:
-        errors: δ/Xd of each channel by itself, coarsest first; one or more, shape (n,) each.
+        errors: δ/Xd of each channel alone, coarsest first; at least one, shape (n,) each.
     """
     product = np.asarray(errors[0], dtype=np.complex128)
     for error in errors[1:]:
@@ -66,12 +69,12 @@ def iterative(*errors: npt.ArrayLike) -> Complex:
 
 
 def contraction(q: npt.ArrayLike, z: npt.ArrayLike, gain: float = 1.0) -> Array:
-    """|Q - γZ|, the factor by which a cycle shrinks what is left to learn; shape as given."""
+    """Return |Q - γZ|, the factor by which each cycle reduces the learning error; shape as given."""
     return np.abs(np.asarray(q) - gain * np.asarray(z))
 
 
 def cycles(factor: npt.ArrayLike, fraction: float) -> Array:
-    """Cycles after which ``fraction`` of what is to be learned is left; inf where the ``factor`` of a cycle is >= 1.
+    """Return the cycles until ``fraction`` of the learning error remains; inf where the ``factor`` per cycle is >= 1.
 
     Raises:
         InputError: the fraction is not between 0 and 1.
@@ -87,39 +90,39 @@ def cycles(factor: npt.ArrayLike, fraction: float) -> Array:
 
 @dataclass(frozen=True)
 class Peak:
-    """Where a response is largest: frequency [rad/s] and magnitude there."""
+    """Peak of a response: frequency [rad/s] and magnitude."""
 
     frequency: float
     magnitude: float
 
 
 def supremum(response: Response, highest: float) -> Peak:
-    """Largest magnitude of a response from 0 to ``highest`` [rad/s]; of Q - γZ it has to be below 1.
+    """Return the peak of a response from 0 to ``highest`` [rad/s]; for Q - γZ its magnitude has to be below 1.
 
-    The grid of 4097 frequencies finds a resonance that is wider than ``highest``/4096.
+    The grid of 4097 frequencies resolves resonances wider than ``highest``/4096.
     """
     grid = np.linspace(0.0, highest, _GRID)
     magnitude = np.abs(response(grid))
     worst = int(np.argmax(magnitude))
     ends = float(grid[max(worst - 1, 0)]), float(grid[min(worst + 1, _GRID - 1)])
     near = scipy.optimize.minimize_scalar(lambda w: -abs(response(np.array([w]))[0]), bounds=ends, method="bounded")
-    # The bounded search never looks at its ends, where a response without a resonance is largest.
+    # The bounded search never evaluates its ends, where a response without a resonance is largest.
     if -near.fun > magnitude[worst]:
         return Peak(float(near.x), float(-near.fun))
     return Peak(float(grid[worst]), float(magnitude[worst]))
 
 
 def lead_errors(q: Response, z: Response, highest: float, gain: float = 1.0) -> tuple[float, float]:
-    """How much too short and too long the lead may be: the changes of T0 [s] at which sup|Q - γZ| reaches 1.
+    """Return the limits of the lead error: the negative and positive changes of T0 [s] at which sup|Q - γZ| = 1.
 
     Args:
-        q: Q.
-        z: Z with the lead as designed; a change d of T0 makes it Z·e^{jωd}.
-        highest: largest frequency looked at [rad/s].
-        gain: γ.
+        q: response Q of the smoothing filter.
+        z: response Z with the lead as designed; a change d of T0 turns it into Z·e^{jωd}.
+        highest: highest frequency of the search [rad/s].
+        gain: learning gain γ.
 
     Returns:
-        The negative and the positive limit [s], infinite if no lead is too long.
+        The negative and the positive limit [s]; the positive limit is infinite if no lead is too long.
 
     Raises:
         InputError: the loop does not converge as designed.
@@ -135,7 +138,7 @@ def lead_errors(q: Response, z: Response, highest: float, gain: float = 1.0) -> 
         raise InputError(f"sup|Q - γZ| = {excess(0.0) + 1.0:.4g} with the lead as designed; allowed: below 1")
 
     def limit(sign: float) -> float:
-        # An eighth of a half turn at the highest frequency a step: no unstable range is stepped over.
+        # Steps of π/8 of phase at the highest frequency: no unstable range is missed.
         step = sign * math.pi / 8.0 / highest
         for k in range(1, _GRID):
             if excess(k * step) >= 0.0:
@@ -146,18 +149,18 @@ def lead_errors(q: Response, z: Response, highest: float, gain: float = 1.0) -> 
 
 
 def limit_frequency(compensator: Response, highest: float, level: float = 1.0) -> float:
-    """Frequency [rad/s] up to which direct compensation leaves less than ``level``: |1 - Wpk| < level.
+    """Return the frequency [rad/s] up to which direct compensation leaves less than ``level``: |1 - Wpk| < level.
 
-    With the level 1 it is where compensation begins to do harm (paper 001, eq. 8; its eq. 9, |Wpk| < 2, follows from
-    that but does not suffice). With 0.5 and a drive it is what paper 001 calls the bandwidth.
+    With a level of 1, compensation increases the vibration from this frequency on (paper 001, eq. 8; eq. 9, |Wpk| < 2,
+    is necessary but not sufficient). With a level of 0.5 and a drive, it is the bandwidth of paper 001.
 
     Args:
-        compensator: Wpk.
-        highest: largest frequency looked at [rad/s].
-        level: above 0.
+        compensator: response Wpk of the piezo.
+        highest: highest frequency of the search [rad/s].
+        level: remaining fraction, above 0.
 
     Returns:
-        The lowest such frequency; inf if there is none up to ``highest``.
+        The lowest frequency at which the level is reached; inf if there is none up to ``highest``.
     """
 
     def excess(frequency: float) -> float:
@@ -173,15 +176,15 @@ def limit_frequency(compensator: Response, highest: float, level: float = 1.0) -
 
 @dataclass(frozen=True)
 class Channel:
-    """A self-learning channel in continuous time.
+    """Self-learning channel in continuous time.
 
     Args:
-        natural_frequency: ωn of the drive [rad/s].
-        damping: ζ [1].
-        delay: τ [s].
-        lead_time: T0 [s].
-        q_time: of Q [s].
-        lead_lag: T1, T2 [s] of the series correction (1 + pT1)/(1 + pT2); equal ones are none.
+        natural_frequency: natural frequency ωn of the drive [rad/s].
+        damping: damping ratio ζ of the drive [1].
+        delay: delay τ of the drive [s].
+        lead_time: lead T0 [s].
+        q_time: time constant of Q [s].
+        lead_lag: T1, T2 [s] of the series correction (1 + pT1)/(1 + pT2); equal values disable it.
     """
 
     natural_frequency: float
@@ -192,22 +195,22 @@ class Channel:
     lead_lag: tuple[float, float] = (0.0, 0.0)
 
     def drive(self, frequency: npt.ArrayLike) -> Complex:
-        """Wi, or Wpk, at ``frequency`` [rad/s]."""
+        """Return the response of the drive, Wi or Wpk, at ``frequency`` [rad/s]."""
         return second_order(frequency, self.natural_frequency, self.damping, self.delay)
 
     def q(self, frequency: npt.ArrayLike) -> Array:
-        """Q at ``frequency`` [rad/s]."""
+        """Return the response of the smoothing filter Q at ``frequency`` [rad/s]."""
         return smoothing(frequency, self.q_time)
 
     def z(self, frequency: npt.ArrayLike) -> Complex:
-        """Z = Wi/W0 at ``frequency`` [rad/s]."""
+        """Return the response of the corrected drive, Z = Wi/W0, at ``frequency`` [rad/s]."""
         correction = lead(frequency, self.lead_time) * lead_lag(frequency, *self.lead_lag)
         return np.asarray(self.drive(frequency) * correction)
 
     def factor(self, frequency: npt.ArrayLike) -> Complex:
-        """Q - Z at ``frequency`` [rad/s]."""
+        """Return the factor per cycle, Q - Z, at ``frequency`` [rad/s]."""
         return np.asarray(self.q(frequency) - self.z(frequency))
 
     def steady_error(self, frequency: npt.ArrayLike) -> Complex:
-        """(1 - Q)/(Z + 1 - Q) at ``frequency`` [rad/s]."""
+        """Return the steady error (1 - Q)/(Z + 1 - Q) at ``frequency`` [rad/s]."""
         return steady_error(self.q(frequency), self.z(frequency))

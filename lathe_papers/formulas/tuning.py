@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the channels' parameters that reproduce the table of steady errors of paper 001.
+"""Tuning of the channel parameters to reproduce the table of steady errors of paper 001.
 
-The paper prints amplitudes of the steady error to two digits and no parameters. Both searches start from the
+The paper prints amplitudes of the steady error to two digits, but no parameters. Both searches start from the
 parameters of an earlier identification (`START`), keep sup|Q - Z| of both channels below 1 and end at
 rounded digits:
 
 - `nearest` changes as few digits as possible so that every entry lies within its limit;
-- `smallest_deviation` makes the largest deviation of any entry as small as it gets.
+- `smallest_deviation` minimises the largest deviation of any entry.
 """
 
 import itertools
@@ -35,13 +35,13 @@ PRINTED = np.array(
         [4.9e-7, 1.1e-5, 8.9e-5, 3.5e-4],
     ]
 )  #: the table of paper 001
-LIMITS = np.array([0.10, 0.10, 0.15, 0.10])  #: largest deviation that a row may have
+LIMITS = np.array([0.10, 0.10, 0.15, 0.10])  #: largest allowed deviation of each row
 HIGHEST = (3e4, 2e5)  #: [rad/s] up to which sup|Q - Z| of the coarse and the fine channel counts
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Parameters of the coarse and the fine channel."""
+    """Tuning parameters of the coarse and the fine channel."""
 
     coarse: Channel
     fine: Channel
@@ -57,7 +57,7 @@ class Tuning:
         return np.asarray(self.table() / PRINTED - 1.0)
 
     def suprema(self) -> tuple[float, float]:
-        """sup|Q - Z| of the coarse and the fine channel."""
+        """Suprema sup|Q - Z| of the coarse and the fine channel."""
         channels = zip((self.coarse, self.fine), HIGHEST, strict=True)
         coarse, fine = (supremum(channel.factor, highest).magnitude for channel, highest in channels)
         return coarse, fine
@@ -67,7 +67,7 @@ START = Tuning(
     Channel(natural_frequency=1038.0, damping=0.804, delay=0.36e-3, lead_time=1.425e-3, q_time=67.0e-6),
     Channel(natural_frequency=14_600.0, damping=0.299, delay=0.0, lead_time=97.0e-6, q_time=38.2e-6),
 )
-PLAIN = Tuning(replace(START.coarse, q_time=66.9e-6), START.fine)  #: what `nearest` finds
+PLAIN = Tuning(replace(START.coarse, q_time=66.9e-6), START.fine)  #: result of `nearest`
 LEAD_LAG = Tuning(
     Channel(
         natural_frequency=782.0,
@@ -85,12 +85,12 @@ LEAD_LAG = Tuning(
         q_time=40.5e-6,
         lead_lag=(744e-6, 626e-6),
     ),
-)  #: what `smallest_deviation` finds with lead-lag
+)  #: result of `smallest_deviation` with lead-lag
 
-# A channel as a vector: ωn, ζ, T0 - τ, time of Q, T1, T2. Each is varied relative to its unit here.
+# A channel as a vector: ωn, ζ, T0 - τ, time constant of Q, T1, T2. Each is scaled by the unit given here.
 _FIELDS = 6
 _LAG_UNIT = 1e-4  # [s] of T1 and T2
-_ROUNDING_ORDER = (5, 4, 11, 10, 0, 1, 6, 7, 2, 8, 3, 9)  # what the rest can make up for best comes first
+_ROUNDING_ORDER = (5, 4, 11, 10, 0, 1, 6, 7, 2, 8, 3, 9)  # parameters that the others compensate best come first
 _STABILITY_GRIDS = (
     np.linspace(10.0, HIGHEST[0], 300),
     np.concatenate((np.linspace(10.0, 4e4, 300), np.linspace(4e4, HIGHEST[1], 60))),
@@ -117,11 +117,11 @@ def _vector(tuning: Tuning) -> Array:
 def _tuning(vector: Array) -> Tuning:
     def channel(part: Array, delay: float) -> Channel:
         natural_frequency, damping, net_lead, q_time, lead, lag = map(float, part)
-        # Sums and products of rounded numbers leave a tail of digits: 15 are exact.
+        # Sums and products of rounded numbers have rounding errors in the last digits: 15 digits are exact.
         lead_time = float(f"{net_lead + delay:.15g}")
         return Channel(natural_frequency, damping, delay, lead_time, q_time, (lead, lag))
 
-    # The delays stay those of START: Z depends on the lead less the delay alone.
+    # The delays of START are kept: Z depends only on the lead minus the delay.
     return Tuning(channel(vector[:_FIELDS], START.coarse.delay), channel(vector[_FIELDS:], START.fine.delay))
 
 
@@ -133,7 +133,7 @@ def _acceptable(tuning: Tuning, limits: Array, margin: float) -> bool:
 
 
 def _digit_changes(count: int) -> Iterator[Tuning]:
-    """All tunings that differ from `START` by ``count`` steps of last digits, without lead-lag."""
+    """Yield all tunings that differ from `START` by ``count`` steps of last digits, without lead-lag."""
     places = [(i, step) for i, step in enumerate(_STEPS[0])]
     places += [(_FIELDS + i, step) for i, step in enumerate(_STEPS[1])]
     signed = [(place, sign * step) for place, step in places for sign in (-1.0, 1.0)]
@@ -145,18 +145,18 @@ def _digit_changes(count: int) -> Iterator[Tuning]:
 
 
 def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> Tuning:
-    """The tuning without lead-lag that meets the limits with the fewest steps of last digits from `START`.
+    """Return the tuning without lead-lag that meets the limits with the fewest steps of last digits from `START`.
 
     Args:
-        limits: largest relative deviation of each row, shape (4,).
-        margin: least 1 - sup|Q - Z| of both channels.
-        changes: most steps to try.
+        limits: largest allowed relative deviation of each row, shape (4,).
+        margin: smallest allowed 1 - sup|Q - Z| of both channels.
+        changes: maximum number of steps to try.
 
     Returns:
-        Of those with equally few steps, the one whose largest deviation relative to its limit is smallest.
+        Among tunings with equally few steps, the tuning with the smallest largest deviation relative to its limit.
 
     Raises:
-        LatheError: none within so many steps.
+        LatheError: no tuning meets the limits within ``changes`` steps.
     """
     for count in range(changes + 1):
         found = [tuning for tuning in _digit_changes(count) if _acceptable(tuning, limits, margin)]
@@ -166,14 +166,14 @@ def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> T
 
 
 def _shortfall(vector: Array, margin: float) -> Array:
-    """1 - margin - |Q - Z| at the frequencies of a grid: negative where a channel is not stable enough."""
+    """Return 1 - margin - |Q - Z| at the frequencies of a grid: negative where a channel is not stable enough."""
     tuning = _tuning(vector)
     channels = zip((tuning.coarse, tuning.fine), _STABILITY_GRIDS, strict=True)
     return np.concatenate([1.0 - margin - np.abs(channel.factor(grid)) for channel, grid in channels])
 
 
 def _minimax(start: Array, bounds: Sequence[tuple[float, float]], weights: Array, margin: float) -> tuple[float, Array]:
-    """Smallest largest weighted |log(entry/printed)|, and the vector that has it; inf if none was found."""
+    """Minimise the largest weighted |log(entry/printed)|; return the minimum (inf: no solution) and its vector."""
 
     def logs(vector: Array) -> Array:
         return np.asarray((np.log1p(_tuning(vector).deviations()) / weights[:, None]).ravel())
@@ -183,7 +183,7 @@ def _minimax(start: Array, bounds: Sequence[tuple[float, float]], weights: Array
         deviation = logs(vector)
         return np.concatenate((bound - deviation, bound + deviation, _shortfall(vector, margin)))
 
-    # A bound as one more variable makes the minimax smooth, which sequential quadratic programming needs.
+    # The bound as an additional variable makes the minimax smooth, as sequential quadratic programming requires.
     def largest(scaled: Array) -> float:
         return float(scaled[-1])
 
@@ -209,19 +209,19 @@ def smallest_deviation(
     starts: int = 24,
     seed: int = 0,
 ) -> Tuning:
-    """The tuning whose largest deviation from the printed table is smallest, with rounded parameters.
+    """Return the rounded tuning that minimises the largest deviation from the printed table.
 
-    Minimax of the log ratio by sequential quadratic programming from random starts. Then one parameter after the
-    other is rounded and held while the rest is optimised again.
+    The log ratio is minimised in the minimax sense by sequential quadratic programming from random starts. The
+    parameters are then rounded one by one and fixed, while the others are optimised again.
 
     Args:
         lead_lag: whether both channels have the correction (1 + pT1)/(1 + pT2), T1 and T2 from 0.1 to 2 ms.
-        weights: of the rows, shape (4,); a row of weight 1.5 may deviate 1.5 times as much. Default: all 1.
-        spread: the drives' ωn and ζ stay within this factor of `START`.
-        margin: least 1 - sup|Q - Z| of both channels.
+        weights: weights of the rows, shape (4,); a row of weight 1.5 may deviate 1.5 times as much. Default: all 1.
+        spread: largest factor between ωn and ζ of the drives and `START`.
+        margin: smallest allowed 1 - sup|Q - Z| of both channels.
         digits: significant digits of each parameter.
         starts: number of starts.
-        seed: of the starts.
+        seed: random seed of the starts.
 
     Raises:
         LatheError: no start converged.
@@ -241,7 +241,7 @@ def smallest_deviation(
         raise LatheError(f"none of {starts} starts converged with a margin of {margin:g}; allow a smaller margin")
     for place in _ROUNDING_ORDER:
         rounded = float(f"{vector[place] * _UNITS[place]:.{digits}g}") / _UNITS[place]
-        bounds[place] = (rounded, rounded)  # held from here on
+        bounds[place] = (rounded, rounded)  # fixed from here on
         vector[place] = rounded
         _, vector = _minimax(vector, bounds, rows, margin)
     return _tuning(np.array([float(f"{value:.{digits}g}") for value in vector * _UNITS]))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far direct piezo compensation reduces a band-limited vibration (paper 001, eq. 6: 2 to 3 times).
+"""Reduction of a band-limited vibration by direct piezo compensation (paper 001, eq. 6: 2 to 3 times).
 
-A measured vibration Δx commands the piezo; Δx·(1 - Wpk) is left. With the spectrum S of Δx, the RMS falls by
+A measured vibration Δx commands the piezo, and Δx·(1 - Wpk) remains. With the spectrum S of Δx, the RMS decreases by
 
     sqrt(∫S dω / ∫S·|1 - Wpk|² dω)
 
-Hysteresis that is not linearised stands before Wpk. For a sine it acts like its describing function N, so
-1 - N·Wpk takes the place of 1 - Wpk; harmonics that it makes are left out.
+Hysteresis without linearisation precedes Wpk. For a sine it acts like its describing function N, so 1 - N·Wpk replaces
+1 - Wpk; the harmonics of the hysteresis are neglected.
 """
 
 import math
@@ -21,21 +21,21 @@ from lathe_papers.formulas.structures import uncompensated
 
 Spectrum = Callable[[Array], Array]
 
-_GRID = 4097  # frequencies of the integral that a band is read from
+_GRID = 4097  # frequencies of the integral from which a band is read
 
 
 def flat(frequency: Array) -> Array:
-    """Equal power at all frequencies, shape (n,)."""
+    """Return a flat spectrum: equal power at all frequencies, shape (n,)."""
     return np.ones_like(frequency)
 
 
 def reduction(compensator: Response, band: float, spectrum: Spectrum = flat) -> float:
-    """RMS of a vibration over what is left of it.
+    """Return the ratio of the RMS of a vibration to the RMS of its remainder.
 
     Args:
-        compensator: Wpk, or N·Wpk.
-        band: the vibration has frequencies from 0 to this [rad/s], above 0.
-        spectrum: power density at frequencies [rad/s], in any unit.
+        compensator: response Wpk of the piezo, or N·Wpk.
+        band: upper limit of the vibration's frequencies [rad/s], above 0; the lower limit is 0.
+        spectrum: power density over frequency [rad/s], in any unit.
     """
 
     def left(frequency: float) -> float:
@@ -48,23 +48,23 @@ def reduction(compensator: Response, band: float, spectrum: Spectrum = flat) -> 
 
 
 def widest_band(compensator: Response, wanted: float, highest: float, spectrum: Spectrum = flat) -> float:
-    """Band [rad/s] up to which a vibration is reduced ``wanted`` times or more.
+    """Return the widest band [rad/s] in which a vibration is reduced by a factor of at least ``wanted``.
 
     Args:
-        compensator: Wpk, or N·Wpk.
-        wanted: RMS before over RMS after.
-        highest: largest band looked at [rad/s].
-        spectrum: see `reduction`.
+        compensator: response Wpk of the piezo, or N·Wpk.
+        wanted: required reduction, RMS before over RMS after.
+        highest: widest band of the search [rad/s].
+        spectrum: power density over frequency [rad/s], as in `reduction`.
 
     Returns:
-        The first band at which the reduction falls to ``wanted``: 0 if the lowest frequencies are reduced less
-        already, inf if it is more up to ``highest``.
+        The first band at which the reduction falls to ``wanted``: 0 if even the lowest frequencies are reduced less,
+        inf if the reduction exceeds ``wanted`` up to ``highest``.
     """
     grid = np.linspace(0.0, highest, _GRID)
     power = spectrum(grid)
     too_much: Array = power * (np.abs(uncompensated(compensator(grid))) ** 2 - wanted**-2)
     excess = scipy.integrate.cumulative_trapezoid(too_much, grid, initial=0)
-    reached = np.flatnonzero(excess[1:] > 0.0)  # below the vibration's lowest frequency it stays 0
+    reached = np.flatnonzero(excess[1:] > 0.0)  # the integral stays 0 below the lowest frequency of the vibration
     if not reached.size:
         return math.inf
     k = int(reached[0])
@@ -74,17 +74,19 @@ def widest_band(compensator: Response, wanted: float, highest: float, spectrum: 
 
 
 def describing_function(amplitude: float, thresholds: Array, weights: Array, proportional: float) -> complex:
-    """N of a Prandtl-Ishlinskii hysteresis for a sine: first harmonic of the output over the input.
+    """Return the describing function N of a Prandtl-Ishlinskii hysteresis: first harmonic of the output over the input.
 
-    Of a play with the threshold r and the amplitude A, with c = 1 - 2r/A,
+    The input is a sine.
+
+    For one play operator with the threshold r and the amplitude A, with c = 1 - 2r/A,
 
         N = 1/2 + (asin c + c·sqrt(1 - c²))/π - j·(4/π)·(r/A)·(1 - r/A)      and 0 for r >= A
 
     Args:
-        amplitude: A, in units of the half-stroke, above 0.
-        thresholds: r_i of the plays, shape (n,).
-        weights: p_i, shape (n,).
-        proportional: p0.
+        amplitude: amplitude A of the sine, in units of the half-stroke, above 0.
+        thresholds: thresholds r_i of the play operators, shape (n,).
+        weights: weights p_i of the play operators, shape (n,).
+        proportional: weight p0 of the proportional term.
     """
     ratio = np.minimum(np.asarray(thresholds, dtype=np.float64) / amplitude, 1.0)
     cosine = 1.0 - 2.0 * ratio
