@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and figures of the five papers, computed anew: each module with a ``STUDY`` is one of ``lathe study``."""
+"""Tables and figures of the five papers, recomputed: each module with a ``STUDY`` defines one ``lathe study``."""
 
-__all__: list[str] = []  # all of it may change
+__all__: list[str] = []  # no stable API

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which coefficients describe the drive in the angle domain (paper 000, eqs 7-12), and where they are good enough.
+"""Accuracy of the drive's coefficient sets in the angle domain (paper 000, eqs 7-12).
 
-The drive 1/(1 + 2ζp/ωn + p²/ωn²) follows a harmonic of the spindle angle while the speed swings. A delay is left
-out: it only reads the same command at φ(t - τ), alike for all sets of coefficients.
+The drive 1/(1 + 2ζp/ωn + p²/ωn²) follows a harmonic of the spindle angle while the speed oscillates. A delay is
+neglected: it only shifts the command to φ(t - τ), equally for all coefficient sets.
 """
 
 from dataclasses import dataclass
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_GOST = (0.10, 0.15)  # deviations that the standard allows lathes, relative to Ω0 (paper 000, after eq. 11)
+_GOST = (0.10, 0.15)  # speed deviations allowed by the standard for lathes, relative to Ω0 (paper 000, after eq. 11)
 _LABELS = ("exact", "quasi-static, eq. 9", "linearised, eq. 12")
 _COLOURS = ("#1f6f8b", "#c0392b", "#e08e0b")
-_POINTS = 64  # in a wave of the profile
-_DECAY = 20.0  # time constants until the start is forgotten
+_POINTS = 64  # points per wave of the profile
+_DECAY = 20.0  # time constants until the initial transient has decayed
 
 
 class AngleDomainParameters(StudyParameters):
-    """Drive, profile and the deviations on the map."""
+    """Parameters of the angle-domain study: drive, profile and speed deviations of the map."""
 
     natural_frequency: Annotated[float, Ge(50), Le(10_000)] = parameter(1038.0, "ωn of the drive", "rad/s")
     damping: Annotated[float, Ge(0.05), Le(10)] = parameter(0.804, "damping ratio ζ of the drive")
@@ -47,7 +47,7 @@ class AngleDomainParameters(StudyParameters):
     tolerance: Annotated[float, Gt(0), Lt(1)] = parameter(0.01, "error that is good enough, relative to the profile")
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse what makes no map."""
+        """Reject amplitudes or frequencies that do not form a map: fewer than two, or not increasing."""
         super().model_post_init(context)
         for name in ("amplitudes", "frequencies"):
             values = getattr(self, name)
@@ -57,24 +57,28 @@ class AngleDomainParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class AngleDomainResult:
-    """Largest errors relative to the profile's amplitude.
+    """Results of the angle-domain study: largest errors relative to the amplitude of the profile.
 
     Attributes:
-        parameters: of the study.
-        errors: by set, in the order of `COEFFICIENTS`, amplitude and frequency, shape (3, amplitudes, frequencies).
+        parameters: parameters of the study.
+        errors: largest errors by coefficient set (in the order of `COEFFICIENTS`), amplitude and frequency of the
+            deviation, shape (3, amplitudes, frequencies).
     """
 
     parameters: AngleDomainParameters
     errors: Array
 
     def good_to(self, kind: int, amplitude: int) -> float | None:
-        """Highest of the frequencies up to which a set is good enough [rad/s]; None where it never is."""
+        """Return the highest frequency up to which a set is within the tolerance [rad/s]; None if there is none."""
         bad = self.errors[kind, amplitude] > self.parameters.tolerance
         good = int(bad.argmax()) if bad.any() else bad.size
         return self.parameters.frequencies[good - 1] if good else None
 
     def to_json(self) -> dict[str, Any]:
-        """Errors by set, one row an amplitude; good_to_SET has a frequency or None for each amplitude."""
+        """Return the results for JSON: errors by set, one row per amplitude.
+
+        ``good_to_SET`` contains a frequency or None per amplitude.
+        """
         given = self.parameters
         rows = range(len(given.amplitudes))
         return {
@@ -87,7 +91,7 @@ class AngleDomainResult:
         }
 
     def table(self) -> Group:
-        """Worst errors by amplitude, and up to which frequency each set is good enough."""
+        """Return a table of the worst errors by amplitude, and the frequency up to which each set is in tolerance."""
         given = self.parameters
         highest = given.frequencies[-1]
         rows = []
@@ -104,7 +108,7 @@ class AngleDomainResult:
         return Group(table, "paper 000: eq. 9 is complete; eq. 12 where the deviation is much smaller than Ω0")
 
     def draw(self, figure: "Figure") -> None:
-        """Maps of the two approximations, and the errors at the limits of the standard."""
+        """Draw maps of the two approximations, and the errors at the limits of the standard."""
         from matplotlib.colors import LogNorm
 
         given = self.parameters
@@ -137,7 +141,7 @@ class AngleDomainResult:
 
 
 def _errors(parameters: AngleDomainParameters, amplitude: float, frequency: float) -> list[float]:
-    """Errors by set for one deviation; they repeat with its period."""
+    """Compute the errors of all coefficient sets for one deviation, over one period of the deviation."""
     nominal = parameters.nominal_rpm * np.pi / 30.0
     law = speed.harmonic(nominal, np.array([amplitude]), np.array([frequency]), np.zeros(1))
     wn = parameters.natural_frequency
@@ -150,7 +154,7 @@ def _errors(parameters: AngleDomainParameters, amplitude: float, frequency: floa
 
 
 def run(parameters: AngleDomainParameters, track: Track = untracked) -> AngleDomainResult:
-    """Compute the study."""
+    """Compute the errors for all amplitudes and frequencies of the deviation."""
     cases = [(amplitude, frequency) for amplitude in parameters.amplitudes for frequency in parameters.frequencies]
     errors = np.array([_errors(parameters, *case) for case in track(cases)])
     shape = len(parameters.amplitudes), len(parameters.frequencies), len(COEFFICIENTS)

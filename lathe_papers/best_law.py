@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which learning law errs least where: over the speed's deviation, the model's error and the sensors.
+"""Comparison of learning laws: smallest error by speed deviation, model error and sensors.
 
-Every law of ``speed-deviation`` turns the oval of ``config/speed_deviation.yaml`` at the same conditions: a sample of
-the frequency and amplitude of the deviation, of ωn and ζ that the laws take for the drive's, and of the noise of the
-position sensor, for some encoders each. The law learns on while the speed swings; what counts is the largest form
-error of the last revolutions, over a period of the slowest deviation. Laws that are told the speed beforehand are
-shown, but are not among the best. It is a sweep; see docs/sweeps.md.
+Every law of ``speed-deviation`` turns the oval of ``config/speed_deviation.yaml`` under the same conditions: a Sobol
+sample of the frequency and amplitude of the deviation, the assumed ωn and ζ of the drive, and the noise of the
+position sensor, each for several encoders. The law keeps learning while the speed oscillates. The criterion is the
+largest form error of the last revolutions, over a period of the slowest deviation. Laws with advance knowledge of the
+speed are shown, but not ranked. The study is a sweep; see docs/sweeps.md.
 """
 
 from collections import Counter
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_LEARNED, _REVOLUTIONS, _JUDGED = 20.0, 50.0, 11  # revolutions at constant speed, in all, and of the last that count
-_TOLD = ("exact_preview", "exact_invariance")  # the speed beforehand
+_LEARNED, _REVOLUTIONS, _JUDGED = 20.0, 50.0, 11  # revolutions at constant speed, in total, and evaluated at the end
+_TOLD = ("exact_preview", "exact_invariance")  # laws with advance knowledge of the speed
 _PLAIN, _ADAPTIVE = "variable_lead", "adaptive_inverse"
 _FREQUENCY = "spindle_encoder.deviation_frequency[0]"
 _AMPLITUDE = "spindle_encoder.deviation_amplitude[0]"
@@ -40,7 +40,7 @@ _DAMPING = "learning_controller.model_damping"
 
 
 class BestLawParameters(StudyParameters):
-    """Conditions."""
+    """Parameters of the law comparison: ranges of the sampled conditions."""
 
     points: Annotated[int, Ge(4), Le(2**16)] = parameter(128, "conditions for each encoder and law")
     encoder_counts: list[Annotated[int, Ge(1000), Le(2**31 - 1)]] = parameter(
@@ -57,13 +57,13 @@ class BestLawParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class BestLawResult:
-    """The error of each law at each condition.
+    """Results of the law comparison: error of each law under each condition.
 
     Attributes:
-        parameters: of the study.
-        counts, frequency, amplitude, noise, model: of each condition, once for each seed of it in a row,
-            shape (conditions * seeds,) [1, rad/s, 1, nm, 1].
-        error: by law, largest error of the last revolutions; infinite where it is refused or diverges [µm].
+        parameters: parameters of the study.
+        counts, frequency, amplitude, noise, model: values of each condition, repeated for each of its seeds in
+            consecutive entries, shape (conditions * seeds,) [1, rad/s, 1, nm, 1].
+        error: largest error of the last revolutions by law; infinite if the law is rejected or diverges [µm].
     """
 
     parameters: BestLawParameters
@@ -76,17 +76,17 @@ class BestLawResult:
 
     @property
     def rivals(self) -> list[str]:
-        """Laws that are not told the speed beforehand."""
+        """Ranked laws: all laws without advance knowledge of the speed."""
         return [law for law in self.error if law not in _TOLD]
 
     @property
     def best(self) -> list[str]:
-        """The rival that errs least, of each condition."""
+        """Best ranked law (smallest error) under each condition."""
         errors = np.array([self.error[law] for law in self.rivals])
         return [self.rivals[place] for place in np.argmin(errors, axis=0)]
 
     def to_json(self) -> dict[str, Any]:
-        """How often each law is the best, by encoder, and all conditions."""
+        """Return the results for JSON: share of conditions in which each law is best, agreement of seeds, medians."""
         return {
             "conditions": self.counts.size // self.parameters.seeds,
             "seeds": self.parameters.seeds,
@@ -96,13 +96,13 @@ class BestLawResult:
         }
 
     def _shares(self, counts: int) -> dict[str, float]:
-        """How often each rival is the best with an encoder [%]."""
+        """Return the share of conditions in which each ranked law is best with one encoder [%]."""
         best = [law for law, of in zip(self.best, self.counts, strict=True) if of == counts]
         found = Counter(best)
         return {law: 100.0 * found[law] / len(best) for law in self.rivals}
 
     def _agreed(self, counts: int) -> float:
-        """How often all seeds of a condition have the same best law [%]."""
+        """Return the share of conditions in which all seeds have the same best law [%]."""
         best = np.array(self.best)[self.counts == counts].reshape(-1, self.parameters.seeds)
         return 100.0 * float(np.mean((best == best[:, :1]).all(axis=1)))
 
@@ -110,7 +110,7 @@ class BestLawResult:
         return {law: float(np.median(error[self.counts == counts])) for law, error in self.error.items()}
 
     def table(self) -> Group:
-        """How often each law is the best, what it errs, and the adaptive inverse against the variable lead."""
+        """Return tables of the best laws, their errors, and the adaptive inverse against the variable lead."""
         encoders = self.parameters.encoder_counts
         columns = ("law", *(f"{counts:,}" for counts in encoders))
         shares, medians = ({c: of(c) for c in encoders} for of in (self._shares, self._medians))
@@ -141,7 +141,7 @@ class BestLawResult:
         return Group(tables[0], "", tables[1], "", tables[2])
 
     def draw(self, figure: "Figure") -> None:
-        """The best law over the deviation, and the adaptive inverse against the variable lead over noise and model."""
+        """Draw the best law over the deviation, and adaptive inverse against variable lead over noise and model."""
         encoders = self.parameters.encoder_counts
         upper, lower = figure.subplots(2, len(encoders), squeeze=False)
         best, ratio = np.array(self.best), np.log10(self.error[_PLAIN] / self.error[_ADAPTIVE])
@@ -175,14 +175,14 @@ def _base() -> Scenario:
         "speed_deviation",
         spindle_encoder={**law, "revolutions": _REVOLUTIONS},
         learning_controller={**law, "events": [], "acceleration_window": 64},
-        # The linear drive is studied, not what it may be asked for.
+        # The study assumes the linear drive, without its limits.
         electrodynamic_actuator={"max_velocity": 1e3, "max_acceleration": 1e6, "stroke": 1.0},
         tool={"harmonic_order": [2], "harmonic_amplitude": [225e-6]},
     )
 
 
 def run(parameters: BestLawParameters, track: Track = untracked) -> BestLawResult:
-    """Compute the study."""
+    """Run the sweep and collect the error of each law under each condition."""
     from lathe_rc.sweep.space import Space
 
     base = _base()
@@ -204,7 +204,7 @@ def run(parameters: BestLawParameters, track: Track = untracked) -> BestLawResul
             _MODEL: f"{low}:{high}",
             _DAMPING: f"{low}:{high}",
         },
-        # Laws that are told the speed beforehand are told the truth.
+        # Laws with advance knowledge of the speed receive the true speed.
         ties={target.replace("spindle_encoder", "learning_controller"): target for target in (_FREQUENCY, _AMPLITUDE)},
         sample=f"sobol:{parameters.points}",
         seeds=parameters.seeds,

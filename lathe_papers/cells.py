@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running the scenarios of ``config/`` with changes."""
+"""Runs of the scenarios of ``config/`` with changed parameters."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeVar
@@ -21,22 +21,22 @@ def _yaml(value: object) -> str:
 
 
 def load(name: str, shared: Values | None = None, **nodes: Values) -> Scenario:
-    """A scenario of ``config/`` with shared parameters and parameters by node replaced."""
+    """Load a scenario of ``config/`` with shared and node parameters replaced."""
     changes = [f"{parameter}={_yaml(value)}" for parameter, value in (shared or {}).items()]
     changes += [f"{node}.{parameter}={_yaml(v)}" for node, table in nodes.items() for parameter, v in table.items()]
     return scenario.load(name, changes)
 
 
 def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Result:
-    """Run a scenario of ``config/`` offline, with the same changes as `load`."""
+    """Run a scenario of ``config/`` offline, with the same replacements as `load`."""
     return harness.run(load(name, shared, **nodes))
 
 
 def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterator[K | None]:
-    """Run many scenarios; yield the result of each keeper in their order, None for a run that failed.
+    """Run many scenarios; yield the result of each keeper in order, and None for a failed run.
 
     Raises:
-        InputError: one is refused.
+        InputError: a scenario is invalid.
     """
     outcomes = batch.run_many(made, keep)
     for _ in track(range(len(made))):

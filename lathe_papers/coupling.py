@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that a delay in the loop of drive and cut would cause, and its effect in the loop of cut and spindle.
+"""Errors due to a delay in the loop of drive and cut, and its effect in the loop of cut and spindle.
 
-An electrodynamic drive follows an oval and cuts a part with two keyways. As one stage drive and cut are computed sample
-by sample; as two, the force would reach the drive some samples late. The stability limit is that of
-`lathe_papers.formulas.regeneration` at an overlap of 1, with the delay in it: K = -1/(2·min Re G·e^{-jωD}). Between the
-cut and the spindle that it slows there is such a delay, and its effect is shown against that of one sample.
+An electrodynamic drive follows an oval and cuts a part with two keyways. In one stage, drive and cut are computed
+sample by sample; in two stages, the force would reach the drive some samples late. The stability limit is that of
+`lathe_papers.formulas.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
+cut and loaded spindle has such a delay, and its effect is compared with a delay of one sample.
 """
 
 from dataclasses import dataclass
@@ -34,15 +34,15 @@ _SPEED = 1000.0 * np.pi / 30.0  # [rad/s]
 _FREQUENCY, _DAMPING, _MASS = 1038.0, 0.804, 1.2  # of the drive [rad/s, 1, kg]
 _COMPLIANCE = compliance(natural_frequency=_FREQUENCY, damping=_DAMPING, moving_mass=_MASS)
 _DELAY = 0.36e-3  # of the command [s]
-_TURNS, _SPINDLE_TURNS = 3, 12  # of which the last is compared; a spindle takes longer to settle
-_LEAD = 1.425e-3  # T0, by which a controller of this drive leads (spec/learning.md) [s]
-_FEED = 1e-3  # [m/rev], at which K is kc1 times 1 mm
+_TURNS, _SPINDLE_TURNS = 3, 12  # simulated revolutions, the last is compared; a spindle takes longer to settle
+_LEAD = 1.425e-3  # lead T0 of a controller of this drive (spec/learning.md) [s]
+_FEED = 1e-3  # [m/rev]; at this feed, K is kc1 times 1 mm
 _GAPS = ((1.0, 0.35), (1.0 + np.pi, 0.35))
 _COLOURS = ("#1f6f8b", "#2e8b57", "#e08e0b", "#c0392b", "#7d3c98", "#555555")
 
 
 class CouplingParameters(StudyParameters):
-    """The cut, the delays, and the spindle."""
+    """Parameters of the coupling study: cut, delays and spindle."""
 
     stiffness: Annotated[float, Gt(0), Le(1e8)] = parameter(300e3, "K, force over depth of cut", "N/m")
     depth: Annotated[float, Gt(0), Le(1e-2)] = parameter(0.3e-3, "depth of cut", "m")
@@ -56,17 +56,18 @@ class CouplingParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class CouplingResult:
-    """The effects of the delays.
+    """Results of the coupling study: effects of the delays.
 
     Attributes:
-        parameters: of the study.
-        angle: of the last revolution [rad], shape (m,).
-        position, force: with drive and cut as one stage [m, N], shape (m,).
-        moved: position with each delay less that [m], shape (delays, m).
-        invented: energy that the delay brings into the drive, over what the force exchanges with it, shape (delays,).
-        limits: stable K without a delay and with each [N/m], shape (delays + 1,).
-        speed: of the loaded spindle at a delay of one sample [rad/s], shape (m,).
-        slowed: speed with each delay less that with one sample [rad/s], shape (delays, m).
+        parameters: parameters of the study.
+        angle: spindle angle over the last revolution [rad], shape (m,).
+        position, force: position and force with drive and cut as one stage [m, N], shape (m,).
+        moved: position with each delay minus ``position`` [m], shape (delays, m).
+        invented: spurious energy that the delay adds to the drive, over the energy exchanged by force and drive,
+            shape (delays,).
+        limits: largest stable K without a delay, then with each delay [N/m], shape (delays + 1,).
+        speed: speed of the loaded spindle at a delay of one sample [rad/s], shape (m,).
+        slowed: speed with each delay minus the speed with a delay of one sample [rad/s], shape (delays, m).
     """
 
     parameters: CouplingParameters
@@ -80,7 +81,7 @@ class CouplingResult:
     slowed: Array
 
     def to_json(self) -> dict[str, Any]:
-        """The numbers of the tables, and the curves."""
+        """Return the results for JSON: the numbers of the tables, and the curves."""
         return {
             "delays": self.parameters.delays,
             "position_difference": np.abs(self.moved).max(axis=1).tolist(),
@@ -97,11 +98,11 @@ class CouplingResult:
         }
 
     def _edge(self) -> Array:
-        """By how much the lead T0 errs if the speed is wrong by so much [m], shape (delays,)."""
+        """Return the edge error due to the speed difference of each delay at the lead T0 [m], shape (delays,)."""
         return np.asarray(2.0 * self.parameters.amplitude * _LEAD * np.abs(self.slowed).max(axis=1))
 
     def table(self) -> Group:
-        """Drive and cut, then cut and spindle."""
+        """Return two tables: drive and cut, then cut and spindle."""
         given = self.parameters
         rows = [("one stage", "0", "0%", f"{self.limits[0] / 1e3:.4g}", "100%")]
         for k, delay in enumerate(given.delays):
@@ -126,7 +127,7 @@ class CouplingResult:
         return Group(drive, "", spindle)
 
     def draw(self, figure: "Figure") -> None:
-        """The effect of the delays on the edge, the stable K, and the spindle's angle."""
+        """Draw the effect of the delays on the edge, the stable K, and the spindle angle."""
         given = self.parameters
         edge, stable, spindle = figure.subplots(1, 3)
         degrees = np.degrees(self.angle - self.angle[0])
@@ -163,7 +164,7 @@ def _cut(given: CouplingParameters) -> CuttingProcess:
 
 
 def _uniform(samples: int) -> tuple[Array, Array]:
-    """Angle and speed of a spindle that nothing slows."""
+    """Return angle and speed of a spindle without load."""
     time: Array = _STEP * np.arange(samples, dtype=np.float64)
     return _SPEED * time, np.full(samples, _SPEED, dtype=np.float64)
 
@@ -173,7 +174,7 @@ def _turning(angle: Array, speed: Array) -> dict[str, Array]:
 
 
 def _chips(cut: CuttingProcess, turning: dict[str, Array], displacement: Array) -> Array:
-    """The force [N] of a block."""
+    """Return the cutting force of a block [N]."""
     none = np.zeros_like(displacement)
     made = {name: np.zeros_like(none) for name in ("force", "deflection", "depth_of_cut", "feed", "wear")}
     cut.block(**turning, displacement=displacement, height=none, cross_position=none, allowance=none, **made)
@@ -195,13 +196,16 @@ def _drive(given: CouplingParameters) -> ToolDrive:
 
 
 def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array], delay: int) -> tuple[Array, Array]:
-    """Position and velocity, shape (n, 2), and the force as it acts: that of the chip ``delay`` samples before."""
+    """Simulate drive and cut as two stages; return position and velocity, shape (n, 2), and the delayed force.
+
+    The force is that of the chip ``delay`` samples earlier.
+    """
     table, cut, samples = _drive(given).table, _cut(given), command.size
     weights = table.weights
     sent = np.concatenate((np.zeros(table.delay + 2), command))
     moved, force = np.zeros((samples + 1, 2)), np.zeros(samples + delay + 1)
     driven = np.stack([sent[2 - k : samples + 2 - k] for k in range(3)], axis=1) @ weights.coarse.T
-    # A force that comes ``delay`` samples late lets as many samples be computed before the chip is asked again.
+    # With a force ``delay`` samples late, blocks of ``delay`` samples can be computed before the next chip.
     for begin in range(0, samples, delay):
         block = slice(begin, min(begin + delay, samples))
         for n in range(block.start, block.stop):
@@ -214,20 +218,20 @@ def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array],
 
 
 def _energy(given: CouplingParameters, velocity: Array, acts: Array, made: Array) -> float:
-    """The energy that a late force brings in, over that which the drive and the force of the chip exchange."""
+    """Return the energy added by the delayed force over the energy exchanged by the drive and the undelayed force."""
     power = given.radial_ratio * velocity
     return float(((acts - made) * power).sum() / np.abs(made * power).sum())
 
 
 def _limit(given: CouplingParameters, delay: int) -> float:
-    """Largest K [N/m] that is stable at every speed with an overlap of 1, the force without its lag."""
+    """Return the largest K [N/m] that is stable at every speed, with an overlap of 1 and no lag of the force."""
     frequency = np.geomspace(1.0, np.pi / _STEP, 200_000)
     response = given.radial_ratio * _COMPLIANCE.response(frequency) * np.exp(-1j * frequency * delay * _STEP)
     return float(-0.5 / response.real.min())
 
 
 def _spun(given: CouplingParameters, samples: int, delay: int) -> Array:
-    """Speed of a spindle that feels the cut ``delay`` samples late."""
+    """Return the speed of a spindle on which the cutting force acts ``delay`` samples late."""
     spindle = LoadedSpindle(
         inertia=0.75 * given.inertia,
         motor_inertia=0.25 * given.inertia,
@@ -246,7 +250,7 @@ def _spun(given: CouplingParameters, samples: int, delay: int) -> Array:
 
 
 def run(parameters: CouplingParameters, track: Track = untracked) -> CouplingResult:
-    """Compute the study."""
+    """Simulate both loops with each delay and compute the stability limits."""
     turn = round(2.0 * np.pi / _SPEED / _STEP)
     samples, last = _TURNS * turn, slice((_TURNS - 1) * turn, _TURNS * turn)
     angle, speed = _uniform(samples)
@@ -260,7 +264,7 @@ def run(parameters: CouplingParameters, track: Track = untracked) -> CouplingRes
         moved.append(state[last, 0] - true["position"][last])
         made = acts[delay : delay + samples]
         invented.append(_energy(parameters, state[last, 1], acts[:samples][last], made[last]))
-        # A delay of one sample is the reference itself: the run that takes longest, since every sample is a block.
+        # A delay of one sample is the reference itself, and the slowest run, since every sample is a block.
         late = swinging if delay == 1 else _spun(parameters, _SPINDLE_TURNS * turn, delay)[-turn:]
         slowed.append(late - swinging)
     return CouplingResult(

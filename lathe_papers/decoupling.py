@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force and position loop of paper 004 together, with and without the compensators K1 and K2 (Figs 4 and 6-17).
+"""Coupled force and position loops of paper 004, with and without the compensators K1 and K2 (Figs 4 and 6-17).
 
-Poles come from the linear system, all courses from the simulation with limits at the paper's step of 50 µs. What the
-paper prints stands beside what its own parameters give; nothing is fitted to it.
+Poles are computed from the linear system, and all time series from the simulation with limits at the paper's step of
+50 µs. Printed values are shown beside the values computed from the paper's parameters; no parameter is fitted to them.
 """
 
 from collections.abc import Mapping
@@ -48,8 +48,8 @@ _PRINTED_NOISE: Mapping[str, float] = {
     "position_disturbance_rms_mm": 0.0577, "position_error_rms_mm": 0.0082, "position_efficiency": 7.0,
     "position_error_coupled_mm": 0.0018, "position_error_alone_mm": 0.0032,
 }  # fmt: skip
-_ENTRY = 4.0  # how long an entry is followed [s]
-_FIT_STEP, _FIT_SPAN = 0.25e-3, 2.0  # of the response that models are fitted to [s]
+_ENTRY = 4.0  # simulated duration of an entry [s]
+_FIT_STEP, _FIT_SPAN = 0.25e-3, 2.0  # step and span of the response for model fits [s]
 _EXPECTED = {
     "paper": {"none": "+0.1 to +0.24", "k1": "stable", "k2": "diverges", "both": "stable"},
     "realistic": dict.fromkeys(CONNECTIONS, "stable"),
@@ -79,7 +79,7 @@ _RED, _BLUE, _AMBER, _GREY = "#c0392b", "#1f6f8b", "#e08e0b", "#7f8c8d"
 
 
 def numbers(loop: Loop) -> dict[str, float | None]:
-    """A loop in the units of the paper; None for what it does not have."""
+    """Return the figures of a loop in the units of the paper; None for missing values."""
     values = {
         "rise_s": loop.rise,
         "settling_s": loop.settling,
@@ -94,17 +94,17 @@ def numbers(loop: Loop) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class DecouplingResult:
-    """Everything about the two loops.
+    """Results of the decoupling study: both loops, their robustness, and the fitted models.
 
     Attributes:
-        parameters: of the study.
-        prompt, delayed: both loops without and with the delay.
-        robustness: largest real part of the poles with both compensators and one parameter of the plant off by half.
-        full: the force loop alone with the full plant.
+        parameters: parameters of the study.
+        prompt, delayed: behaviour of both loops without and with the delay.
+        robustness: largest real part of the poles with both compensators and one plant parameter off by 50 %.
+        full: force loop alone with the full plant.
         uncompensated: entry and disturbance without K1 and K2.
-        alone: the position under the disturbance, with neither the force loop nor W4.
-        entries: by a step and smoothly, without disturbance.
-        model, inverse: of the full W1, as in the two stages of the paper.
+        alone: position under the disturbance, with neither the force loop nor W4.
+        entries: entry with a step and smooth entry, without disturbance.
+        model, inverse: fitted model of the full W1 and its inverse, as in the two stages of the paper.
     """
 
     parameters: DecouplingParameters
@@ -119,7 +119,7 @@ class DecouplingResult:
     inverse: Fit
 
     def entry_numbers(self) -> dict[str, dict[str, float]]:
-        """Overshoot of the force [%] and largest position error [mm] of an entry by a step and of a smooth one."""
+        """Return force overshoot [%] and largest position error [mm] of an entry with a step and of a smooth entry."""
         return {
             name: {
                 "force_overshoot_pct": max(float(run.force.max()) / self.parameters.force - 1.0, 0.0) * 100.0,
@@ -129,12 +129,12 @@ class DecouplingResult:
         }
 
     def noise_numbers(self) -> dict[str, float]:
-        """With both compensators, and the position loop alone."""
+        """Return the noise figures with both compensators, and those of the position loop alone."""
         alone = rms(self.alone.settled(self.alone.position)) * 1e3
         return {**self.prompt.noise_numbers(self.parameters.force), "position_error_alone_mm": alone}
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers, those that the paper prints beside them; deviations in N and m."""
+        """Return all numbers for JSON, with the printed values beside them; deviations in N and m."""
         given = self.parameters
         uncompensated = self.uncompensated
         return {
@@ -178,7 +178,7 @@ class DecouplingResult:
         }
 
     def table(self) -> Group:
-        """Computed beside printed."""
+        """Return tables of computed values beside printed values."""
         return Group(
             self._stability_table(), "", self._loop_table(), "", self._cross_table(), "", self._noise_table(), "",
             self._model_table(),
@@ -272,7 +272,7 @@ class DecouplingResult:
         )
 
     def draw(self, figure: "Figure") -> None:
-        """The paper's Figs 11 and 12, 4 and 14, then steps, entry, disturbance and the reduced-order model."""
+        """Draw Figs 11 and 12, 4 and 14 of the paper, then steps, entry, disturbance and the reduced-order model."""
         panels = figure.subplots(3, 3)
         self._draw_single(panels[0, 0], panels[0, 1])
         self._draw_together(panels[0, 2])
@@ -359,15 +359,15 @@ def _number(value: float | None) -> str:
 
 
 def run(parameters: DecouplingParameters, track: Track = untracked) -> DecouplingResult:
-    """Compute the study.
+    """Simulate both loops, with and without the delay, and fit the models of the full W1.
 
     Raises:
-        InputError: the delay is no whole number of samples.
+        InputError: the delay is not a whole number of samples.
     """
     noise = disturbance(parameters)
     prompt, delayed = (behaviour(parameters, wait, noise) for wait in track([0.0, parameters.delay_ms * 1e-3]))
     none, both = (loops(parameters.preset, parameters.plant, name) for name in ("none", "both"))
-    # Without W4 and the force's controller the position loop is alone, under the deflection by the disturbance.
+    # Without W4 and the force controller, the position loop acts alone, under the deflection by the disturbance.
     off = PidGains(0.0, 0.0, 0.0, 1.0)
     uncoupled = replace(none, force=off, channels=replace(none.channels, w4=gain(0.0)))
     time = times(round(_FIT_SPAN / _FIT_STEP) + 1, _FIT_STEP)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The runs of the study of decoupling at one delay: poles, single loops, steps, disturbance."""
+"""Runs of the decoupling study at one delay: poles, single loops, steps, disturbance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from lathe_rc.transfer import LinearSystem
 
 Array = npt.NDArray[np.float64]
 
-SETTLED = 2.0  #: the paper takes RMS of the force from then on [s]
-CROSS = 3.0  #: how long a step is followed [s]
-_SHOWN = 4000  # points of a course in the figure
+SETTLED = 2.0  #: start of the RMS of the force in the paper [s]
+CROSS = 3.0  #: simulated duration of a step [s]
+_SHOWN = 4000  # points per curve in the figure
 
 
 class DecouplingParameters(StudyParameters):
-    """Plant, disturbance and converters."""
+    """Parameters of the decoupling study: plant, disturbance and converters."""
 
     preset: Literal["paper", "realistic"] = parameter("paper", "W3 as printed (2.9 Hz), or of a lathe (53 Hz)")
     plant: Literal["approximate", "full"] = parameter(
@@ -54,15 +54,15 @@ class DecouplingParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class Course:
-    """A run of both loops.
+    """Time series of one run of both loops.
 
     Attributes:
-        time: [s], shape (n,).
-        force: F [N], shape (n,).
-        position: y [m], shape (n,).
-        disturbance: n [N], shape (n,).
-        deflection: W3·F [m], shape (n,).
-        cut: commands that controllers and drives have cut off.
+        time: times [s], shape (n,).
+        force: force F [N], shape (n,).
+        position: position y [m], shape (n,).
+        disturbance: disturbance force n [N], shape (n,).
+        deflection: deflection W3·F [m], shape (n,).
+        cut: number of commands limited by controllers and drives.
     """
 
     time: Array
@@ -73,17 +73,17 @@ class Course:
     cut: int
 
     def settled(self, values: Array) -> Array:
-        """A row after the entry."""
+        """Return the samples of an array after the entry has settled."""
         return np.asarray(values[self.time >= SETTLED])
 
     def curve(self, values: Array, unit: float = 1.0) -> tuple[Array, Array]:
-        """Time [s] and a row over a unit, thinned out for a figure."""
+        """Return time [s] and an array divided by ``unit``, downsampled for a figure."""
         every = max(1, values.size // _SHOWN)
         return self.time[::every], values[::every] / unit
 
 
 def times(samples: int, step: float) -> Array:
-    """Times from 0 on [s], shape (samples,)."""
+    """Return sample times starting at 0 [s], shape (samples,)."""
     return np.arange(samples, dtype=np.float64) * step
 
 
@@ -100,13 +100,13 @@ def course(
     """Simulate both loops from rest.
 
     Args:
-        system: the loops.
-        given: converters and the smooth entry are taken from it.
-        seconds: length.
-        force: set point [N] from the start on.
-        position: set point [m] from the start on.
-        noise: n [N], shape (samples,); None for none.
-        smooth: whether the set point of the force rises smoothly.
+        system: the coupled loops.
+        given: parameters of the study, for the converters and the smooth entry.
+        seconds: simulated time [s].
+        force: set point of the force from the start [N].
+        position: set point of the position from the start [m].
+        noise: disturbance force n [N], shape (samples,); None for no disturbance.
+        smooth: whether the force set point rises smoothly.
     """
     samples = round(seconds / STEP)
     simulation = CoupledSimulation(
@@ -126,7 +126,7 @@ def course(
 
 
 def disturbance(given: DecouplingParameters) -> Array:
-    """Force that the allowance makes through W4, n [N], at the step of the simulation."""
+    """Return the force n [N] due to the allowance through W4, at the step of the simulation."""
     samples = round(given.seconds / STEP)
     allowance = Allowance(
         mean_reverting(given.walk_um * 1e-6, given.correlation_s, STEP),
@@ -142,18 +142,18 @@ def disturbance(given: DecouplingParameters) -> Array:
 
 
 def rms(values: Array) -> float:
-    """Root mean square."""
+    """Return the root mean square of an array."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """Both loops at one delay.
+    """Behaviour of both loops at one delay.
 
     Attributes:
         stability: largest real part of the poles by connection [1/s].
-        force, position: each loop alone.
-        position_step, force_step: without and with K1 and K2.
+        force, position: figures of each loop alone.
+        position_step, force_step: response to a step of the set point, without and with K1 and K2.
         noise: entry and disturbance with K1 and K2.
     """
 
@@ -165,7 +165,7 @@ class Behaviour:
     noise: Course
 
     def peaks(self) -> dict[str, dict[str, float]]:
-        """Largest deviation of the force [N] and the position [m] while the other loop makes a step."""
+        """Return the largest deviation of force [N] and position [m] during a step of the other loop."""
         names = ("uncompensated", "compensated")
         forces = [float(np.abs(run.force).max()) for run in self.position_step]
         positions = [float(np.abs(run.position).max()) for run in self.force_step]
@@ -175,10 +175,10 @@ class Behaviour:
         }
 
     def noise_numbers(self, force: float) -> dict[str, float]:
-        """RMS and efficiency as the paper takes them: of the force from 2 s on, of the position from the start on.
+        """Return RMS and efficiency as defined in the paper: force after 2 s, position from the start.
 
         Args:
-            force: set point [N].
+            force: set point of the force [N].
         """
         run = self.noise
         force_disturbance, force_error = rms(run.settled(run.disturbance)), rms(run.settled(run.force) - force)
@@ -196,7 +196,7 @@ class Behaviour:
 
 
 def behaviour(given: DecouplingParameters, wait: float, noise: Array) -> Behaviour:
-    """Compute both loops with a delay ``wait`` [s] under a disturbance [N]."""
+    """Compute the behaviour of both loops with a delay ``wait`` [s] under a disturbance [N]."""
     by_name = {name: loops(given.preset, given.plant, name, wait) for name in CONNECTIONS}
     none, both = by_name["none"], by_name["both"]
     position = given.position_step_um * 1e-6

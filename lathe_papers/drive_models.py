@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of the drive from its step response, and learning with the correction that each suggests (000, Fig. 4).
+"""Drive models from a step response, and learning with the inverse of each model as correction (000, Fig. 4).
 
-The correction is the inverse of the model, 1/W0 = 1/W: for a delay the lead by T0, which reads the memory ahead. On
-the drive Wi it gives Z = Wi/W, and learning goes as Q - Z with Q = 1/(1 + (ω·q_time)²).
+The correction is the inverse of the model, 1/W0 = 1/W; for a delay it is the lead by T0, which reads the memory ahead.
+With the drive Wi it gives Z = Wi/W, and Q - Z with Q = 1/(1 + (ω·q_time)²) is the factor per learning cycle.
 """
 
 from dataclasses import asdict, dataclass
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 _PRINTED = 2e-3  # T0 of eqs 18 and 19 in paper 000 [s]
-_SAMPLES = 1000  # of the simulated response
-_DECAY = 10.0  # time constants that it lasts
-_FREQUENCIES = 20_001  # at which Q - Z is looked at
+_SAMPLES = 1000  # number of samples of the simulated response
+_DECAY = 10.0  # duration of the simulated response in time constants
+_FREQUENCIES = 20_001  # number of frequencies of Q - Z
 
 
 class DriveModelsParameters(StudyParameters):
-    """Where the response comes from, and how the controller learns."""
+    """Parameters of the drive-model study: source of the step response, and settings of the controller."""
 
     file: str = parameter("", "CSV with columns time_ms,response; empty: simulate the drive", path=True)
     natural_frequency: Annotated[float, Ge(50), Le(10_000)] = parameter(1038.0, "ωn of the simulated drive", "rad/s")
@@ -58,15 +58,15 @@ class DriveModelsParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model and learning with its inverse.
+    """Drive model with the learning behaviour of its inverse.
 
     Attributes:
-        name: in words.
-        model: with its parameters.
-        fitted: False for the parameters that the paper prints.
-        rms: residual against the measured response [1].
+        name: name of the model in words.
+        model: model with its parameters.
+        fitted: False for the parameters printed in the paper.
+        rms: RMS residual against the measured response [1].
         factor: magnitude of Q - Z at the frequencies of the result, shape (m,).
-        contraction: the same at the harmonic of the profile.
+        contraction: magnitude of Q - Z at the harmonic of the profile.
     """
 
     name: str
@@ -78,15 +78,15 @@ class Candidate:
 
     @property
     def supremum(self) -> float:
-        """Supremum of the magnitude of Q - Z; learning converges below 1."""
+        """Supremum of the magnitude of Q - Z; learning converges if it is below 1."""
         return float(self.factor.max())
 
     def values(self) -> dict[str, float]:
-        """The model's parameters by name."""
+        """Parameters of the model by name."""
         return asdict(self.model)
 
     def words(self) -> str:
-        """The model's parameters in a few words."""
+        """Parameters of the model as a short text."""
         model = self.model
         if not isinstance(model, SecondOrder):
             return f"T0 {next(iter(self.values().values())) * 1e3:.4g} ms"
@@ -94,7 +94,7 @@ class Candidate:
         return f"ωn {model.natural_frequency:.4g} rad/s, ζ {model.damping:.3g}{delay}"
 
     def correction(self) -> str:
-        """The inverse of the model as a formula in its own parameters."""
+        """Inverse of the model as a formula in its own parameters."""
         if isinstance(self.model, FirstOrder):
             return "1 + p·time_constant"
         lead = "e^(p·delay)"
@@ -106,13 +106,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class DriveModelsResult:
-    """Response, models and learning.
+    """Results of the drive-model study: response, models and learning behaviour.
 
     Attributes:
-        parameters: of the study.
-        measured: the step response.
-        candidates: the models.
-        frequency: at which Q - Z was looked at [rad/s], shape (m,).
+        parameters: parameters of the study.
+        measured: step response.
+        candidates: models with their learning behaviour.
+        frequency: frequencies of Q - Z [rad/s], shape (m,).
     """
 
     parameters: DriveModelsParameters
@@ -122,11 +122,11 @@ class DriveModelsResult:
 
     @property
     def harmonic(self) -> float:
-        """Frequency of the profile's harmonic [rad/s]."""
+        """Frequency of the harmonic of the profile [rad/s]."""
         return _harmonic(self.parameters)
 
     def to_json(self) -> dict[str, Any]:
-        """The response, and each model with its step response and what learning does with its inverse."""
+        """Return the results for JSON: the response, and for each model its step response and learning behaviour."""
         return {
             "file": self.parameters.file or None,
             "time_s": self.measured.time.tolist(),
@@ -150,7 +150,7 @@ class DriveModelsResult:
         }
 
     def table(self) -> Group:
-        """The models beside the values that the paper prints."""
+        """Return a table of the models beside the values printed in the paper."""
         rows = [
             (
                 candidate.name + ("" if candidate.fitted else ", paper 000"),
@@ -170,7 +170,7 @@ class DriveModelsResult:
         return Group(table, "The inverse of a delay is a lead: the memory is read ahead by T0.")
 
     def draw(self, figure: "Figure") -> None:
-        """Fig. 4 of the paper with the fits; Q - Z of each."""
+        """Draw Fig. 4 of the paper with the fits, and Q - Z of each model."""
         steps, learning = figure.subplots(1, 2)
         steps.plot(self.measured.time * 1e3, self.measured.response, color="k", lw=2.5, label="measured")
         colours = ("#c0392b", "#e08e0b", "#7b5ea7", "#1f6f8b")
@@ -197,7 +197,7 @@ def _harmonic(parameters: DriveModelsParameters) -> float:
 
 
 def _simulated(drive: SecondOrder) -> StepResponse:
-    """The measurement of a test of the drive."""
+    """Simulate a step test of the drive."""
     slowest = drive.natural_frequency * (drive.damping - np.sqrt(max(drive.damping**2 - 1.0, 0.0)))
     step = (drive.delay + _DECAY / slowest) / _SAMPLES
     machine = ElectrodynamicDrive(
@@ -212,15 +212,15 @@ def _simulated(drive: SecondOrder) -> StepResponse:
     )
     position, velocity, current = np.empty((3, _SAMPLES))
     machine.block(np.ones(_SAMPLES), position, velocity, current)
-    # The command rises linearly from sample -1 to sample 0: half a step before, on the average.
+    # The command rises linearly from sample -1 to sample 0: on average, half a step earlier.
     return StepResponse((np.arange(_SAMPLES) + 0.5) * step, position)
 
 
 def run(parameters: DriveModelsParameters, track: Track = untracked) -> DriveModelsResult:
-    """Compute the study.
+    """Fit the models to the step response and evaluate learning with their inverses.
 
     Raises:
-        InputError: the file holds no step response.
+        InputError: the file does not contain a step response.
     """
     drive = SecondOrder(parameters.natural_frequency, parameters.damping, parameters.delay)
     measured = read_csv(Path(parameters.file)) if parameters.file else _simulated(drive)
@@ -233,7 +233,7 @@ def run(parameters: DriveModelsParameters, track: Track = untracked) -> DriveMod
         ("first order", FirstOrder(_PRINTED), False),
         ("delay", Delay(_PRINTED), False),
     ]
-    # Of a measured drive nothing better is known than the best fit.
+    # The best fit is the best available model of a measured drive.
     true: Model = delayed if parameters.file else drive
     harmonic = _harmonic(parameters)
     highest = harmonic / parameters.waves * parameters.points_per_revolution / 2

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of a tolerance of drives: one controller, many drives of a batch.
+"""Cost of a tolerance of the drive parameters: one controller for many drives of a batch.
 
 The controllers keep the models and settings of the scenario. Natural frequency, damping and delay of every drive are
-drawn independently, normal about the scenario's value, with the tolerance as the standard deviation. A drive with
-which learning would diverge is refused, and counts as one that never comes below any error. It is a sweep; see
+independent and normally distributed about the value of the scenario, with the tolerance as the standard deviation. A
+drive with which learning would diverge is rejected, and its error counts as infinite. The study is a sweep; see
 docs/sweeps.md.
 """
 
@@ -32,7 +32,7 @@ _SHARES = (0.5, 0.95, 0.99)
 
 
 class DriveToleranceParameters(StudyParameters):
-    """Cell, tolerances, and how many drives of each."""
+    """Parameters of the drive-tolerance study: cell, tolerances, and number of drives for each tolerance."""
 
     scenario: Literal["piston", "two_channel"] = parameter("two_channel", "what is turned")
     tolerance: list[Annotated[float, Gt(0), Le(0.3)]] = parameter(
@@ -45,12 +45,13 @@ class DriveToleranceParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class DriveToleranceResult:
-    """Errors by tolerance.
+    """Results of the drive-tolerance study: errors by tolerance.
 
     Attributes:
-        parameters: of the study.
-        nominal: largest error of the last revolution with the scenario's own drives [µm].
-        error: of each drive, rising; infinite where learning would diverge, shape (tolerances, drives) [µm].
+        parameters: parameters of the study.
+        nominal: largest error of the last revolution with the drives of the scenario [µm].
+        error: error of each drive in ascending order; infinite if learning would diverge, shape (tolerances, drives)
+            [µm].
     """
 
     parameters: DriveToleranceParameters
@@ -58,12 +59,12 @@ class DriveToleranceResult:
     error: Array
 
     def _at(self, share: float) -> Array:
-        """Error that so many of the drives stay below, by tolerance [µm]."""
+        """Return the quantile of the error at ``share`` of the drives, by tolerance [µm]."""
         place = int(np.ceil(share * self.error.shape[1])) - 1
         return np.asarray(self.error[:, place])
 
     def to_json(self) -> dict[str, Any]:
-        """Errors that 50, 95 and 99 % stay below; None where more than the rest diverge."""
+        """Return the results for JSON: 50, 95 and 99 % quantiles of the error; None if the quantile is infinite."""
         return {
             "tolerance": self.parameters.tolerance,
             "nominal_um": self.nominal,
@@ -75,7 +76,7 @@ class DriveToleranceResult:
         }
 
     def table(self) -> "RichTable":
-        """Errors that 50, 95 and 99 % of the drives stay below, and the share of refused drives."""
+        """Return a table of the 50, 95 and 99 % quantiles of the error, and the share of rejected drives."""
         columns = ("tolerance (1σ)", *(f"{100 * share:g} % below [µm]" for share in _SHARES), "refused [%]")
         at = [self._at(share) for share in _SHARES]
         rows = [("none", *(f"{self.nominal:.3g}" for _ in _SHARES), "0")]
@@ -87,7 +88,7 @@ class DriveToleranceResult:
         return comparison(title, columns, rows)
 
     def draw(self, figure: "Figure") -> None:
-        """Share of the drives below an error, and the error that 50, 95 and 99 % stay below."""
+        """Draw the distribution of the error over the drives, and its 50, 95 and 99 % quantiles."""
         left, right = figure.subplots(1, 2)
         shares = 100.0 * np.arange(1, self.error.shape[1] + 1) / self.error.shape[1]
         for place, tolerance in enumerate(self.parameters.tolerance):
@@ -115,7 +116,7 @@ class DriveToleranceResult:
 
 
 def _drawn(scenario: Scenario) -> list[str]:
-    """The parameters that differ from drive to drive."""
+    """Return the names of the parameters that differ between drives."""
     drives = [name for name, stage in Cell(scenario.nodes).stages.items() if isinstance(stage, Drive)]
     return [
         f"{node}.{name}"
@@ -126,7 +127,7 @@ def _drawn(scenario: Scenario) -> list[str]:
 
 
 def run(parameters: DriveToleranceParameters, track: Track = untracked) -> DriveToleranceResult:
-    """Compute the study."""
+    """Run the sweep and collect the errors by tolerance."""
     from lathe_rc.sweep.space import Space
 
     base = cells.load(parameters.scenario, spindle_encoder={"revolutions": parameters.revolutions})
@@ -134,7 +135,7 @@ def run(parameters: DriveToleranceParameters, track: Track = untracked) -> Drive
     for tolerance in parameters.tolerance:
         laws = dict.fromkeys(_drawn(base), f"normal:{100.0 * tolerance!r}%")
         spaces.append(Space(sampled=laws, sample=f"sobol:{parameters.drives}"))
-    # A folder of its own each: nothing else distinguishes the rows of one from another's.
+    # One folder per tolerance: nothing else distinguishes their rows.
     asked = [(f"tolerance-{number}", base, space) for number, space in enumerate(spaces)]
     own, *found = sweeps.table(asked, parameters.folder, ["tool.max_error"], track, models="nominal")
     errors = [

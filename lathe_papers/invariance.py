@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invariance to the spindle speed (paper 000, Figs 2 and 3, eqs 13-17).
+"""Invariance of a step response to the spindle speed (paper 000, Figs 2 and 3, eqs 13-17).
 
-A first-order plant gets a unit step and its response is drawn against the angle: at constant speeds, and while
-the speed swings, with the step at many places of the swing. What does not depend on the speed gives one curve.
+The response of a first-order plant to a unit step is drawn against the angle: at constant speeds, and at an
+oscillating speed, with the step at many phases of the oscillation. A speed-independent response gives a single curve.
 """
 
 from dataclasses import dataclass
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_STEPS = 1000  # in T0
-_SPAN = 5.0  # angle that is shown, in θ0
-_POINTS = 201  # shown
-_PHASES = 16  # of the swing at which the step comes
+_STEPS = 1000  # integration steps per T0
+_SPAN = 5.0  # angle range of the figure, in θ0
+_POINTS = 201  # points of the curves
+_PHASES = 16  # number of phases of the oscillation at which the step occurs
 _CHAINS = ("Wk2 → Wk1 → plant", "plant alone", "Wk1 → Wk2 → plant")  # in the order of `responses`
 _COLOURS = ("#1f6f8b", "#c0392b", "#e08e0b")
 
 
 class InvarianceParameters(StudyParameters):
-    """Plant, speeds and deviation."""
+    """Parameters of the invariance study: plant, speeds and speed deviation."""
 
     t0_ms: Annotated[float, Gt(0), Le(1000)] = parameter(2.0, "time constant T0 of the plant", "ms")
     speeds: list[Annotated[float, Gt(0), Le(10_000)]] = parameter([84.0, 105.0, 126.0], "spindle speeds", "rad/s")
@@ -49,26 +49,27 @@ class InvarianceParameters(StudyParameters):
     )
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse speeds at which the response would take more than ten times as long."""
+        """Reject speeds that would make the response more than ten times as long."""
         super().model_post_init(context)
         if min(self.speeds) < self.nominal_speed / 10:
             raise InputError(f"speeds = {self.speeds}; allowed: from {self.nominal_speed / 10:g} rad/s, a tenth of Ω0")
 
     @property
     def time_constant(self) -> float:
-        """T0 [s]."""
+        """Time constant T0 of the plant [s]."""
         return self.t0_ms * 1e-3
 
 
 @dataclass(frozen=True)
 class InvarianceResult:
-    """Step responses against the angle.
+    """Results of the invariance study: step responses against the angle.
 
     Attributes:
-        parameters: of the study.
-        angles: since the step [rad], shape (m,).
-        corrected, uncorrected: one row a speed, shape (speeds, m).
-        deviating: while the speed swings, shape (frequencies, 3, phases, m): corrected, uncorrected, wrong order.
+        parameters: parameters of the study.
+        angles: angles since the step [rad], shape (m,).
+        corrected, uncorrected: responses at constant speed, one row per speed, shape (speeds, m).
+        deviating: responses at oscillating speed (corrected, uncorrected, wrong order), shape
+            (frequencies, 3, phases, m).
     """
 
     parameters: InvarianceParameters
@@ -78,7 +79,7 @@ class InvarianceResult:
     deviating: Array
 
     def to_json(self) -> dict[str, Any]:
-        """Responses, and the largest difference between any two of a kind at the same angle."""
+        """Return the results for JSON: responses, and the largest difference at the same angle within each kind."""
         swing = _spread(self.deviating)
         return {
             "speeds": self.parameters.speeds,
@@ -95,7 +96,7 @@ class InvarianceResult:
         }
 
     def table(self) -> Group:
-        """Spreads, at constant and at swinging speed."""
+        """Return a table of the spreads at constant and oscillating speed."""
         constant = comparison(
             f"Step responses over the angle at {', '.join(f'{v:g}' for v in self.parameters.speeds)} rad/s",
             ("", "largest difference", "paper 000, Fig. 3"),
@@ -117,7 +118,7 @@ class InvarianceResult:
         return Group(constant, "", swinging)
 
     def draw(self, figure: "Figure") -> None:
-        """Fig. 3 of the paper; what the swing does to the response; the spread against the frequency of the swing."""
+        """Draw Fig. 3 of the paper, the responses at oscillating speed, and the spread against its frequency."""
         given = self.parameters
         constant, swinging, spread = figure.subplots(1, 3)
         for chain, rows in ((1, self.uncorrected), (0, self.corrected)):
@@ -146,15 +147,15 @@ class InvarianceResult:
 
 
 def _spread(responses: Array) -> Array:
-    """Largest difference at the same angle, over the last but one axis."""
+    """Return the largest difference at the same angle between responses along the second-to-last axis."""
     return np.asarray(np.ptp(responses, axis=-2).max(axis=-1))
 
 
 def _wrong_order(time_constant: float, angle_constant: float, motion: Array) -> Array:
-    """Input of the plant [1] when Wk1 stands before Wk2, for a unit step.
+    """Return the plant input [1] for a unit step when Wk1 precedes Wk2.
 
-    Wk1 makes an impulse of the step, which Wk2 turns into a jump. With u = (T0·Ω/θ0)·Y + r the equation of Wk2 is
-    (θ0/Ω)·dr/dt + r = (1 - T0·Ω/θ0 - T0·(dΩ/dt)/Ω)·Y, without derivatives of Y.
+    Wk1 turns the step into an impulse, and Wk2 turns the impulse into a jump. With u = (T0·Ω/θ0)·Y + r the
+    equation of Wk2 is (θ0/Ω)·dr/dt + r = (1 - T0·Ω/θ0 - T0·(dΩ/dt)/Ω)·Y, without derivatives of Y.
     """
     angle, omega, acceleration = motion
     jump = time_constant * omega / angle_constant
@@ -170,16 +171,16 @@ def _wrong_order(time_constant: float, angle_constant: float, motion: Array) -> 
 
 
 def responses(law: SpeedLaw, time_constant: float, nominal: float, angles: Array) -> Array:
-    """Step responses of the plant corrected, alone, and corrected in the wrong order.
+    """Compute step responses of the plant: corrected, uncorrected, and corrected in the wrong order.
 
     Args:
-        law: spindle speed; the step comes at time 0.
-        time_constant: T0 [s].
-        nominal: Ω0 [rad/s]; θ0 = T0·Ω0.
-        angles: where the responses are wanted [rad], shape (m,).
+        law: spindle speed; the step occurs at time 0.
+        time_constant: time constant T0 of the plant [s].
+        nominal: nominal speed Ω0 [rad/s]; θ0 = T0·Ω0.
+        angles: angles of the responses [rad], shape (m,).
 
     Returns:
-        Shape (3, m).
+        Responses, shape (3, m).
     """
     step, angle_constant = time_constant / _STEPS, time_constant * nominal
     motion = law.at(np.arange(law.samples_until(float(angles[-1]), step) + 2) * step)
@@ -191,14 +192,14 @@ def responses(law: SpeedLaw, time_constant: float, nominal: float, angles: Array
     )
     commands = np.stack((corrected, desired, _wrong_order(time_constant, angle_constant, motion)))
     plant = discretise(np.array([[-1.0 / time_constant]]), np.array([1.0 / time_constant]), 0.0, step, "foh")
-    # The command jumps at sample 0, where the plant is still at rest.
+    # The command jumps at sample 0, when the plant is still at rest.
     still = -plant.weights[0, 0] * commands[:, :1]
     moved, _ = scipy.signal.lfilter(plant.weights[0, :2], [1.0, -plant.transition[0, 0]], commands, zi=still)
     return np.asarray(scipy.interpolate.CubicSpline(angle, moved, axis=1)(angles))
 
 
 def run(parameters: InvarianceParameters, track: Track = untracked) -> InvarianceResult:
-    """Compute the study."""
+    """Compute the step responses at constant and oscillating speed."""
     t0, nominal = parameters.time_constant, parameters.nominal_speed
     angles = np.linspace(0.0, _SPAN * t0 * nominal, _POINTS)
     constant = np.stack([responses(speed.constant(value), t0, nominal, angles) for value in parameters.speeds])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of paper 001: steady error of four structures for a unit harmonic, printed, analytic and simulated.
+"""Table of paper 001: steady error of four structures for a unit harmonic, printed, analytic and simulated.
 
-Simulated are the cells of ``config/``, one harmonic a run, as a whole number of waves of a revolution.
+The simulation runs the cells of ``config/``, one harmonic per run, with a whole number of waves per revolution.
 """
 
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ Complex = npt.NDArray[np.complex128]
 
 SCENARIOS = ("one_channel", "direct_compensation", "two_coarse", "two_channel")  # in the order of the table
 _TUNINGS = {"none": PLAIN, "lead_lag": LEAD_LAG}
-_SLOWEST = 500.0  # [rad/s] about the speed of the spindle: the frequencies of the table are its first four harmonics
-_AMPLITUDE = 10e-6  # [m], which the piezo can reach
+_SLOWEST = 500.0  # [rad/s] approximate spindle speed: the frequencies of the table are its first four harmonics
+_AMPLITUDE = 10e-6  # [m], within the stroke of the piezo
 _COLOURS = ("#c0392b", "#e08e0b", "#7d3c98", "#1f6f8b")
 
 
 class MultichannelParameters(StudyParameters):
-    """Frequencies and how finely they are simulated."""
+    """Parameters of the multichannel study: frequencies and resolution of the simulation."""
 
     omega: list[Annotated[float, Gt(0), Le(20_000)]] = parameter(FREQUENCIES.tolist(), "frequencies", "rad/s")
     samples_per_revolution: Annotated[int, Ge(64), Le(16_384)] = parameter(
@@ -47,13 +47,13 @@ class MultichannelParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class MultichannelResult:
-    """Amplitudes of the steady error, shape (4, n) each.
+    """Results of the multichannel study: amplitudes of the steady error, shape (4, n) each.
 
     Attributes:
-        parameters: of the study.
-        printed: by the paper; NaN where it has no column.
-        analytic: by the formulas with continuous responses.
-        simulated: in the last revolution.
+        parameters: parameters of the study.
+        printed: values printed in the paper; NaN for columns that it lacks.
+        analytic: values of the formulas with continuous responses.
+        simulated: values in the last simulated revolution.
         rates: sample rate of each column [Hz].
     """
 
@@ -64,7 +64,7 @@ class MultichannelResult:
     rates: list[int]
 
     def to_json(self) -> dict[str, Any]:
-        """The table, and the convergence of both channels."""
+        """Return the results for JSON: the table, and the convergence of both channels."""
         tuning = _TUNINGS[self.parameters.correction]
         omega = np.array(self.parameters.omega)
         peaks = [
@@ -87,7 +87,7 @@ class MultichannelResult:
         }
 
     def table(self) -> Group:
-        """Printed, analytic and simulated, and how far they are apart."""
+        """Return a table of printed, analytic and simulated values, and their differences."""
         columns = ("", *(f"{omega:g} rad/s" for omega in self.parameters.omega))
         tables: list[RenderableType] = []
         for row, name in enumerate(ROWS):
@@ -106,7 +106,7 @@ class MultichannelResult:
         return Group(*tables[:-1])
 
     def draw(self, figure: "Figure") -> None:
-        """Error against frequency: formula as a line, simulation as dots, the paper's as crosses."""
+        """Draw the error against frequency: formula as a line, simulation as dots, printed values as crosses."""
         axes = figure.subplots()
         frequency = np.geomspace(min(self.parameters.omega) / 2, max(self.parameters.omega) * 2, 400)
         smooth = np.abs(analytic(_TUNINGS[self.parameters.correction], frequency))
@@ -122,14 +122,14 @@ class MultichannelResult:
 
 
 def analytic(tuning: Tuning, frequency: Array) -> Complex:
-    """Steady error over the profile in the four structures at ``frequency`` [rad/s], shape (4, n)."""
+    """Return the steady error over the profile of the four structures at ``frequency`` [rad/s], shape (4, n)."""
     coarse, fine = tuning.coarse.steady_error(frequency), tuning.fine.steady_error(frequency)
     direct = direct_compensation(coarse, tuning.fine.drive(frequency))
     return np.stack((coarse, direct, iterative(coarse, coarse), iterative(coarse, fine)))
 
 
 def _nodes(structure: str, tuning: Tuning, correction: str) -> dict[str, dict[str, object]]:
-    """Parameters of drives and controllers of a structure."""
+    """Return the parameters of drives and controllers of a structure."""
     fine = tuning.coarse if structure == "two_coarse" else tuning.fine
 
     def controller(channel: Any) -> dict[str, object]:
@@ -145,7 +145,7 @@ def _nodes(structure: str, tuning: Tuning, correction: str) -> dict[str, dict[st
     def drive(channel: Any) -> dict[str, object]:
         return {"natural_frequency": channel.natural_frequency, "damping": channel.damping}
 
-    # The linear structure is studied, not what the coarse drive may be asked for.
+    # The study assumes the linear structure, without the limits of the coarse drive.
     nodes = {
         "learning_controller": controller(tuning.coarse),
         "electrodynamic_actuator": {**drive(tuning.coarse), "max_velocity": 1e3, "max_acceleration": 1e6},
@@ -158,7 +158,10 @@ def _nodes(structure: str, tuning: Tuning, correction: str) -> dict[str, dict[st
 
 
 def sample_rate(samples_per_revolution: int, speed: float) -> int:
-    """The sample rate [Hz] nearest to ``samples_per_revolution`` at ``speed`` [rad/s] whose step is whole in ns."""
+    """Return the sample rate [Hz] nearest to ``samples_per_revolution`` at ``speed`` [rad/s].
+
+    The sampling step is a whole number of nanoseconds.
+    """
     wanted = samples_per_revolution * speed / (2 * np.pi)
     rates = [rate for rate in range(1000, 1_000_001) if 1_000_000_000 % rate == 0]
     return min(rates, key=lambda rate: abs(np.log(rate / wanted)))
@@ -193,7 +196,7 @@ def _simulate(structure: str, omega: float, parameters: MultichannelParameters) 
 
 
 def run(parameters: MultichannelParameters, track: Track = untracked) -> MultichannelResult:
-    """Compute the study."""
+    """Compute the steady errors by formula and by simulation."""
     omega = np.array(parameters.omega)
     printed = np.full((len(ROWS), omega.size), np.nan)
     for column, frequency in enumerate(omega):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The oval-barrel piston in the four structures of paper 001: what form error is left, analytic and simulated.
+"""Oval-barrel piston in the four structures of paper 001: remaining form error, analytic and simulated.
 
-At a fixed height the profile is periodic, and its harmonics times the steady errors of the structure give the error.
-With the feed the form changes from revolution to revolution, which no memory of one revolution knows: simulated only.
+At a fixed height the profile is periodic, and the error is the product of its harmonics and the steady errors of the
+structure. With feed, the form changes from revolution to revolution, which a memory of one revolution cannot
+anticipate; this case is only simulated.
 """
 
 from dataclasses import dataclass
@@ -27,12 +28,12 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 _SETTLED = 50  # revolutions after which learning has settled
-_POINTS = 1024  # of the profile over a revolution
+_POINTS = 1024  # points of the profile per revolution
 _COLOURS = ("#c0392b", "#e08e0b", "#7d3c98", "#1f6f8b")
 
 
 class PistonParameters(StudyParameters):
-    """The piston and how it is turned."""
+    """Parameters of the piston study: piston and turning conditions."""
 
     height_mm: Annotated[float, Ge(0), Le(60)] = parameter(0.0, "height along the skirt, from its end", "mm")
     feed_mm: Annotated[float, Gt(0), Le(1)] = parameter(0.1, "feed of the runs with feed", "mm/rev")
@@ -42,13 +43,13 @@ class PistonParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class PistonResult:
-    """Form errors of the last revolution by structure [µm].
+    """Results of the piston study: form errors of the last revolution by structure [µm].
 
     Attributes:
-        parameters: of the study.
-        expected: over the angle, by the formulas, shape (4, n).
-        simulated: over the angle, shape (4, n).
-        with_feed: largest and RMS of the worst revolution after the first fifty, shape (4, 2).
+        parameters: parameters of the study.
+        expected: error over the angle by the formulas, shape (4, n).
+        simulated: simulated error over the angle, shape (4, n).
+        with_feed: largest and RMS error of the worst revolution after the first fifty, shape (4, 2).
     """
 
     parameters: PistonParameters
@@ -57,7 +58,7 @@ class PistonResult:
     with_feed: Array
 
     def to_json(self) -> dict[str, Any]:
-        """Largest and RMS errors."""
+        """Return the largest and RMS errors for JSON."""
         found: dict[str, Any] = {"structures": list(ROWS)}
         for name, error in (("analytic", self.expected), ("simulated", self.simulated)):
             found[name] = {"max_um": np.abs(error).max(axis=1).tolist(), "rms_um": _rms(error).tolist()}
@@ -65,7 +66,7 @@ class PistonResult:
         return found
 
     def table(self) -> RichTable:
-        """One row a structure; the paper expects a piezo to win at least a factor of ten."""
+        """Return a table with one row per structure; the paper expects at least a tenfold improvement by a piezo."""
         rows = []
         for row, name in enumerate(ROWS):
             expected, simulated, feed = self.expected[row], self.simulated[row], self.with_feed[row]
@@ -76,7 +77,7 @@ class PistonResult:
         return comparison("Form error of the oval-barrel piston after learning", columns, rows)
 
     def draw(self, figure: "Figure") -> None:
-        """Error over the angle: formula and run."""
+        """Draw the error over the angle by formula and by simulation."""
         degrees = np.arange(_POINTS) * 360 / _POINTS
         for row, (axes, name) in enumerate(zip(figure.subplots(2, 2, sharex=True).flat, ROWS, strict=True)):
             axes.plot(degrees, self.simulated[row], color=_COLOURS[row], lw=2.5, alpha=0.5, label="run")
@@ -124,7 +125,7 @@ def _simulate(structure: str, parameters: PistonParameters, feed: float) -> tupl
 
 
 def run(parameters: PistonParameters, track: Track = untracked) -> PistonResult:
-    """Compute the study."""
+    """Compute the form errors of the piston by formula and by simulation."""
     expected, simulated, with_feed = _expected(parameters), np.empty((len(ROWS), _POINTS)), np.empty((len(ROWS), 2))
     for row, structure in enumerate(track(SCENARIOS)):
         simulated[row], _, _ = _simulate(structure, parameters, 0.0)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws under a speed, a force and a drive that vary: which of them hold.
+"""Robustness of the laws against varying speed, force and drive parameters.
 
-The cell of ``config/robust_cutting.yaml`` under one condition after the other, each with the drive that the laws are
-told and with drives whose natural frequency, damping, stiffness and delay differ from it: at all corners, and between.
+The cell of ``config/robust_cutting.yaml`` runs under each condition, with the nominal drive that the laws assume and
+with drives of different natural frequency, damping, stiffness and delay: at all corners of the range, and inside it.
 """
 
 from collections.abc import Mapping
@@ -35,14 +35,14 @@ Array = npt.NDArray[np.float64]
 Values = Mapping[str, Value]
 
 _TURN = 2.0 * np.pi
-_LAST = 10  # revolutions that are judged
-_SPREAD = 0.2  # of the drives, relative
-TOLD = (1038.0, 0.804, 0.36e-3)  # natural frequency [rad/s], damping and delay [s] that the laws are told
-_MASS = 1.2  # [kg] of it
+_LAST = 10  # number of evaluated revolutions
+_SPREAD = 0.2  # relative spread of the drives
+TOLD = (1038.0, 0.804, 0.36e-3)  # nominal natural frequency [rad/s], damping and delay [s], assumed by the laws
+_MASS = 1.2  # [kg] moving mass of the nominal drive
 _MODEL = ("model_natural_frequency", "model_damping", "model_delay")
-_FREQUENCIES = np.geomspace(1.0, 3e4, 4000)  # [rad/s] at which a margin is looked for
+_FREQUENCIES = np.geomspace(1.0, 3e4, 4000)  # [rad/s] frequency grid of the margin
 
-# Parameters of spindle and cut that a condition leaves as they are in the scenario, where everything happens at once.
+# Overrides that switch off single disturbances of spindle and cut; the scenario itself combines all of them.
 _STEADY: Values = {"spindle_encoder.random_rms": 0.0}
 _WHOLE: Values = {"loaded_drive.cut_gap_start": [], "loaded_drive.cut_gap_width": []}
 _EVEN: Values = {
@@ -71,7 +71,7 @@ CONDITIONS: dict[str, Values] = {
     "slowed by cut": {**_STEADY, **_EVEN},
     "all at once": {},
 }  # fmt: skip
-_SLOWED = "slowed by cut"  # three keyways, and a spindle that the cut slows in between
+_SLOWED = "slowed by cut"  # three keyways, and a spindle slowed by the cut between them
 _SPINDLE: cells.Values = {"stage": "loaded_spindle", "inertia": 0.03, "motor_inertia": 0.01, "torque_limit": 10.0}
 _QUICK = ("nominal", "speed 213", "three keyways", "all at once")
 
@@ -84,7 +84,7 @@ _INVERSE: cells.Values = {
     "soft_start": 1.0,
     "acceleration_window": 64,
 }
-_ANY: cells.Values = {"allow_unstable": True, "stop_ratio": 0.0}  # what diverges is told by its error
+_ANY: cells.Values = {"allow_unstable": True, "stop_ratio": 0.0}  # divergence shows in the error
 _LEARNING: cells.Values = {**_ANY, "stage": "learning_controller", "identify": False}
 #: by name: parameters of the node ``controller``
 LAWS: dict[str, cells.Values] = {
@@ -93,7 +93,7 @@ LAWS: dict[str, cells.Values] = {
     "adapt.": {**_LEARNING, **_INVERSE, "identify": True},
     "comp.": {
         **_ANY, "stage": "compound_controller",
-        # tuned for drives that it is not told: more has to come from the error
+        # tuned for unknown drives: the feedback of the error has to contribute more
         "proportional": 1.9, "integral": 28.0, "derivative": 1.4e-4, "derivative_bandwidth": 19_000.0,
     },
     "told": {**_ANY, "stage": "compound_controller"},
@@ -101,12 +101,12 @@ LAWS: dict[str, cells.Values] = {
     "DOB": {**_ANY, "learning_gain": 0.0, "identify": False},
     "ours": _ANY,
 }  # fmt: skip
-_KNOWS = "told"  # the law that is told each drive
+_KNOWS = "told"  # the law with the true parameters of each drive
 _COLOURS = ("#b7950b", "#e08e0b", "#111111", "#c0392b", "#7d3c98", "#2874a6", "#148f77", "#1e8449")
 
 
 class RobustParameters(StudyParameters):
-    """How many drives, how long, and what counts as good."""
+    """Parameters of the robustness study: number of drives, duration, and tolerance."""
 
     plants: Annotated[int, Ge(1), Le(1000)] = parameter(
         32, "drives beside the one that is told: the 16 corners of ±20 %, and random ones within"
@@ -122,20 +122,22 @@ class RobustParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class RobustResult:
-    """The error of each law under each condition; arrays of shape (conditions, laws, drives), the told drive first.
+    """Results of the robustness study: error of each law under each condition.
 
-    Each value is that of the seed where it is largest.
+    Arrays have the shape (conditions, laws, drives), with the nominal drive first.
+
+    Each value is the largest over the seeds.
 
     Attributes:
-        conditions, laws: their names.
-        seeds: how many.
-        tolerance: [µm].
-        largest, rms: form error of the last ten revolutions where there is material [µm]; NaN where a run was stopped.
-        settled: revolution from which on the error stays within the tolerance; inf: it does not.
+        conditions, laws: names of the conditions and laws.
+        seeds: number of seeds.
+        tolerance: tolerance of the form error [µm].
+        largest, rms: form error of the last ten revolutions, outside gaps in the material [µm]; NaN for a stopped run.
+        settled: revolution from which the error stays within the tolerance; inf if it never does.
         effort: RMS current of the drive [A].
-        margin: of the loop, shape (laws, drives): 1 - sup|factor of a revolution| of a law that learns, least |1 + L|
-            of one that acts in time.
-        curves: by law, largest error by revolution under the last condition for its worst drive [µm].
+        margin: margin of the loop, shape (laws, drives): 1 - sup|factor per revolution| of a learning law, minimum
+            |1 + L| of a law in the time domain.
+        curves: largest error by revolution under the last condition for the worst drive of each law [µm].
     """
 
     conditions: list[str]
@@ -150,7 +152,7 @@ class RobustResult:
     curves: list[Array]
 
     def to_json(self) -> dict[str, Any]:
-        """Per condition and law: with the told drive, and with the worst; None where a run was stopped."""
+        """Return the results for JSON, by condition and law: nominal drive and worst drive; None for a stopped run."""
         found: dict[str, Any] = {"conditions": self.conditions, "laws": self.laws, "seeds": self.seeds}
         found["tolerance_um"] = self.tolerance
         for name, values in (
@@ -164,7 +166,7 @@ class RobustResult:
         return found
 
     def table(self) -> Group:
-        """One table a quantity."""
+        """Return one table per quantity."""
         tables: list[RichTable | str] = []
         worst = f"worst of {self.largest.shape[-1]} drives"
         seeds = f", worst of {self.seeds} seeds" if self.seeds > 1 else ""
@@ -185,7 +187,7 @@ class RobustResult:
         return Group(*tables, comparison("Margin of the loop, before anything is identified", ("", *self.laws), rows))
 
     def draw(self, figure: "Figure") -> None:
-        """Largest errors by condition, and by revolution under the last one; both for the worst drive."""
+        """Draw the largest errors by condition, and by revolution under the last condition, for the worst drive."""
         bars, course = figure.subplots(1, 2, width_ratios=(3, 2))
         worst, width = _worst(self.largest), 0.8 / len(self.laws)
         for k, (law, colour) in enumerate(zip(self.laws, _COLOURS, strict=True)):
@@ -203,7 +205,7 @@ class RobustResult:
 
 
 def _worst(values: Array) -> Array:
-    """Largest value over the last axis, drives or seeds; a stopped run (NaN) is the worst."""
+    """Return the largest value over the last axis (drives or seeds); NaN, a stopped run, counts as the worst."""
     return np.asarray(np.where(np.isnan(values).any(axis=-1), np.nan, values.max(axis=-1)))
 
 
@@ -221,25 +223,25 @@ def _figure(value: float) -> str:
 
 @dataclass(frozen=True)
 class _Judged:
-    """Kept results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
+    """Evaluated results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
 
     largest: Array
     rms: float
     effort: float
 
     def settled(self, tolerance: float) -> float:
-        """The revolution from which on the error stays within a tolerance [µm]; inf: it does not."""
+        """Return the revolution from which the error stays within a tolerance [µm]; inf if it never does."""
         out = np.flatnonzero(~(self.largest <= tolerance))  # not `>`: NaN is out of tolerance, too
         first = int(out[-1]) + 1 if out.size else 0
         return float(first) if first < self.largest.size else np.inf
 
 
 class Judge:
-    """Keeps what is judged of a run: only where there is material.
+    """Recorder of the evaluated signals of a run; errors in gaps of the material are excluded.
 
     Args:
-        cell: that runs.
-        samples: of the run.
+        cell: running cell.
+        samples: number of samples of the run.
     """
 
     heard = ("encoder.angle_true", "tool.error", "coarse/state.effort")
@@ -257,13 +259,13 @@ class Judge:
         self._current[part] = dense["coarse/state"]["effort"]
 
     def kept(self) -> _Judged:
-        """Error and current of the complete revolutions."""
+        """Return error and current of the complete revolutions."""
         error = np.abs(self._error) * 1e6
         for start, width in self._gaps:
             error[np.mod(self._angle - start, _TURN) < width] = 0.0
         revolution = np.floor(self._angle / _TURN)
         starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
-        # The run ends within a revolution: its last start only closes the one before.
+        # The run ends within a revolution: the start of the last revolution only closes the previous one.
         largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
         last = error[starts[-1 - _LAST] : starts[-1]]
         return _Judged(
@@ -272,17 +274,17 @@ class Judge:
 
 
 def drives_near(count: int) -> list[tuple[float, float, float, float]]:
-    """Factors of natural frequency, damping, stiffness and delay; the told drive first."""
+    """Return factors of natural frequency, damping, stiffness and delay for each drive; the nominal drive first."""
     ends = (1.0 - _SPREAD, 1.0 + _SPREAD)
     corners = [*product(ends, repeat=4)]
-    # Of few, opposite ones.
+    # With few drives, opposite corners come first.
     corners = [corners[k] for k in (3, 12, 5, 10, 15, 0, 6, 9, 1, 2, 4, 7, 8, 11, 13, 14)]
     random = np.random.default_rng(0).uniform(*ends, size=(max(count - len(corners), 0), 4)).tolist()
     return [(1.0, 1.0, 1.0, 1.0), *[*corners, *map(tuple, random)][:count]]
 
 
 def machine(frequency: float, damping: float, stiffness: float, delay: float) -> Values:
-    """A drive by factors of the one that the laws are told."""
+    """Return the drive parameters, given as factors of the nominal drive that the laws assume."""
     natural_frequency, own_damping, own_delay = TOLD
     return {
         "loaded_drive.coarse_natural_frequency": natural_frequency * frequency,
@@ -294,7 +296,7 @@ def machine(frequency: float, damping: float, stiffness: float, delay: float) ->
 
 
 def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> Values:
-    """Parameters of the law: the drive as it is identified, in error by these factors."""
+    """Return the model parameters of the law: the nominal drive times these error factors."""
     factors = zip(_MODEL, TOLD, (frequency, damping, delay), strict=True)
     return {f"controller.{name}": value * factor for name, value, factor in factors}
 
@@ -312,7 +314,7 @@ def _cell(
 
 
 def _margin(scenario: Scenario) -> float:
-    """Margin of the law's loop, as in `RobustResult.margin`."""
+    """Return the margin of the law's loop, as in `RobustResult.margin`."""
     cell = Cell(scenario.nodes)
     law, drive = cell.stages["controller"], cell.stages["loaded_drive"]
     assert isinstance(law, Learner), "it commands the drive"
@@ -328,7 +330,7 @@ def _margin(scenario: Scenario) -> float:
 
 
 def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
-    """Compute the study."""
+    """Run every law under every condition with every drive."""
     conditions, count, revolutions = parameters.conditions, parameters.plants, parameters.revolutions
     seeds = parameters.seeds
     if parameters.quick:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled position servo of paper 003: its table, Figs 2-4 and series, and what the servo really does.
+"""Sampled position servo of paper 003: its table, Figs 2-4 and series, compared with the simulated servo.
 
-The paper's table is the step response of the desired function with the pseudo-frequency read as a frequency. Beside
-it stands the drive with the link that makes that function, seen between the samples too; and beside the paper's link
-one that does not ripple, both on a drive with backlash.
+The table of the paper is the step response of the desired function with the pseudo-frequency read as a frequency. It is
+compared with the drive and the link that produces this function, including the motion between the samples. The link of
+the paper is compared with a ripple-free link, both on a drive with backlash.
 """
 
 from dataclasses import dataclass
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Group
 
-_BACKLASH_PERIODS = 60  # a loop over a gap has no pole to say how long it takes
+_BACKLASH_PERIODS = 60  # a loop with backlash has no pole that gives its settling time
 
 
 @dataclass(frozen=True)
 class SampledServoResult(SampledServoNumbers):
-    """The result of the study; see `SampledServoNumbers`."""
+    """Result of the sampled-servo study, with table and figures (numbers in `SampledServoNumbers`)."""
 
     def table(self) -> "Group":
-        """All numbers beside those that the paper prints."""
+        """Return tables of all numbers beside the printed values."""
         return sampled_servo_table.table(self)
 
     def draw(self, figure: "Figure") -> None:
-        """Figs 2-4 of the paper, with the motion between samples and behind a gap."""
+        """Draw Figs 2-4 of the paper, with the motion between samples and with backlash."""
         sampled_servo_figure.draw(self, figure)
 
 
 def _as_continuous(function: PseudoFrequency, time: Array) -> Measures | None:
-    """Of the closed loop with jλ read as p; None where that is unstable."""
+    """Return the measures of the closed loop with jλ read as p; None if it is unstable."""
     response = sampled_loop.continuous_step(*function.as_continuous(), time)
     return None if response is None else sampled_loop.measures(time, response)
 
@@ -97,7 +97,7 @@ def _link_row(
 
 
 def run(parameters: SampledServoParameters, track: Track = untracked) -> SampledServoResult:
-    """Compute the study."""
+    """Compute the table, the series, and the links with and without backlash."""
     rows, uncorrected, misread = [], [], []
     time = parameters.time
     links: dict[str, list[LinkRow]] = {"paper": [], "ripple_free": []}
@@ -108,7 +108,7 @@ def run(parameters: SampledServoParameters, track: Track = untracked) -> Sampled
             _table_row(drive, ratio, time, paper_says)
             for ratio, paper_says in zip(RATIOS, printed or [None] * len(RATIOS), strict=True)
         ]
-        # The simulation knows whole steps only.
+        # The simulation supports only whole steps.
         step = period / sampled_loop.STEPS
         delay = min(round(parameters.delay_ms * 1e-3 / step) * step, period)
         uncorrected.append(_link_row(drive, NONE, None, parameters, delay))

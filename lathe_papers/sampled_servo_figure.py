@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figs 2-4 of paper 003, with what the drive does between samples and behind a gap."""
+"""Figs 2-4 of paper 003, with the motion of the drive between samples and with backlash."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_SHOWN = 1.2  # time of the step responses [s]
+_SHOWN = 1.2  # time span of the step responses [s]
 _COLOURS = ("#1f6f8b", "#e08e0b", "#c0392b", "#4a8f3c")
 
 
 def _line(found: Sequence[Measures | None]) -> Array:
-    """Overshoot [%] and settling [s] of several, NaN for None, shape (2, n)."""
+    """Return overshoot [%] and settling time [s] of several responses, NaN for None, shape (2, n)."""
     return np.asarray(np.array([numbers(one) for one in found], dtype=np.float64).T)
 
 
 def draw(result: "SampledServoNumbers", figure: "Figure") -> None:
-    """Figs 2-4 with what is true between samples, and the backlash."""
+    """Draw Figs 2-4 with the simulated motion between samples, and the backlash."""
     (steps, gain, phase), (overshoot, settling, gap) = figure.subplots(2, 3)
     _draw_steps(result, steps)
     _draw_bode(result, gain, phase)
@@ -42,7 +42,7 @@ def draw(result: "SampledServoNumbers", figure: "Figure") -> None:
 
 
 def _middle(result: "SampledServoNumbers") -> int:
-    """Place of the period that the figures of one period are for: 0.16 s, or the nearest."""
+    """Return the index of the period for the single-period figures: 0.16 s, or the nearest."""
     return int(np.argmin(np.abs(np.array(result.parameters.t) - 0.16)))
 
 
@@ -69,7 +69,7 @@ def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> No
     ripple_free_loop = sampled_loop.open_loop(drive, ripple_free(drive))
     curves.append(("ripple-free link", np.asarray(ripple_free_loop(1j * frequency)), _COLOURS[3]))
     for label, response, colour in curves:
-        # Each begins at -90°, as its integrator does.
+        # Each phase starts at -90°, due to the integrator.
         angle = np.degrees(np.unwrap(np.angle(1j * response))) - 90.0
         gain.semilogx(frequency, 20.0 * np.log10(np.abs(response)), color=colour, label=label)
         phase.semilogx(frequency, angle, color=colour, label=label)

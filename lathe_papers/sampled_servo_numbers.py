@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of paper 003 on the sampled position servo, parameters and results of the study of it.
+"""Numbers of paper 003 on the sampled position servo: parameters and results of the study.
 
-The paper's table is the step response of the desired function with the pseudo-frequency read as a frequency. Beside
-it stands the drive with the link that makes that function, seen between the samples too; and beside the paper's link
-one that does not ripple, both on a drive with backlash.
+The table of the paper is the step response of the desired function with the pseudo-frequency read as a frequency. It is
+compared with the drive and the link that produces this function, including the motion between the samples. The link of
+the paper is compared with a ripple-free link, both on a drive with backlash.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from lathe_rc.study import StudyParameters
 Array = npt.NDArray[np.float64]
 
 RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.775, 1.0, 1.125, 1.25, 1.5)
-#: overshoot [%] and settling [s] of the paper's table by T/2 [s], None where it says "unstable"
+#: overshoot [%] and settling time [s] of the paper's table by T/2 [s], None for the entry "unstable"
 PRINTED: dict[float, tuple[tuple[float, float] | None, ...]] = {
     0.04: (
         (2.5, 0.28), (2.0, 0.29), (1.2, 0.3), (0.5, 0.31), (0.0, 0.33),
@@ -33,7 +33,7 @@ PRINTED: dict[float, tuple[tuple[float, float] | None, ...]] = {
         (12.0, 0.46), (0.0, 0.18), (0.0, 0.26), (0.0, 0.35), None,
     ),
 }  # fmt: skip
-_GAIN, _LAG, PRINTED_PERIOD = 6.25, 0.08, 0.16  #: K [1/s], T1 [s] and T [s] of what is printed outside the table
+_GAIN, _LAG, PRINTED_PERIOD = 6.25, 0.08, 0.16  #: K [1/s], T1 [s] and T [s] of the printed values outside the table
 #: Eqs 5-7, with T = 0.16 s
 DESIRED = tuple(PseudoFrequency(_GAIN, 0.08, zero, pole) for zero, pole in ((0.08, 0.08), (0.062, 0.08), (0.105, 0.04)))
 PRINTED_SERIES = (
@@ -41,13 +41,13 @@ PRINTED_SERIES = (
     (0.0, 0.89, 1.1, 1.02, 0.99, 0.905, 0.897, 0.903, 0.903),
     (0.0, 0.19, 0.62, 1.1, 1.45, 1.57, 1.47),
 )
-TERMS = 9  #: of the series that are shown, X[0] included
-_POINTS = 8000  # of the continuous responses
+TERMS = 9  #: displayed terms of the series, including X[0]
+_POINTS = 8000  # points of the continuous responses
 FEEDBACKS: tuple[Feedback, Feedback] = ("motor", "load")
 
 
 class SampledServoParameters(StudyParameters):
-    """Drive, periods and backlash."""
+    """Parameters of the sampled-servo study: drive, periods and backlash."""
 
     t: list[Annotated[float, Ge(0.01), Le(0.5)]] = parameter([0.08, 0.16, 0.24], "periods T of the hold", "s")
     gain: Annotated[float, Gt(0), Le(100)] = parameter(_GAIN, "K of the drive", "1/s")
@@ -57,25 +57,25 @@ class SampledServoParameters(StudyParameters):
 
     @property
     def as_printed(self) -> bool:
-        """Whether the drive is the one of the paper's table."""
+        """Whether the drive has the parameters of the paper's table."""
         return (self.gain, self.lag) == (_GAIN, _LAG)
 
     @property
     def time(self) -> Array:
-        """Of the continuous responses [s]: long after they have settled."""
+        """Times of the continuous responses [s], long enough for them to settle."""
         return np.arange(_POINTS, dtype=np.float64) * (max(50.0 / self.gain, 20.0 * self.lag) / _POINTS)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the paper's table.
+    """Row of the table of paper 003.
 
     Attributes:
-        half_period: T/2 [s].
-        ratio: ρ = Te/(T/2).
-        continuous: of the desired function with jλ read as p; None where that is unstable.
-        true: of the drive with the link of that function; None where that is unstable.
-        printed: overshoot [%] and settling [s]; None where there is none.
+        half_period: half of the sampling period, T/2 [s].
+        ratio: ratio ρ = Te/(T/2).
+        continuous: measures of the desired function with jλ read as p; None if it is unstable.
+        true: measures of the drive with the link of this function; None if it is unstable.
+        printed: printed overshoot [%] and settling time [s]; None if not printed.
     """
 
     half_period: float
@@ -87,14 +87,14 @@ class Row:
 
 @dataclass(frozen=True)
 class LinkRow:
-    """A link at one period.
+    """Results of one link at one period.
 
     Attributes:
-        design: on paper.
-        step: of a drive without backlash; None where the loop is unstable.
-        motor, load: with backlash, measured there.
-        late: with a late measurement; None where the loop is unstable.
-        late_known: the same with a link made for that, where there is one.
+        design: design report, without simulation.
+        step: step response of a drive without backlash; None if the loop is unstable.
+        motor, load: step responses with backlash, with the position measured at the motor or the load.
+        late: measures with a delayed measurement; None if the loop is unstable.
+        late_known: like ``late``, with a link designed for the delay; None if there is none.
     """
 
     design: DesignReport
@@ -106,11 +106,11 @@ class LinkRow:
 
     @property
     def measures(self) -> Measures | None:
-        """Of the step without backlash."""
+        """Overshoot and settling time of the step response without backlash."""
         return None if self.step is None else sampled_loop.measures(self.step.time, self.step.load)
 
     def to_json(self) -> dict[str, Any]:
-        """Numbers; those with backlash for a measurement at the motor, and at the load."""
+        """Return the numbers of the link for JSON; with backlash, for measurement at the motor and at the load."""
         found = numbers(self.measures)
         return {
             "t": self.design.drive.period,
@@ -136,15 +136,15 @@ class LinkRow:
 
 @dataclass(frozen=True)
 class SampledServoNumbers:
-    """The result of the study, in numbers.
+    """Numerical results of the sampled-servo study.
 
     Attributes:
-        parameters: of the study.
-        analog: step response of the loop without sampling, and its time [s], shape (2, n).
-        rows: of the table, by period and ratio.
-        uncorrected: the drive without a link, at each period.
-        misread: the same with jλ read as p; None where that is unstable.
-        links: ``paper`` and ``ripple_free``, at each period.
+        parameters: parameters of the study.
+        analog: time [s] and step response of the loop without sampling, shape (2, n).
+        rows: rows of the table, by period and ratio.
+        uncorrected: results of the drive without a link, at each period.
+        misread: like ``uncorrected``, with jλ read as p; None if it is unstable.
+        links: results of the links ``paper`` and ``ripple_free``, at each period.
         computed: series of eqs 5-7, each of shape (10,).
     """
 
@@ -157,7 +157,7 @@ class SampledServoNumbers:
     computed: tuple[Array, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The table, the links and the series; None where a loop is unstable or nothing is printed."""
+        """Return the table, the links and the series for JSON; None for unstable loops and missing printed values."""
         time, analog = self.analog
         found, crossing = sampled_loop.measures(time, analog), first_crossing(time, analog)
         return {
@@ -191,21 +191,21 @@ class SampledServoNumbers:
         }
 
     def all_links(self) -> list[tuple[str, tuple[LinkRow, ...]]]:
-        """Name and rows, with those of no link first."""
+        """Names and rows of all links, starting with the drive without a link."""
         return [("none", self.uncorrected), ("paper", self.links["paper"]), ("ripple-free", self.links["ripple_free"])]
 
 
 def numbers(found: Measures | None) -> tuple[float | None, float | None]:
-    """Overshoot [%] and settling [s]."""
+    """Return overshoot [%] and settling time [s] of a response; None for both if there is none."""
     return (None, None) if found is None else (100.0 * found.overshoot, found.settling)
 
 
 def stable(function: PseudoFrequency) -> bool:
-    """Whether the loop of a desired function is."""
+    """Whether the closed loop of a desired function is stable."""
     return bool(np.abs(np.roots(function.closed()[1])).max() < 1.0)
 
 
 def first_crossing(time: Array, response: Array) -> float:
-    """When the response first reaches its end [s]; NaN if it never does."""
+    """Return the time when the response first reaches its final value [s]; NaN if it never does."""
     reached = np.flatnonzero(response >= 1.0)
     return float(time[reached[0]]) if reached.size else np.nan

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of the study of the sampled servo, beside what paper 003 prints."""
+"""Tables of the sampled-servo study, with computed and printed values of paper 003 side by side."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ _SERIES_TOLERANCE = 0.01  # the printed terms have two digits
 
 
 def _cell(found: Measures | None, place: int) -> str:
-    """Overshoot or settling as the tables show it."""
+    """Format overshoot or settling time for a table cell."""
     if found is None:
         return "" if place else "unstable"
     value = numbers(found)[place]
@@ -38,14 +38,14 @@ def _cell(found: Measures | None, place: int) -> str:
 
 
 def _beside(printed: Sequence[float], n: int, computed: float) -> str:
-    """The printed term, in brackets where it is wrong."""
+    """Format the printed term, in brackets if it is wrong."""
     if n >= len(printed):
         return ""
     return f"{printed[n]:g}" if abs(printed[n] - computed) <= _SERIES_TOLERANCE else f"[{printed[n]:g}]"
 
 
 def _polynomials(link: Link) -> str:
-    """D(z) of a link of first order or none."""
+    """Format D(z) of a link of order zero or one."""
     if len(link.numerator) == 1:
         return f"{link.numerator[0]:g}"
     (gain, zero), (_, pole) = link.numerator, link.denominator
@@ -53,7 +53,7 @@ def _polynomials(link: Link) -> str:
 
 
 def table(result: "SampledServoNumbers") -> Group:
-    """All numbers of the study beside those that the paper prints."""
+    """Return tables of all numbers of the study beside the values printed in the paper."""
     parts = (_steps, _drives, _designs, _desired, _links, _gap, _series)
     pieces: list[RichTable | str] = [piece for part in parts for piece in (part(result), "")]
     return Group(*pieces[:-1])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Periodic control of a drive whose input saturates (paper 002, Figs 2-4), and what its law needs to last.
+"""Periodic control of a drive with input saturation (paper 002, Figs 2-4), and conditions of its long-term stability.
 
-The paper's example, its conditions of hyperstability, and the runs that show what the memory's filter, the anti-windup
-and the choice of gains are for.
+The study covers the example of the paper, its conditions of hyperstability, and runs that show the purpose of the
+memory filter, the anti-windup and the choice of gains.
 """
 
 from dataclasses import asdict, dataclass
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_SHORT = 0.8  # of the input that the nominal drive needs
-_COARSE = 1e-4  # quantisation in the table
-_REFERENCE_PERIODS = 400  # of the run with the filter
+_SHORT = 0.8  # fraction of the input that the nominal drive requires
+_COARSE = 1e-4  # quantisation step in the table
+_REFERENCE_PERIODS = 400  # periods of the run with the filter
 _LEVELS = (0.0, 0.5, 1.0)  # of y_F in the figure
 _FREQUENCIES = np.geomspace(0.5, 50.0, 400)  # in the figure [rad/s]
 _COLOURS = ("#1f6f8b", "#c0392b", "#e08e0b", "#7b5ea7")
 
 
 class SaturationParameters(StudyParameters):
-    """The law and how long it runs."""
+    """Parameters of the saturation study: law and duration of the run."""
 
     periods: Annotated[int, Ge(1), Le(10_000)] = parameter(8, "periods of 25 s to run")
     s0: Annotated[float, Gt(0), Le(1000)] = parameter(2.0, "limit S0 of the drive's input")
@@ -54,13 +54,13 @@ class SaturationParameters(StudyParameters):
 
     @property
     def gains(self) -> PeriodicGains:
-        """Of the preset."""
+        """Gains of the selected preset."""
         return PRESETS[self.preset]
 
 
 @dataclass(frozen=True)
 class Check:
-    """A number that spec/feed-and-force.md expects, and the computed one."""
+    """Comparison of a number expected by spec/feed-and-force.md with its computed value."""
 
     name: str
     expected: str
@@ -69,13 +69,13 @@ class Check:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Hyperstability over the box.
+    """Conditions of hyperstability over the box of drives.
 
     Attributes:
-        neglected: eq. 14 with T* = 0, as the paper takes it.
-        whole: with T*.
-        learning: where the memory learns.
-        needed: largest |u°|, nominal and at the worst corner.
+        neglected: eq. 14 with T* = 0, as assumed by the paper.
+        whole: eq. 14 with T*.
+        learning: learning behaviour of the memory.
+        needed: largest |u°| of the nominal drive and of the worst corner.
     """
 
     neglected: Positivity
@@ -86,16 +86,16 @@ class Conditions:
 
 @dataclass(frozen=True)
 class SaturationResult:
-    """Runs and conditions.
+    """Results of the saturation study: runs and conditions.
 
     Attributes:
-        parameters: of the study.
-        outcome: the nominal drive.
-        without_filter: as published, 200 periods.
-        with_filter: published gains with filter and anti-windup, 400 periods.
-        corners: of the box, one for each row of `hyperstability.corners`; empty unless asked for.
-        checks: numbers of the spec.
-        conditions: of hyperstability.
+        parameters: parameters of the study.
+        outcome: run of the nominal drive.
+        without_filter: run with the published law, 200 periods.
+        with_filter: run with published gains, filter and anti-windup, 400 periods.
+        corners: runs of the corners of the box, one for each row of `hyperstability.corners`; empty unless requested.
+        checks: comparisons with the numbers of the specification.
+        conditions: conditions of hyperstability.
     """
 
     parameters: SaturationParameters
@@ -107,7 +107,7 @@ class SaturationResult:
     conditions: Conditions
 
     def to_json(self) -> dict[str, Any]:
-        """The run, its corners, the conditions, the checks, the curves of the first periods."""
+        """Return the run, corners, conditions, checks and curves of the first periods for JSON."""
         controller, conditions = self.outcome.controller, self.conditions
         return {
             **_errors(self.outcome),
@@ -148,7 +148,7 @@ class SaturationResult:
         }  # fmt: skip
 
     def table(self) -> Group:
-        """Errors by period, the conditions, and the numbers of the spec."""
+        """Return tables of errors by period, conditions, and comparisons with the specification."""
         return Group(self._periods(), "", self._conditions(), "", self._checks())
 
     def _periods(self) -> Table:
@@ -209,7 +209,7 @@ class SaturationResult:
         )
 
     def draw(self, figure: "Figure") -> None:
-        """Figs 2, 3 and 4 of the paper; error and eq. 15 by period; where the memory learns."""
+        """Draw Figs 2, 3 and 4 of the paper, error and eq. 15 by period, and the learning factor of the memory."""
         (motion, error, inputs), (errors, integral, factor) = figure.subplots(2, 3)
         time, wanted, output, command, load = self.outcome.curves
         motion.plot(time, output, color=_COLOURS[0], label="y")
@@ -281,7 +281,7 @@ def _where(found: Positivity) -> str:
 
 
 def _checks(step: float, needed: tuple[float, float], without_filter: Outcome, with_filter: Outcome) -> list[Check]:
-    """The numbers of the specification."""
+    """Compute the comparisons with the numbers of the specification."""
 
     def at(outcome: Outcome, period: int) -> float:
         return float(outcome.period_max_error[period - 1])
@@ -293,7 +293,7 @@ def _checks(step: float, needed: tuple[float, float], without_filter: Outcome, w
         case = Case(periods=100, step=step, quantisation=_COARSE, gains=PRESETS[preset])
         return float(simulate(case, NOMINAL).period_max_error[50:].max())
 
-    switch = short(anti_windup=False)  # its error goes up and down between periods, so its mean is compared
+    switch = short(anti_windup=False)  # its error alternates between periods, so its mean is compared
     return [
         Check("needed |u|, nominal drive", "0.891", needed[0]),
         Check("needed |u|, worst corner", "1.10", needed[1]),
@@ -329,10 +329,10 @@ def _conditions(gains: PeriodicGains, memory_filter: float, step: float) -> Cond
 
 
 def run(parameters: SaturationParameters, track: Track = untracked) -> SaturationResult:
-    """Compute the study.
+    """Run the example and evaluate the conditions of hyperstability.
 
     Raises:
-        InputError: the period is no whole number of steps.
+        InputError: the period is not a whole number of steps.
     """
     step = parameters.step
     case = Case(

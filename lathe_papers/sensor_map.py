@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A law that does not know the speed, with errors of encoder and position sensor, against the variable lead.
+"""Effect of encoder and position-sensor errors on a law that does not know the speed, against the variable lead.
 
-The cell of `lathe_papers.speed_deviation`, frozen, with the variable lead of paper 000 (eq. 20) and with
-``disturbance_controller``, over counts, noise, frequencies of the deviation, harmonics of the profile and seeds. Counts
-that pass a ratio of small numbers per sample are among them, of which the check before a start warns.
+The cell of `lathe_papers.speed_deviation` runs with a frozen memory, with the variable lead of paper 000 (eq. 20) and
+with ``disturbance_controller``, for combinations of encoder counts, noise, frequency of the deviation, harmonic of the
+profile and seed. Some encoder counts give a small-integer ratio of counts per sample; the check before a start warns
+of them.
 """
 
 from collections.abc import Mapping
@@ -32,11 +33,11 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_BEGINS = 3.0  # [s] the deviation, after 50 revolutions at constant speed
-_SHOWN = 1.0  # [s] of deviation
-_GOLDEN = 0.6180339887  # of a revolution, by which the next seed's deviation begins later
+_BEGINS = 3.0  # [s] start of the deviation, after 50 revolutions at constant speed
+_SHOWN = 1.0  # [s] duration of the deviation
+_GOLDEN = 0.6180339887  # fraction of a revolution by which the start of the deviation shifts per seed
 _PLAIN, _OURS = "speed_deviation", "robust"  # scenarios
-_FREE: Mapping[str, Value] = {  # the linear drive is studied, not what it may be asked for
+_FREE: Mapping[str, Value] = {  # the study assumes the linear drive, without its limits
     "electrodynamic_actuator.max_velocity": 1e3,
     "electrodynamic_actuator.max_acceleration": 1e6,
     "electrodynamic_actuator.stroke": 1.0,
@@ -44,7 +45,7 @@ _FREE: Mapping[str, Value] = {  # the linear drive is studied, not what it may b
 
 
 class SensorMapParameters(StudyParameters):
-    """Sensors, deviations and profiles."""
+    """Parameters of the sensor-map study: sensors, deviations and profiles."""
 
     counts: list[Annotated[int, Ge(0), Le(2**31 - 1)]] = parameter(
         [1000, 2048, 3000, 3500, 4096, 5000, 7000, 8192, 10_000, 100_000, 1_000_000],
@@ -64,14 +65,16 @@ class SensorMapParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class SensorMapResult:
-    """Largest errors while the speed swings [µm]; shape (counts, noise, harmonics, wd · seeds).
+    """Results of the sensor-map study: largest errors during the speed deviation [µm].
+
+    Arrays have the shape (counts, noise, harmonics, wd · seeds) unless noted.
 
     Attributes:
-        parameters: of the study.
-        plain: of the variable lead.
-        ours: of ``disturbance_controller``.
-        floor: of the variable lead at constant speed, shape (counts, noise, harmonics).
-        warned: whether the check before a start warns of the counts, shape (counts,).
+        parameters: parameters of the study.
+        plain: errors of the variable lead.
+        ours: errors of ``disturbance_controller``.
+        floor: errors of the variable lead at constant speed, shape (counts, noise, harmonics).
+        warned: whether the check before a start warns of the encoder counts, shape (counts,).
     """
 
     parameters: SensorMapParameters
@@ -82,11 +85,11 @@ class SensorMapResult:
 
     @property
     def ratio(self) -> Array:
-        """Error of ours over that of the variable lead."""
+        """Ratio of the error of ``disturbance_controller`` to that of the variable lead."""
         return self.ours / self.plain
 
     def to_json(self) -> dict[str, Any]:
-        """All errors."""
+        """Return all errors for JSON."""
         given = self.parameters
         return {
             **{name: getattr(given, name) for name in ("counts", "noise_nm", "harmonics", "wd", "seeds")},
@@ -99,12 +102,12 @@ class SensorMapResult:
         }
 
     def table(self) -> Group:
-        """The worst over frequencies and seeds: of the ratio, and of the error itself."""
+        """Return tables of the worst ratio and the worst error over frequencies and seeds."""
         given = self.parameters
         tables: list[RichTable | str] = []
         columns = ("counts", "a sample", "warning", "nm", *(f"{harmonic} waves" for harmonic in given.harmonics))
         shared = cells.load(_OURS).shared
-        passed = shared.nominal_speed * shared.step / (2.0 * np.pi)  # of a revolution, in a sample
+        passed = shared.nominal_speed * shared.step / (2.0 * np.pi)  # revolutions per sample
         for title, values in (
             ("Largest error over that of the variable lead, at the worst wd and seed", self.ratio.max(axis=-1)),
             ("Largest error [µm], at the worst wd and seed", self.ours.max(axis=-1)),
@@ -126,7 +129,7 @@ class SensorMapResult:
         return Group(*tables, *told)
 
     def draw(self, figure: "Figure") -> None:
-        """A map for each harmonic: counts over frequency, at the noise in the middle of those that are given."""
+        """Draw one map per harmonic, counts over frequency, at the middle of the given noise levels."""
         given = self.parameters
         noise = len(given.noise_nm) // 2
         panels = np.atleast_1d(figure.subplots(1, len(given.harmonics), sharey=True))
@@ -145,7 +148,7 @@ class SensorMapResult:
 
 
 class _Largest:
-    """Keeps the largest error [µm] from the begin of the deviation on."""
+    """Recorder of the largest error [µm] from the start of the deviation."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
         self._tool = next(topic for topic, source in cell.dense.items() if source.type == messages.TOOL)
@@ -154,17 +157,20 @@ class _Largest:
         self._largest = 0.0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take the error of a chunk, from the start of the swing on."""
+        """Update the largest error with a chunk, from the start of the deviation."""
         error = dense[self._tool]["error"][max(self._begins - first, 0) :]
         self._largest = max(self._largest, float(np.abs(error).max(initial=0.0)) * 1e6)
 
     def kept(self) -> float:
-        """Largest form error since the swing began [µm]."""
+        """Return the largest form error since the start of the deviation [µm]."""
         return self._largest
 
 
 def _cells(parameters: SensorMapParameters) -> list[Scenario]:
-    """For counts, noise and harmonics: the plain law at constant speed, then both laws for each frequency and seed."""
+    """Return the scenarios for all combinations of counts, noise and harmonics.
+
+    Each combination contains the plain law at constant speed, then both laws for each frequency and seed.
+    """
     nominal = cells.load(_PLAIN).shared.nominal_speed
     turns = (_BEGINS + _SHOWN) * nominal / (2 * np.pi)
     bases = {
@@ -192,7 +198,7 @@ def _cells(parameters: SensorMapParameters) -> list[Scenario]:
 
 
 def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapResult:
-    """Compute the study."""
+    """Run all scenarios and collect the largest errors."""
     shape = len(parameters.counts), len(parameters.noise_nm), len(parameters.harmonics), -1
     found = np.reshape(
         [np.nan if kept is None else kept for kept in cells.kept(_cells(parameters), _Largest, track)], shape
@@ -208,7 +214,7 @@ def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapR
 
 
 def _warned(parameters: SensorMapParameters, counts: int) -> bool:
-    """Whether the check before a start warns of counts."""
+    """Whether the check before a start warns of an encoder with this number of counts."""
     cell = Cell(cells.load(_OURS).nodes)
     nominal, law = cell.master.shared.nominal_speed, cell.stages["disturbance_controller"]
     assert isinstance(law, Learner), "it commands the drive"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of a swinging spindle speed for each learning law (paper 000, Fig. 6).
+"""Effect of an oscillating spindle speed on the error of each learning law (paper 000, Fig. 6).
 
-The cell of ``config/speed_deviation.yaml`` learns a harmonic profile at constant speed; then the speed swings. The
-protocol ``frozen`` holds the memory from there on, ``learning`` goes on learning.
+The cell of ``config/speed_deviation.yaml`` learns a harmonic profile at constant speed; then the speed oscillates. The
+protocol ``frozen`` freezes the memory at this point, and ``learning`` continues learning.
 """
 
 from collections.abc import Mapping
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Overrides = Mapping[str, object]
 
-_CYCLES = 50  # learned at constant speed
-_SHOWN = 1.0  # [s] of deviation, at least a period and a half
+_CYCLES = 50  # learning cycles at constant speed
+_SHOWN = 1.0  # [s] duration of the deviation, at least 1.5 periods
 _DYNAMIC = "second_order_inverse_dynamic"
 COLOURS = {
     "time_periodic": "#7f7f7f",
@@ -42,12 +42,12 @@ COLOURS = {
     "disturbance_controller": "#1e8449",
 }
 LAWS = tuple(COLOURS)
-OURS = "disturbance_controller"  #: the last of the laws: a stage of its own, in a cell of its own
+OURS = "disturbance_controller"  #: the last of the laws: a separate stage in a separate cell
 _TRACES = ("constant_lead", "variable_lead", "adaptive_inverse", OURS)
 
 
 class SpeedDeviationParameters(StudyParameters):
-    """Profile, deviation and settings of the laws."""
+    """Parameters of the speed-deviation study: profile, deviation and settings of the laws."""
 
     wd: list[Annotated[float, Gt(0), Le(2000)]] = parameter(
         [10.7, 106.0, 213.0], "frequencies of the deviation", "rad/s"
@@ -71,12 +71,13 @@ class SpeedDeviationParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class SpeedDeviationResult:
-    """Errors while the speed swings.
+    """Results of the speed-deviation study: errors during the deviation.
 
     Attributes:
-        parameters: of the study.
-        largest, rms: by law, one number a frequency [µm].
-        traces: by law of the figure, one (revolutions since the deviation began, error [µm]) a frequency.
+        parameters: parameters of the study.
+        largest, rms: largest and RMS error by law, one value per frequency [µm].
+        traces: curves by law of the figure, one pair (revolutions since the start of the deviation, error [µm]) per
+            frequency.
     """
 
     parameters: SpeedDeviationParameters
@@ -85,11 +86,11 @@ class SpeedDeviationResult:
     traces: dict[str, list[tuple[Array, Array]]]
 
     def to_json(self) -> dict[str, Any]:
-        """Errors by law."""
+        """Return the errors by law for JSON."""
         return {"wd": self.parameters.wd, "max_um": self.largest, "rms_um": self.rms}
 
     def table(self) -> Group:
-        """Largest and RMS errors, one row a law; the paper prints curves, and this ordering with them."""
+        """Return a table of largest and RMS errors, one row per law; the paper prints curves and this ordering."""
         given = self.parameters
         columns = ("law", *(f"{wd:g} rad/s" for wd in given.wd))
         title = f"{given.amplitude_um:g} µm, {given.harmonic} waves, ±{given.deviation:g} rad/s, {given.protocol}"
@@ -117,7 +118,7 @@ class SpeedDeviationResult:
         return Group(tables[0], "", tables[1], "", factors)
 
     def draw(self, figure: "Figure") -> None:
-        """Fig. 6 of the paper for up to three frequencies, and the largest error against the frequency."""
+        """Draw Fig. 6 of the paper for up to three frequencies, and the largest error against the frequency."""
         given = self.parameters
         shown = list(enumerate(given.wd))[:3]
         *panels, overview = figure.subplots(1, len(shown) + 1)
@@ -145,15 +146,15 @@ def _figure(value: float) -> str:
 
 
 def _models(parameters: SpeedDeviationParameters) -> list[Overrides]:
-    """The wrong models that laws begin with."""
+    """Return the initial drive models of the laws, with errors in natural frequency and damping."""
     ends = (1 - parameters.model_error, 1 + parameters.model_error)
     return [{"model_natural_frequency": 1038.0 * w, "model_damping": 0.804 * z} for w, z in product(ends, ends)]
 
 
 def settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
-    """Parameters of the learning controller by law; several where the worst counts."""
+    """Return the parameters of the learning controller by law, with several variants if the worst counts."""
     lead, q = parameters.t0_ms * 1e-3, parameters.q_us * 1e-6
-    delay = 0.36e-3  # of the drive: all that an inverse leaves to the lead
+    delay = 0.36e-3  # of the drive: the only part that an inverse leaves to the lead
     inverse: Overrides = {"lead_time": delay, "q_time": q}
     adaptive: Overrides = {
         "correction": _DYNAMIC,
@@ -179,13 +180,13 @@ def settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]
 
 
 def _run_cell(parameters: SpeedDeviationParameters, wd: float, name: str, controller: Overrides) -> tuple[Array, Array]:
-    """Revolutions since the deviation began, and the form error [µm]."""
+    """Simulate the cell; return revolutions since the start of the deviation and the form error [µm]."""
     shared = cells.load("speed_deviation").shared
     nominal, rate = shared.nominal_speed, shared.sample_rate
     start = round(_CYCLES * parameters.cycle_revolutions * 2 * np.pi / nominal * rate) / rate
     shown = max(_SHOWN, 3 * np.pi / wd)
     frozen = parameters.protocol == "frozen"
-    deviating = shown if frozen else 2 * shown  # what is shown begins when the law has met the deviation once
+    deviating = shown if frozen else 2 * shown  # the evaluation starts after one pass of the deviation
     law = {
         "deviation_amplitude": [parameters.deviation / nominal],
         "deviation_frequency": [wd],
@@ -209,7 +210,7 @@ def _run_cell(parameters: SpeedDeviationParameters, wd: float, name: str, contro
         node: {**controller, "events": [f"second {start!r}: freeze"] if frozen else []},
         "electrodynamic_actuator": {
             "noise_rms": parameters.sensor_noise_nm * 1e-9,
-            # The linear drive is studied, not what it may be asked for.
+            # The study assumes the linear drive, without its limits.
             "max_velocity": 1e3,
             "max_acceleration": 1e6,
             "stroke": 1.0,
@@ -224,7 +225,7 @@ def _run_cell(parameters: SpeedDeviationParameters, wd: float, name: str, contro
 
 
 def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> SpeedDeviationResult:
-    """Compute the study."""
+    """Simulate every law at every frequency of the deviation."""
     largest: dict[str, list[float]] = {law: [] for law in LAWS}
     rms: dict[str, list[float]] = {law: [] for law in LAWS}
     traces: dict[str, list[tuple[Array, Array]]] = {law: [] for law in _TRACES}
@@ -235,7 +236,7 @@ def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> Speed
         largest[law].append(float(np.abs(error).max()))
         rms[law].append(float(np.sqrt(np.mean(error**2))))
         if law in traces:
-            every = max(error.size // 4000, 1)  # more points than the figure has pixels only cost memory
+            every = max(error.size // 4000, 1)  # points beyond the pixels of the figure only cost memory
             traces[law].append((turns[::every], error[::every]))
     return SpeedDeviationResult(parameters, largest, rms, traces)
 

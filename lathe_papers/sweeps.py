@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps of studies: computed on all cores, with the progress of a study."""
+"""Sweeps for studies: computed on all cores, with the progress display of a study."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 def table(
     asked: Sequence[tuple[str, Scenario, "Space"]], folder: str, columns: Sequence[str], track: Track, **options: Any
 ) -> "list[pa.Table]":
-    """Columns of the rows of some sweeps, one table each.
+    """Run several sweeps and return the requested columns of their rows, one table per sweep.
 
     Args:
-        asked: name, scenario and space of each; sweeps with the same name share a folder.
-        folder: that keeps them, in one of their own each; empty: nothing is kept.
-        columns: that are read; a target that a sweep does not vary has the scenario's value.
-        track: shows the progress in cells.
-        options: see `lathe_rc.run_sweep`.
+        asked: name, scenario and space of each sweep; sweeps with the same name share a folder.
+        folder: parent folder of the sweep folders; empty to discard the rows.
+        columns: columns to read; a target that a sweep does not vary has the value of the scenario.
+        track: progress display, in cells.
+        options: further arguments of `lathe_rc.run_sweep`.
     """
     from lathe_rc.sweep.workers import client_of
 
