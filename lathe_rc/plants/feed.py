@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feed drive of a slide, cross or longitudinal: a linear model with limits, and a screw with backlash.
+"""Feed drive of a cross or longitudinal slide: a linear model with limits, and a screw with backlash.
 
     command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
                                            ↑ friction
 
-Limits of the command are in `lathe_rc.plants.feed`, friction in `lathe_rc.plants.friction`, errors of the screw
-in `lathe_rc.plants.screw`.
+The limits of the command are in `lathe_rc.control.limits`, friction is in `lathe_rc.plants.friction`, errors of the
+screw are in `lathe_rc.plants.screw`.
 
-The command is in the unit of the model (`lathe_rc.plants.feed_models`): [m] where it is a wanted position, [V], or a
-part of full scale. It is held from sample to sample, as a power converter holds it, and for that the difference
-equation is exact. The position of a sample does not depend on the command of the same sample.
+The command is in the unit of the model (`lathe_rc.plants.feed_models`): [m] for a position command, [V], or a fraction
+of full scale. It is held between samples, as by a power converter, and the difference equation is exact for a held
+command. The position of a sample does not depend on the command of the same sample.
 
-The states are the position of the motor and its derivatives, so that a limit of the speed can hold them: a motor that
-would go beyond its greatest speed stays at it without acceleration, as if its command were no larger than what that
-speed needs. Nothing is left to unwind when the command falls.
+The states are the position of the motor and its derivatives, so that a speed limit can be applied to them: a motor
+that would exceed its maximum speed stays at it without acceleration, as if its command were no larger than that speed
+requires. No windup has to decay when the command falls.
 
-Limits of the command are those of the motion that it asks for. What the command u asks for is where the model settles:
-of a model that integrates the speed k·u, of any other the position k·u, with its gain k.
+The limits of the command are limits of the requested motion, which is the steady state of the model for the command u:
+the speed k·u for a model that integrates, the position k·u for any other, with the gain k of the model.
 
     position  |k·u| ≤ stroke, |k·du/dt| ≤ velocity, |k·d²u/dt²| ≤ acceleration, |k·d³u/dt³| ≤ jerk
     speed     |x∞| ≤ stroke, |k·u| ≤ velocity, |k·du/dt| ≤ acceleration, |k·d²u/dt²| ≤ jerk
 
-x∞ is where the motor would come to rest if the command were 0 from now on: with the denominator p·(a1 + a2·p + …) the
-motor's position x + (a2·dx/dt + a3·d²x/dt² + …)/a1, which moves with k·u. How they are kept is in
-`lathe_rc.control.limits`.
+x∞ is the position at which the motor would come to rest if the command were 0 from now on: with the denominator
+p·(a1 + a2·p + …) it is x + (a2·dx/dt + a3·d²x/dt² + …)/a1 for the motor's position x, and it moves with k·u. The
+limiter is in `lathe_rc.control.limits`.
 """
 
 from typing import Literal, NamedTuple
@@ -48,23 +48,25 @@ Complex = npt.NDArray[np.complex128]
 
 @kernel
 def follow(load: float, half: float, motor: float) -> float:
-    """Position of the load once the motor has moved straight to ``motor``: it moves only when a flank pushes it.
+    """Return the position of the load behind a backlash gap, after the motor has moved straight to ``motor``.
+
+    The load moves only when a flank of the gap pushes it.
 
     Args:
-        load: where it was, within ``half`` of where the motor was [m].
+        load: previous position of the load, within ``half`` of the previous position of the motor [m].
         half: half the width of the gap [m].
-        motor: where the motor is now [m].
+        motor: present position of the motor [m].
     """
     return min(max(load, motor - half), motor + half)
 
 
 class LimitTable(NamedTuple):
-    """Limits of a drive's command for kernels, as `lathe_rc.control.limits` has them; all in the command's unit.
+    """Limits of a drive's command for kernels (see `lathe_rc.control.limits`); all in the command's unit.
 
     Attributes:
-        limits: of the position or the velocity that the command is.
-        step: from one taken command to the next [s].
-        coming: of a velocity: weights of the states in x∞, shape (m,); of a position: empty.
+        limits: limits of the position or velocity that the command stands for.
+        step: time between two commands [s].
+        coming: weights of the states in x∞ for a velocity command, shape (m,); empty for a position command.
     """
 
     limits: CommandLimits
@@ -74,7 +76,7 @@ class LimitTable(NamedTuple):
 
 @inlined
 def keep_within(limits: LimitTable, memory: Array, state: Array, command: float) -> bool:
-    """Keep a command within its limits, by the ``state`` of the drive; ``memory[0]`` is the limited command."""
+    """Limit a drive's command, given the ``state`` of the drive; the limited command is stored in ``memory[0]``."""
     if limits.coming.size == 0:
         return keep_position(limits.limits, limits.step, memory, command)
     coming = 0.0
@@ -84,7 +86,7 @@ def keep_within(limits: LimitTable, memory: Array, state: Array, command: float)
 
 
 def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
-    """Return the limits of a drive's command that is taken every ``step`` [s]."""
+    """Return the limits of a drive's command that is sampled every ``step`` [s]."""
     gain, integrates = settles(model)
     if limits.any and not gain:
         raise InputError(
@@ -102,7 +104,7 @@ def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: f
 
 Feedback = Literal["motor", "load"]
 
-# Places in a drive's state, from the end; before them the motor's position, speed, … and room for their next values.
+# Indices in a drive's state, from its end; before them the motor's position, speed, … and space for their next values.
 _WARMTH, _BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -5, -4, -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
@@ -113,19 +115,19 @@ _PERFECT = Screw()
 
 @sized
 class DriveTable(NamedTuple):
-    """Constants of a `FeedDrive` for kernels.
+    """Constants of a feed drive for kernels (see `FeedDrive`).
 
     Attributes:
         transition, weights: x[n] = Φ·x[n-1] + g·u[n-1], shapes (m, m) and (m,); x is position, speed, ….
-        jumps: what the command adds at once to speed, acceleration, …, shape (m,).
-        command_limit: to each side, in the unit of the command.
-        speed_limit: to each side [m/s].
-        needed: command that keeps that speed; infinite where none does.
-        furthest: travel in a step at that speed [m].
+        jumps: immediate effect of the command on speed, acceleration, …, shape (m,).
+        command_limit: in both directions, in the unit of the command.
+        speed_limit: in both directions [m/s].
+        needed: steady command for the speed limit; infinite if there is none.
+        furthest: travel per step at the speed limit [m].
         half: half the backlash [m].
-        friction: of the slide.
-        rubbed: what 1 N of friction, held over a step, takes from x, shape (m,).
-        screw: between motor and slide.
+        friction: friction of the slide.
+        rubbed: decrease of x by 1 N of friction, held over a step, shape (m,).
+        screw: screw between motor and slide.
     """
 
     transition: Array
@@ -143,19 +145,19 @@ class DriveTable(NamedTuple):
 
 @kernel
 def motor_of(state: Array) -> float:
-    """Position of the motor [m], in a drive's state."""
+    """Return the position of the motor [m] from a drive's state."""
     return float(state[0])
 
 
 @kernel
 def load_of(state: Array) -> float:
-    """Position of the slide [m], in a drive's state."""
+    """Return the position of the slide [m] from a drive's state."""
     return float(state[_LOAD])
 
 
 @inlined
 def _rub(table: DriveTable, state: Array) -> None:
-    """Subtract friction from the next values, which stand behind the present ones."""
+    """Subtract the effect of friction from the next values, which are stored after the present values."""
     order = table.weights.size
     speed, free, gained = state[1], state[order + 1], table.rubbed[1]
     force, rests = 0.0, False
@@ -173,7 +175,7 @@ def _rub(table: DriveTable, state: Array) -> None:
 
 @inlined
 def move(table: DriveTable, state: Array) -> bool:
-    """Step a drive with the command that it holds; returns whether it is at its greatest speed."""
+    """Step a drive with its held command; return whether the drive is at its speed limit."""
     order = table.weights.size
     effort, before = state[_EFFORT] + state[_DISTURBANCE], state[0]
     for row in range(order):
@@ -190,8 +192,8 @@ def move(table: DriveTable, state: Array) -> bool:
     if limited:
         state[0] = before + min(max(travel, -table.furthest), table.furthest)
         state[1] = min(max(speed, -table.speed_limit), table.speed_limit)
-        # A drive that would accelerate further gets derivatives of 0 under the command that just keeps this speed (the
-        # states lack what the command adds at once), so that it slows down as soon as its command falls.
+        # A drive that would accelerate further gets derivatives of 0 under the steady command for this speed (the
+        # states lack the immediate effect of the command), so that it slows down as soon as its command falls.
         if order > 2 and (state[2] + table.jumps[1] * effort) * speed > 0.0:
             enough = min(max(effort, -table.needed), table.needed)
             for row in range(2, order):
@@ -206,23 +208,23 @@ def move(table: DriveTable, state: Array) -> bool:
 
 @inlined
 def hold(table: DriveTable, state: Array, command: float) -> bool:
-    """Give a drive the command to hold from now on; returns whether it was cut off."""
+    """Set the command that a drive holds from now on; return whether the command was clipped."""
     state[_EFFORT] = min(max(command, -table.command_limit), table.command_limit)
     return abs(command) > table.command_limit
 
 
 class FeedTable(NamedTuple):
-    """A `FeedDrive` for kernels.
+    """A feed drive with its limits and memory, for kernels (see `FeedDrive`).
 
     Attributes:
-        drive, state: its constants and memory.
-        limits, memory: those of its command, which are looked at if it is ``kept``; the memory ends with whether the
-            command that is held is clipped.
-        divisor: the command is taken every so many samples.
+        drive, state: constants and state of the drive.
+        limits, memory: limits of the command and the limiter's memory, used only if ``kept`` is true; the last entry of
+            the memory is 1 while the held command is clipped.
+        divisor: the command is sampled every ``divisor`` samples.
         resolution: of the position sensor [m].
-        from_load: whether that is at the load.
-        kept: see above.
-        counts: commands that were cut off and samples at the greatest speed so far.
+        from_load: whether the position sensor is at the load.
+        kept: whether the command has limits.
+        counts: numbers of clipped commands and of samples at the speed limit so far.
     """
 
     drive: DriveTable
@@ -249,7 +251,7 @@ def advance(
     measured: Array,
     clipped: npt.NDArray[np.uint8],
 ) -> None:
-    """Step through a block, see `FeedDrive.block`; what is ``clipped`` of sample n stands at n modulo its size."""
+    """Step a feed drive through a block (implements `FeedDrive.block`); ``clipped`` is a ring: sample n at n % size."""
     table, state, memory, divisor = feed.drive, feed.state, feed.memory, feed.divisor
     saturated = limited = 0
     mask = clipped.size - 1
@@ -267,7 +269,7 @@ def advance(
         clipped[(first + k) & mask] = memory[-1] > 0.0
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
-        # Within the gap the slide stands.
+        # While the motor moves within the gap, the slide is at rest.
         speed = state[1]
         if table.screw.real:
             speed = nut_speed(table.screw, state[_WARMTH], state[0], speed)
@@ -279,10 +281,10 @@ def advance(
 
 
 def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
-    """Loss of position, speed, … by 1 N of friction, held over a step, shape (m,).
+    """Return the decrease of position, speed, … by 1 N of friction, held over a step, shape (m,).
 
     Raises:
-        InputError: the friction acts on a lag that the drive does not have.
+        InputError: the friction has a pole that the drive does not have.
     """
     lags, rest = np.polydiv(model.denominator, friction.mobility.denominator)
     if np.abs(rest).max() > 1e-9 * np.abs(model.denominator).max():
@@ -295,30 +297,30 @@ def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
 
 
 class FeedDrive:
-    """The drive as a machine: command in, motion of the slide and of the motor out.
+    """Simulated feed drive: from the command to the motion of slide and motor.
 
     Args:
         model: position over command, see `lathe_rc.plants.feed_models`.
         step: sampling step [s].
-        divisor: the command is taken at samples that are multiples of it, and held between.
-        command_limit: the command is cut off at ± this, in its unit.
-        speed_limit: of the motor, to each side [m/s].
+        divisor: the command is sampled at multiples of this number of samples, and held in between.
+        command_limit: the command is clipped to ± this value, in its unit.
+        speed_limit: maximum speed of the motor in both directions [m/s].
         backlash: width of the gap between motor and slide [m].
         resolution: of the position sensor [m]; 0 for none.
-        feedback: where the position sensor is.
-        limits: of the motion that the command asks for.
-        friction: of the slide; None: it has none.
-        screw: between motor and slide; perfect by default.
+        feedback: location of the position sensor.
+        limits: of the motion that the command requests.
+        friction: of the slide; None for none.
+        screw: screw between motor and slide; without errors by default.
 
     Attributes:
-        table: its constants for `move` and `hold`.
-        state: its memory for them.
-        whole: both and all else for `advance`.
+        table: constants for `move` and `hold`.
+        state: memory for `move` and `hold`.
+        whole: constants and memory for `advance`.
         integrates: whether the command stands for a speed.
 
     Raises:
-        InputError: a model whose speed would jump with the command, a value that is out of range, limits for a
-            command that stands for neither a position nor a speed, or friction that does not fit the model.
+        InputError: a model whose speed would jump with the command, a value out of range, limits for a command that
+            stands for neither a position nor a speed, or friction that does not fit the model.
     """
 
     def __init__(
@@ -348,9 +350,9 @@ class FeedDrive:
                 raise InputError(f"feed drive: {name} = {value:g} m; allowed: 0 for none, or above 0")
         a, b = realise(model)
         linear = discretise(a, b, 0.0, step, "foh")
-        # What is exact for a command that is linear over a step is so for one that does not change in it.
+        # A discretisation that is exact for a command linear over a step is also exact for a constant one.
         held = linear.weights[:, 0] + linear.weights[:, 1]
-        # A model that integrates needs a certain command for a certain speed.
+        # A model that integrates has one steady command for each speed.
         gain, self.integrates = settles(model)
         needed = speed_limit / gain if self.integrates and gain > 0.0 else np.inf
         if friction and np.isfinite(speed_limit) and held.size > 2:
@@ -387,18 +389,18 @@ class FeedDrive:
 
     @property
     def saturated(self) -> int:
-        """Commands so far that were cut off."""
+        """Number of clipped commands so far."""
         return int(self.whole.counts[0])
 
     @property
     def limited(self) -> int:
-        """Samples so far at the greatest speed."""
+        """Number of samples at the speed limit so far."""
         return int(self.whole.counts[1])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Motor over command, as the difference equation has it, at ``frequency`` [rad/s].
+        """Return the frequency response of the difference equation, motor over command, at ``frequency`` [rad/s].
 
-        Limits, divisor and friction are left out.
+        Limits, divisor and friction are ignored.
         """
         z = np.exp(1j * np.asarray(frequency, dtype=np.float64) * self._step)
         weights = self.table.weights
@@ -418,19 +420,21 @@ class FeedDrive:
         disturbance: Array = _UNDISTURBED,
         clipped: npt.NDArray[np.uint8] = _UNTOLD,
     ) -> None:
-        """Step from sample ``first`` on; at rest at 0 before sample 0. Arrays of shape (n,); the motion is filled.
+        """Step the drive through a block of samples; the output arrays are filled, all arrays have the shape (n,).
+
+        The drive is at rest at 0 before sample 0.
 
         Args:
             first: index of the first sample.
             command: in the unit of the model.
             position: of the slide [m].
             velocity: of the slide [m/s].
-            effort: what the motor is given from this sample on: the command, sampled and cut off.
-            motor: position of the motor, on the slide's scale by a perfect screw [m].
-            measured: that of the two which the sensor sees, as it reads it [m].
-            disturbance: adds to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
-            clipped: filled with 1 where the command that is held is not what it was when it was taken; needed if there
-                are limits, else it may be empty.
+            effort: input of the motor from this sample on: the sampled and clipped command.
+            motor: position of the motor, converted to slide travel by an ideal screw [m].
+            measured: reading of the position sensor, at the slide or the motor [m].
+            disturbance: added to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
+            clipped: filled with 1 where the held command differs from the sampled command; required with limits,
+                else it may be empty.
         """
         wanted = command.size if self.whole.kept or clipped.size else 0
         assert clipped.size == wanted, "room for what is clipped"

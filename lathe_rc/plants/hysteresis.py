@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rate-independent hysteresis of piezo ceramics, and the inverse operators that linearise it.
 
-Input and output are relative: 1 is the half-stroke, at full voltage. Nothing here knows of time: the output
-depends on the path of the input alone, and on each monotone piece of it only on where the piece ends.
+Input and output are relative: 1 is the half-stroke, at full voltage. The operators do not depend on time: the output
+depends on the path of the input alone, and within each monotone section only on its end point.
 
-Prandtl-Ishlinskii: weighted plays beside a proportional part,
+Prandtl-Ishlinskii: weighted play operators in parallel with a proportional part,
 
     y = p0·u + Σ p_i·F_i(u),    F_i ← max(u - r_i, min(u + r_i, F_i)).
 
@@ -15,11 +15,11 @@ Bouc-Wen with n = 1, written in u so that the rate cancels:
 
     y = g·(u - h),    dh = A·du - β·h·|du| - γ·|h|·du,
 
-g such that a steady loop over ±1 ends at ±1. While u goes one way, h obeys a linear equation in u with one change
-of rate where h passes 0, so a step of any length is taken exactly. The inverse solves that step for its length,
-sample by sample; it exists while dy/du = g·(1 - dh/du) is positive, which is 2Aβ/(β + γ) < 1.
+with g chosen so that a steady loop over ±1 ends at ±1. While u moves in one direction, h obeys a linear equation in u
+whose rate changes once, where h passes 0, so a step of any length is computed exactly. The inverse solves that step for
+its length, sample by sample; it exists while dy/du = g·(1 - dh/du) is positive, which is 2Aβ/(β + γ) < 1.
 
-Source: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation has to remove.
+Source: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation has to compensate.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.checks import stacked
 
-#: Ten plays; with them the loop over ±1 is 13 % of its height wide and ends at ±1.
+#: Ten play operators; with them the loop over ±1 is 13 % of its height wide and ends at ±1.
 THRESHOLDS = np.arange(1, 11) / 11
 WEIGHTS = np.full(10, 0.04767)
 PROPORTIONAL = 0.7617
@@ -41,7 +41,7 @@ _LINEAR, PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3  #: kinds of a `Law`
 
 
 class Law(NamedTuple):
-    """Operator for kernels: its kind and constants; its state is an array of its own."""
+    """Kind and constants of a hysteresis operator for kernels; its state is a separate array."""
 
     kind: int
     table: Array
@@ -52,9 +52,9 @@ LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; it has no state
 
 @kernel
 def _relax(rate: float, travel: float) -> float:
-    """(1 - e^{-rate·travel})/rate, which is the travel itself where the rate is 0."""
+    """Compute (1 - e^{-rate·travel})/rate, which is the travel itself for a rate of 0."""
     x = rate * travel
-    # Below, the next term x/2 is less than rounding, and the quotient of subnormal numbers would be more.
+    # Below this, the next term x/2 is less than rounding, and the quotient of subnormal numbers would be inexact.
     if x < 1e-17:
         return travel
     return float(-np.expm1(-x) / rate)
@@ -62,7 +62,7 @@ def _relax(rate: float, travel: float) -> float:
 
 @kernel
 def _travel(rate: float, relaxed: float) -> float:
-    """Inverse of `_relax`."""
+    """Compute the travel from its relaxed value (inverse of `_relax`)."""
     x = rate * relaxed
     if x < 1e-17:
         return relaxed
@@ -71,7 +71,7 @@ def _travel(rate: float, relaxed: float) -> float:
 
 @kernel
 def _move(h: float, travel: float, shape: Array) -> float:
-    """The hysteretic part after ``travel`` >= 0; positive in the direction of travel, as ``h`` is."""
+    """Return the hysteretic part after ``travel`` >= 0; it and ``h`` are positive in the direction of travel."""
     a, beta, gamma = shape[0], shape[1], shape[2]
     if h < 0.0:  # against the travel: the rate is β - γ until h passes 0, then β + γ
         slope = a - (beta - gamma) * h
@@ -84,9 +84,9 @@ def _move(h: float, travel: float, shape: Array) -> float:
 
 @kernel
 def _solve(slope: float, rate: float, target: float) -> float:
-    """The d with d - slope·(1 - e^{-rate·d})/rate = target, for 0 <= slope < 1.
+    """Solve d - slope·(1 - e^{-rate·d})/rate = target for d, for 0 <= slope < 1.
 
-    The left side is convex and rises, and the start is not below the root: Newton's steps go down to it.
+    The left side is convex and increasing, and the start is not below the root: Newton's steps decrease towards it.
     """
     d = target / (1.0 - slope)
     while True:
@@ -98,7 +98,7 @@ def _solve(slope: float, rate: float, target: float) -> float:
 
 @kernel
 def _needed(h: float, target: float, shape: Array) -> float:
-    """Travel in which travel less the gain of the hysteretic part is ``target`` >= 0; ``h`` as in `_move`."""
+    """Solve travel - (increase of the hysteretic part) = ``target`` >= 0 for the travel; ``h`` as in `_move`."""
     a, beta, gamma = shape[0], shape[1], shape[2]
     travel = 0.0
     if h < 0.0:
@@ -112,13 +112,13 @@ def _needed(h: float, target: float, shape: Array) -> float:
 
 @inlined
 def play(position: float, threshold: float, value: float) -> float:
-    """Position of a play after the input ``value``."""
+    """Return the position of a play operator after the input ``value``."""
     return min(max(position, value - threshold), value + threshold)
 
 
 @kernel
 def plays(thresholds: Array, start: Array, value: Array) -> Array:
-    """Positions of plays alone, shape (n, m).
+    """Compute the positions of play operators without weights, shape (n, m).
 
     Args:
         thresholds: r_i, shape (m,).
@@ -136,13 +136,13 @@ def plays(thresholds: Array, start: Array, value: Array) -> Array:
 
 @kernel
 def advance(kind: int, table: Array, state: Array, start: int, value: float) -> float:
-    """Step an operator to the input ``value``; returns the output and changes ``state``.
+    """Step an operator to the input ``value``: return the output and update ``state``.
 
     Args:
-        kind: of the `Law`.
-        table: of the `Law`. Plays: rows thresholds (first 0) and weights (first p0). Bouc-Wen: A, β, γ, g.
-        state: holds the positions of the plays, or u and h, from ``start`` on. (A slice would cost more than a step.)
-        start: place of the operator's own state.
+        kind: kind of the operator, see `Law`.
+        table: constants of the operator. Plays: rows thresholds (first 0) and weights (first p0). Bouc-Wen: A, β, γ, g.
+        state: holds the positions of the plays, or u and h, starting at ``start``. (A slice is slower than a step.)
+        start: index of the operator's own state.
         value: relative input.
     """
     if kind == PLAYS:
@@ -169,9 +169,9 @@ def advance(kind: int, table: Array, state: Array, start: int, value: float) -> 
 
 @kernel
 def _plays_along(table: Array, state: Array, start: int, value: Array, result: Array) -> None:
-    """`advance` of plays: one after the other goes through the block, five at a time to keep the processor busy.
+    """Step play operators through a block, one operator after the other, five at a time for speed.
 
-    The output of a sample grows play by play in the order of `advance`, so that the bits are the same.
+    The output of a sample is summed in the order of `advance`, so that the results are bit-identical.
     """
     r, p = table[0], table[1]
     for k in range(value.size):
@@ -199,7 +199,7 @@ def _plays_along(table: Array, state: Array, start: int, value: Array, result: A
 
 @kernel
 def advance_along(kind: int, table: Array, state: Array, start: int, value: Array, result: Array) -> None:
-    """`advance` for a block: fills ``result`` from ``value``, shape (n,), two arrays of their own."""
+    """Step an operator through a block: fill ``result`` from ``value``, shape (n,); the arrays must not overlap."""
     if kind == PLAYS:
         _plays_along(table, state, start, value, result)
     else:
@@ -208,27 +208,27 @@ def advance_along(kind: int, table: Array, state: Array, start: int, value: Arra
 
 
 class Hysteresis:
-    """An operator with memory.
+    """Base of hysteresis operators, which have a state.
 
     Attributes:
-        law: for kernels that step it themselves, see `advance`.
-        state: its memory, shape (n,).
-        steepest: largest slope dy/du that it can have.
+        law: kind and constants, for kernels that step the operator themselves, see `advance`.
+        state: memory of the operator, shape (n,).
+        steepest: largest possible slope dy/du.
     """
 
     def __init__(self, law: Law, state: Array, steepest: float) -> None:
         self.law, self.state, self.steepest = law, state, steepest
 
     def block(self, value: Array, result: Array) -> None:
-        """Step through a block; relative input and output, shape (n,)."""
+        """Step through a block of relative inputs: fill ``result`` from ``value``, shape (n,)."""
         advance_along(*self.law, self.state, 0, value, result)
 
 
 def check_thresholds(thresholds: Array) -> None:
-    """Refuse thresholds of plays that are not above 0 and increasing.
+    """Check that the thresholds of play operators are positive and increasing.
 
     Raises:
-        InputError: they are not.
+        InputError: the thresholds are not positive and increasing.
     """
     rising = (thresholds[:1] > 0.0).all() and (thresholds[1:] > thresholds[:-1]).all()
     if not rising or not np.isfinite(thresholds).all():
@@ -236,23 +236,23 @@ def check_thresholds(thresholds: Array) -> None:
 
 
 def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
-    """Law, state and steepest slope of plays in such a state."""
+    """Return law, state and steepest slope of play operators in a given state."""
     table = np.empty((2, thresholds.size + 1))
-    # Plays that are past their thresholds add up: the steepest slope is the largest partial sum.
+    # Contributions of plays beyond their thresholds add up: the steepest slope is the largest partial sum.
     table[:, 0], table[0, 1:], table[1, 1:] = (0.0, proportional), thresholds, weights
     return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
 
 class PrandtlIshlinskii(Hysteresis):
-    """Weighted plays.
+    """Prandtl-Ishlinskii operator: weighted play operators in parallel with a proportional part.
 
     Args:
-        thresholds: r_i, half-widths of the plays, above 0 and increasing, shape (n,).
+        thresholds: r_i, half-widths of the plays, positive and increasing, shape (n,).
         weights: p_i, shape (n,).
         proportional: p0.
 
     Raises:
-        InputError: thresholds out of order, or slopes without an inverse.
+        InputError: thresholds that are not increasing, or slopes without an inverse.
     """
 
     def __init__(
@@ -270,26 +270,26 @@ class PrandtlIshlinskii(Hysteresis):
         super().__init__(*_weighted(thresholds, weights, proportional, np.zeros(thresholds.size)))
 
     def identified(self, scale: float) -> "PrandtlIshlinskii":
-        """The model of an identification that found the plays' weights ``scale`` times too large; at rest."""
+        """Return a model at rest with the play weights multiplied by ``scale``, as by an inexact identification."""
         return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
 
     def inverse(self) -> "PrandtlIshlinskiiInverse":
-        """Return the inverse from the present state on."""
+        """Return the inverse operator, starting at the present state."""
         return PrandtlIshlinskiiInverse(self)
 
 
 class PrandtlIshlinskiiInverse(Hysteresis):
-    """The operator that undoes `PrandtlIshlinskii`; plays as well, in closed form.
+    """Inverse of `PrandtlIshlinskii` in closed form; itself a weighted sum of play operators.
 
     Args:
-        forward: operator to undo. Its present state is taken over, so at rest the inverse is at rest too.
+        forward: operator to invert. Its present state is adopted, so at rest the inverse is at rest too.
     """
 
     def __init__(self, forward: PrandtlIshlinskii) -> None:
         r, p, slopes = forward.thresholds, forward.weights, forward.proportional + np.cumsum(forward.weights)
-        before = slopes - p  # slope while play i still stands
+        before = slopes - p  # slope before play i moves
         before[:1] = forward.proportional
-        # Where play i begins to move, the output has gone r'_i and the input r_i.
+        # At the point where play i begins to move, the output has travelled r'_i and the input r_i.
         thresholds = np.cumsum(before * np.diff(r, prepend=0.0))
         beyond = np.append(np.cumsum((p * forward.state)[::-1])[::-1][1:], 0.0)[: r.size]
         state = slopes * forward.state + beyond
@@ -303,7 +303,7 @@ class BoucWen(Hysteresis):
         a: A, initial slope of h; 0.33 with the others makes a loop of 13 %.
         beta: β.
         gamma: γ.
-        gain: g; None: the one with which a steady loop over ±1 ends at ±1.
+        gain: g; None: the gain for which a steady loop over ±1 ends at ±1.
 
     Raises:
         InputError: h grows without bound, or there is no inverse.
@@ -324,31 +324,31 @@ class BoucWen(Hysteresis):
         super().__init__(Law(_BOUC_WEN, table), np.zeros(2), self.gain)
 
     def _end_of_loop(self) -> float:
-        """Hysteretic part at the end of a steady loop over ±1: a travel of 2 turns it into its opposite."""
+        """Return the hysteretic part at the end of a steady loop over ±1, where a travel of 2 inverts its sign."""
         shape = np.array([self.a, self.beta, self.gamma])
-        # It stays below A/(β + γ), but for rounding.
+        # It stays below A/(β + γ), apart from rounding.
         bound = 2.0 * self.a / (self.beta + self.gamma)
         return float(scipy.optimize.brentq(lambda h: _move(-h, 2.0, shape) - h, 0.0, bound, xtol=1e-15))
 
     @property
     def flattest(self) -> float:
-        """Smallest slope dy/du that it can have."""
+        """Smallest possible slope dy/du."""
         return self.gain * (1.0 - self._fall)
 
     def identified(self, scale: float) -> "BoucWen":
-        """The model of an identification that found A ``scale`` times too large; at rest."""
+        """Return a model at rest with A multiplied by ``scale``, as by an inexact identification."""
         return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
 
     def inverse(self) -> "BoucWenInverse":
-        """Return the inverse from the present state on."""
+        """Return the inverse operator, starting at the present state."""
         return BoucWenInverse(self)
 
 
 class BoucWenInverse(Hysteresis):
-    """The operator that undoes `BoucWen`: each sample's step in u is solved for.
+    """Inverse of `BoucWen`, which solves for the step in u at each sample.
 
     Args:
-        forward: operator to undo; its present state is taken over.
+        forward: operator to invert; its present state is adopted.
     """
 
     def __init__(self, forward: BoucWen) -> None:

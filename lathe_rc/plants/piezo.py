@@ -6,8 +6,8 @@
     resonance: 1/(1 + 2ζp/ωn + p²/ωn²)
     creep:     1 + c·Σ 1/(1 + pτ_i), τ_i a decade apart: after a step about c·lg(t) more
 
-The hysteresis is ahead of the resonance and works on displacements relative to the stroke. The set point is held
-within the stroke and the voltage within its range; samples where that cuts something off are counted.
+The hysteresis precedes the resonance and works on displacements relative to the stroke. The set point is limited to
+the stroke and the voltage to its range; clipped samples are counted.
 
 Source: paper 001 (Wpk of eqs 6-9); parameters of spec/learning.md.
 """
@@ -27,23 +27,23 @@ from lathe_rc.plants.linear import Constant, DiscretePlant, Discretisation, disc
 
 Complex = npt.NDArray[np.complex128]
 
-_ROUNDING = 1e-9  # of the stroke: an exact inverse may pass full voltage by rounding
+_ROUNDING = 1e-9  # of the stroke: an exact inverse may exceed full voltage by rounding
 
-# Places in the state of a stack; after them those of creep, inverse and hysteresis.
+# Indices in the state of a stack; after them the states of creep, inverse and hysteresis.
 VOLTAGE, _DEMAND, _EXTENSION, _MEMORIES = 0, 1, 2, 3
 
 
 class StackTable(NamedTuple):
-    """Constants of a `Stack` for kernels.
+    """Constants of a piezo stack for kernels (see `Stack`).
 
     Attributes:
-        stroke: [m].
+        stroke: displacement at full voltage [m].
         inverse, forward: linearisation and hysteresis.
-        inverse_size: numbers in the state of the inverse.
-        decay, now, before: the amplifier's lag, weights of its last output and of its inputs.
-        slew: largest change of its output in a sample, relative to full voltage.
-        creep: the same of each lag of the creep, shape (n, 3).
-        creep_gain: of each of them.
+        inverse_size: size of the state of the inverse.
+        decay, now, before: lag of the amplifier: weights of its last output, its present and its last input.
+        slew: largest change of the amplifier's output in a sample, relative to full voltage.
+        creep: decay and input weights of each creep lag, shape (n, 3).
+        creep_gain: gain of each creep lag.
     """
 
     stroke: float
@@ -60,12 +60,12 @@ class StackTable(NamedTuple):
 
 @kernel
 def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bool]:
-    """Step a stack; returns the extension it would have unloaded [m], and whether something was cut off.
+    """Step a piezo stack; return its extension without load [m], and whether set point or voltage was clipped.
 
     Args:
-        stack: its constants.
-        state: its memory, changed; ``state[VOLTAGE]`` is the amplifier's output relative to full voltage.
-        set_point: wanted extension [m].
+        stack: constants of the stack.
+        state: memory, updated; ``state[VOLTAGE]`` is the amplifier's output relative to full voltage.
+        set_point: desired extension [m].
     """
     wanted = set_point / stack.stroke
     within = min(max(wanted, -1.0), 1.0)
@@ -88,10 +88,10 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
 
 @kernel
 def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: Array, voltage: Array) -> int:
-    """`extend` for a block: fills the extension [m] and the voltage relative to full, shape (n,).
+    """Step a piezo stack through a block: fill the extension [m] and the voltage relative to full voltage, shape (n,).
 
-    Element by element through the whole block, which is faster; each keeps the order of operations of `extend`.
-    Returns the number of samples where something was cut off.
+    Each element of the stack is stepped through the whole block, which is faster; the order of operations is that of
+    `extend`. Returns the number of samples where set point or voltage was clipped.
     """
     inverse = _MEMORIES + stack.creep.shape[0]
     for k in range(set_point.size):
@@ -121,26 +121,26 @@ def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: 
 
 
 def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
-    """1/(1 + p·time), times in s."""
-    least = float(f"{step / 1000.0:g}")  # the rounded number of the message is itself allowed
+    """Discretise the lag 1/(1 + p·time), times in s."""
+    least = float(f"{step / 1000.0:g}")  # the rounded number in the message is itself allowed
     if time < least:
         raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: at least {least:g} s, or none")
     return discretise(np.array([[-1.0 / time]]), np.array([1.0 / time]), 0.0, step, method)
 
 
 def _row(lag: DiscretePlant) -> Array:
-    """Decay of a lag, and the weights of its present and last input."""
+    """Return the decay of a lag, and the weights of its present and last input."""
     return np.array([lag.transition[0, 0], lag.weights[0, 0], lag.weights[0, 1]])
 
 
 @dataclass(frozen=True)
 class LinearStack:
-    """Amplifier and creep; the hysteresis is taken as linearised to a gain of 1.
+    """Linear model of amplifier and creep; the hysteresis is assumed to be linearised to a gain of 1.
 
     Attributes:
-        amplifier: its lag, if any.
-        creep: its lags.
-        creep_gain: of each.
+        amplifier: lag of the amplifier; None for none.
+        creep: lags of the creep.
+        creep_gain: gain of each creep lag.
     """
 
     amplifier: DiscretePlant | None
@@ -148,7 +148,7 @@ class LinearStack:
     creep_gain: float
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Response of the extension to the set point at ``frequency`` [rad/s]."""
+        """Return the frequency response of the extension to the set point at ``frequency`` [rad/s]."""
         frequency = np.asarray(frequency, dtype=np.float64)
         whole = np.ones(frequency.shape, dtype=np.complex128)
         for lag in self.creep:
@@ -157,27 +157,27 @@ class LinearStack:
 
 
 class Stack:
-    """Amplifier and ceramics, up to the extension that a stack without load and mass would have.
+    """Amplifier and piezo ceramics, from the set point to the extension of a stack without load and mass.
 
     Args:
-        stroke: displacement at full voltage, to each side [m].
+        stroke: displacement at full voltage, in both directions [m].
         amplifier_lag: T [s]; 0 for none.
-        slew_rate: largest change of its output in a second, relative to full voltage [1/s]; inf for none.
+        slew_rate: largest change of the amplifier's output in a second, relative to full voltage [1/s]; inf for none.
         hysteresis: of the ceramics; None for none.
-        inverse: what linearises it; None for nothing.
+        inverse: operator that linearises the hysteresis; None for none.
         creep_per_decade: c, relative creep in a decade of time; 0 for none.
-        creep_times: τ_i [s], a decade apart; used where there is creep, shape (n,).
+        creep_times: τ_i [s], a decade apart; only used with creep, shape (n,).
         step: sampling step [s].
         method: discretisation of the lags, see `lathe_rc.plants.linear.discretise`.
 
     Attributes:
-        table: its constants for `extend`.
-        state: its memory for `extend`.
-        linear: what it is without hysteresis and limits.
-        steepest: largest change of the extension in a sample, over that of the set point in the same sample.
+        table: constants for `extend`.
+        state: memory for `extend`.
+        linear: model without hysteresis and limits.
+        steepest: largest change of the extension relative to the change of the set point in the same sample.
 
     Raises:
-        InputError: a lag that is far shorter than the step.
+        InputError: a lag that is much shorter than the step.
     """
 
     def __init__(
@@ -220,15 +220,15 @@ class Stack:
 
 
 class FineTable(NamedTuple):
-    """A `PiezoDrive` for kernels.
+    """A fine piezo drive with its state, for kernels (see `PiezoDrive`).
 
     Attributes:
-        transition, weights: of the resonance.
-        stack: amplifier and ceramics.
-        memory: their state.
+        transition, weights: difference equation of the resonance.
+        stack: constants of amplifier and ceramics.
+        memory: state of amplifier and ceramics.
         full_voltage: [V].
         state: position, velocity, and the last extension [m, m/s, m].
-        saturated: samples so far in which something was cut off, shape (1,).
+        saturated: number of samples so far in which set point or voltage was clipped, shape (1,).
     """
 
     transition: Array
@@ -242,7 +242,7 @@ class FineTable(NamedTuple):
 
 @kernel
 def advance_fine(drive: FineTable, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
-    """Step the drive through a block, see `PiezoDrive.block`."""
+    """Step a fine piezo drive through a block (implements `PiezoDrive.block`)."""
     drive.saturated[0] += _extend_along(drive.stack, drive.memory, set_point, velocity, voltage)
     a, w, state, full_voltage = drive.transition, drive.weights, drive.state, drive.full_voltage
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
@@ -261,7 +261,7 @@ def advance_fine(drive: FineTable, set_point: Array, position: Array, velocity: 
 
 @dataclass(frozen=True)
 class LinearPiezo(Constant):
-    """Wpk of paper 001: the linearised drive, as its difference equations run.
+    """Linear model of the fine piezo drive, Wpk of paper 001, from its difference equations.
 
     Attributes:
         stack: amplifier and ceramics.
@@ -272,7 +272,7 @@ class LinearPiezo(Constant):
     plant: DiscretePlant
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Response of the position to the set point at ``frequency`` [rad/s]."""
+        """Return the frequency response of the position to the set point at ``frequency`` [rad/s]."""
         return np.asarray(self.stack.response(frequency) * self.plant.response(frequency))
 
 
@@ -280,10 +280,10 @@ _linear = lru_cache(maxsize=64)(LinearPiezo)
 
 
 class PiezoDrive:
-    """The drive as a machine: set point in, motion and voltage out.
+    """Simulated fine piezo drive: from the set point to motion and voltage.
 
     Args:
-        stack: amplifier and ceramics; the drive takes over its state.
+        stack: amplifier and ceramics; its state becomes part of the drive.
         natural_frequency: ωn [rad/s].
         damping: ζ [1].
         full_voltage: voltage at the full stroke [V].
@@ -291,8 +291,8 @@ class PiezoDrive:
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
 
     Attributes:
-        linear: what it is without hysteresis and limits.
-        table: for `advance_fine`.
+        linear: model without hysteresis and limits.
+        table: constants and state for `advance_fine`.
     """
 
     def __init__(
@@ -319,9 +319,9 @@ class PiezoDrive:
 
     @property
     def saturated(self) -> int:
-        """Samples so far in which the set point or the voltage was cut off."""
+        """Number of samples so far in which set point or voltage was clipped."""
         return int(self.table.saturated[0])
 
     def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
-        """Step through a block; arrays of shape (n,) [m, m, m/s, V]. At rest at 0 before the first."""
+        """Step the drive through a block of shape (n,) [m, m, m/s, V]; at rest at 0 before the first block."""
         advance_fine(self.table, set_point, position, velocity, voltage)

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spindle that the cut slows: motor, belt and spindle, a speed loop, and the torque of the cutting force.
+"""Spindle under the load of the cut: motor, belt and spindle, a speed loop, and the torque of the cutting force.
 
-The speed law is the motion of the spindle without a load; here are the deviations from it. With the
+The speed law is the motion of the spindle without a load; the model describes the deviations from it. With the
 deviations δ of the spindle's angle and ϑ of the motor's, all referred to the spindle,
 
     J·δ''  = B - r·F,       B = k·(ϑ - δ) + c·(ϑ' - δ')
     Jm·ϑ'' = T - B,         T = Kp·(-ϑ') + Ki·∫(-ϑ')dt
 
-or, with a rigid belt, (J + Jm)·δ'' = T - r·F. The speed loop is sampled: the torque of a sample stands until the next
-one. The motor also accelerates both masses as the law says; its limit holds for the sum. While that is cut off, the
-integral stands. The load is linear between samples.
+or, with a rigid belt, (J + Jm)·δ'' = T - r·F. The speed loop is sampled: the torque of a sample is held until the next
+one. The motor also accelerates both masses according to the law; its limit applies to the sum. While the sum is
+clipped, the integral is frozen. The load is linear between samples.
 
-A load of 0, or an inertia that no load can move, leaves the law as it is, to the bit.
+With a load of 0, or an inertia that no load can move, the results are bit-identical to the law.
 """
 
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise
 
 _DONE, _OVERLOADED, _OUT_OF_SPEED = 0, 1, 2
-_INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # places in the memory of the loop
+_INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # indices in the memory of the loop
 
 
 @dataclass(frozen=True)
 class Belt:
-    """Belt between motor and spindle; referred to the spindle.
+    """Belt between motor and spindle; values referred to the spindle.
 
     Attributes:
         stiffness: k [N·m/rad].
@@ -44,10 +44,10 @@ class Belt:
 
 @dataclass(frozen=True)
 class SpeedLoop:
-    """PI control of the motor's speed.
+    """PI control of the motor speed.
 
     Attributes:
-        bandwidth: Kp over both inertias [rad/s].
+        bandwidth: Kp divided by the sum of both inertias [rad/s].
         integral_time: Kp/Ki [s].
         torque_limit: of the motor, referred to the spindle [N·m]; inf for none.
     """
@@ -57,28 +57,28 @@ class SpeedLoop:
     torque_limit: float = np.inf
 
     def gains(self, inertia: float) -> tuple[float, float]:
-        """Kp [N·m·s/rad] and Ki [N·m/rad] for the sum of the inertias [kg·m²]."""
+        """Return Kp [N·m·s/rad] and Ki [N·m/rad] of the speed loop for the sum of the inertias [kg·m²]."""
         proportional = self.bandwidth * inertia
         return proportional, proportional / self.integral_time
 
 
 class SpindleTable(NamedTuple):
-    """A `LoadedSpindle` for its kernel.
+    """A spindle under load with its state, for kernels (see `LoadedSpindle`).
 
     Attributes:
         step: [s].
         transition: of δ, δ' and, with a belt, ϑ, ϑ', shape (m, m).
         motor: weight of the motor's torque, shape (m,).
         load: weights of the load of a sample and of the one before, shape (m, 2).
-        measured: place of the motor's speed.
+        measured: index of the motor speed.
         proportional, integral: Kp, Ki.
         inertia: of both masses [kg·m²].
         torque_limit: [N·m].
         radius: r [m].
-        largest_load, largest_deviation: what ends a run [N·m, rad/s].
+        largest_load, largest_deviation: limits beyond which a run ends [N·m, rad/s].
         state: shape (m,).
         loop: integral of the loop, load and law's speed of the last sample.
-        limited: of each sample whether the torque was cut off; sample n stands at n modulo the size.
+        limited: ring of flags, 1 where the torque was clipped; sample n is at index n modulo the size.
     """
 
     step: float
@@ -100,7 +100,7 @@ class SpindleTable(NamedTuple):
 
 @kernel
 def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: Array, torque: Array) -> tuple[int, int]:
-    """Let the load act on a block of the law, see `LoadedSpindle.block`; returns where it stopped and why."""
+    """Apply the load to a block of the speed law (implements `LoadedSpindle.block`); return last index and reason."""
     state, loop, transition, step = spindle.state, spindle.loop, spindle.transition, spindle.step
     order, new = state.size, np.empty(state.size)
     for k in range(angle.size):
@@ -108,7 +108,7 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
         error = -state[spindle.measured]
         integral = loop[_INTEGRAL] + error * step
         asked = spindle.proportional * error + spindle.integral * integral
-        # The motor also provides the torque of the law, which takes its part of the limit but is not published.
+        # The motor also provides the torque of the law, which uses part of the limit but is not published.
         own = spindle.inertia * ((speed[k] - loop[_SPEED]) / step) if n > 0 else 0.0
         wanted = asked + own
         given = min(max(wanted, -spindle.torque_limit), spindle.torque_limit)
@@ -134,24 +134,24 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
 
 
 class LoadedSpindle:
-    """The spindle as a machine; at rest against its law before sample 0.
+    """Simulated spindle under the load of the cut; without deviation from its speed law before sample 0.
 
     Args:
         inertia: J of spindle, chuck and part [kg·m²].
         motor_inertia: Jm, referred to the spindle [kg·m²].
-        belt: None: rigid.
-        loop: of the speed.
+        belt: None for a rigid belt.
+        loop: speed control loop.
         radius: r at which the main cutting force acts [m].
         largest_load: torque of the cut beyond which the run ends [N·m].
-        largest_deviation: of the speed by the load, the same [rad/s].
+        largest_deviation: speed deviation by the load beyond which the run ends [rad/s].
         step: sampling step [s].
-        kept: samples of which it is kept whether the torque was limited, a power of two.
+        kept: length of the history of limited samples, a power of two.
 
     Attributes:
-        table: for `turn`.
+        table: constants and state for `turn`.
 
     Raises:
-        InputError: the speed loop oscillates over the belt, or is too fast for the step.
+        InputError: the speed loop oscillates with the belt, or is too fast for the step.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class LoadedSpindle:
         self.table = SpindleTable(
             step=step,
             transition=motor.transition,
-            motor=motor.weights.sum(axis=1),  # the torque stands through a step
+            motor=motor.weights.sum(axis=1),  # the torque is held through a step
             load=np.ascontiguousarray(load.weights[:, :2]),
             measured=measured,
             proportional=proportional,
@@ -202,7 +202,7 @@ class LoadedSpindle:
             )
 
     def _largest_pole(self) -> float:
-        """Largest pole of the loop without a limit; δ itself, which no control brings back, is left out."""
+        """Return the largest pole of the loop without its limit; δ is left out, since the loop does not control it."""
         table = self.table
         order = table.state.size
         row = np.zeros(order + 1)
@@ -211,7 +211,7 @@ class LoadedSpindle:
         closed[:order, :order] = table.transition
         closed[:order] += np.outer(table.motor, row)
         closed[order, table.measured], closed[order, order] = -table.step, 1.0
-        # With δ the integral of δ' is there twice: the twist of the belt takes the place of δ and ϑ.
+        # With δ the integral of δ' would appear twice: the twist of the belt takes the place of δ and ϑ.
         if order > 2:
             change = np.eye(order + 1)
             change[2, 0] = -1.0
@@ -219,19 +219,19 @@ class LoadedSpindle:
         return float(np.abs(np.linalg.eigvals(closed[1:, 1:])).max())
 
     def block(self, first: int, force: Array, angle: Array, speed: Array) -> Array:
-        """Let the load act from sample ``first`` on.
+        """Apply the load to a block of the speed law, starting at sample ``first``.
 
         Args:
             first: index of the first sample.
             force: main cutting force [N], shape (n,).
-            angle: of the law [rad]; changed to the true one.
-            speed: of the law [rad/s]; changed to the true one.
+            angle: of the law [rad]; replaced by the true angle.
+            speed: of the law [rad/s]; replaced by the true speed.
 
         Returns:
-            What the speed loop has added to the motor's torque up to each sample [N·m], shape (n,).
+            Torque that the speed loop adds to the motor torque at each sample [N·m], shape (n,).
 
         Raises:
-            LatheError: load or deviation are larger than allowed.
+            LatheError: the load or the deviation is larger than allowed.
         """
         torque = np.empty_like(angle)
         reached, reason = turn(self.table, first, force, angle, speed, torque)
@@ -241,7 +241,7 @@ class LoadedSpindle:
 
 
 def failure(reason: int, spindle: SpindleTable, angle: float, force: float) -> LatheError:
-    """Return the error of a spindle that cannot go on, at an angle [rad] with a cutting force [N]."""
+    """Return the error for an overloaded spindle, at an angle [rad] and with a cutting force [N]."""
     if reason == _OVERLOADED:
         return LatheError(
             f"the cut loads the spindle with {spindle.radius * force:.4g} N·m at {angle:.6g} rad; allowed: up to "

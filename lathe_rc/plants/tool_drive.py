@@ -9,27 +9,28 @@ at x1, without the tool), r = mt/M, and e is the extension that the piezo would 
     mt·x2'' = mt·q + ρ·F,    q = ω2²·(e - (x2 - x1)) - 2ζ2ω2·(x2 - x1)'
     M·x1''  = k·i - mt·q
 
-The stack's stiffness is mt·ω2²; ω2, ζ2 are those of the tool on a blocked carriage. The piezo's force acts on the
-carriage in full. The coil's current i comes from the drive's position loop
+The stack's stiffness is mt·ω2²; ω2, ζ2 are those of the tool on a blocked carriage. The full force of the piezo acts on
+the carriage. The coil's current i is set by the drive's position loop
 
     i* = (m/k)·(ω1²·(u(t - τ) - x1) - 2ζ1ω1·x1')
 
-with M alone, and only its command is delayed. It is there either at once (``coil=None``: the second-order drive of
-papers 000 and 001, to the bit where there is no force), or by a current loop. That is a sampled one with the step of
-the cell (`lathe_rc.plants.coil`): from the state of a sample it gives the voltage U that stands until the next one,
+with M alone, where only the command is delayed. The current follows either at once (``coil=None``: the second-order
+drive of papers 000 and 001, bit-identical without force), or by a current loop. That loop is sampled with the step of
+the cell (`lathe_rc.plants.coil`): from the state of a sample it computes the voltage U that is held until the next
+one,
 
     L·di/dt = U - R·i - k·x1'
 
-What drives and cut do to each other within a sample is solved with the chip, see `lathe_rc.plants.cutting`: the force
-of sample n moves the tool that makes the chip of sample n. The force acts on the drives as linear between samples.
+The interaction of drives and cut within a sample is solved together with the chip, see `lathe_rc.plants.cutting`: the
+force of sample n moves the tool that makes the chip of sample n. The force is assumed linear between samples.
 
 In air this definition gives |1 - Wpk| = .0396 .1016 .1348 .1515 at 500 ... 2000 rad/s for r = 0.1, where Wpk is x2
-over e. The .039 .101 .133 .150 of spec/learning.md come out to all digits with ζ2 = 0.292, for which a blocked
+over e. The .039 .101 .133 .150 of spec/learning.md are reproduced to all digits with ζ2 = 0.292, for which a blocked
 carriage gives the .020 .040 .061 .083 printed beside them; with ζ2 = 0.299 both rows are 1-3 % higher. With ω1 referred
 to M + mt two entries are 5 % too low, with the servo's delay inside its loop one is 60 % too high.
 
-For r -> 0 the carriage is the coarse drive and x2/e is that of the fine drive. What remains is no matter of the mass
-ratio: the tool's inertia bends the piezo by -x1''/ω2² while the carriage accelerates.
+For r -> 0 the carriage is the coarse drive and x2/e is that of the fine drive. The remaining coupling does not depend
+on the mass ratio: the tool's inertia bends the piezo by -x1''/ω2² while the carriage accelerates.
 """
 
 from collections.abc import Mapping
@@ -49,24 +50,24 @@ from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loa
 
 Complex = npt.NDArray[np.complex128]
 
-_CARRIAGE, _TOOL = 0, 2  # places of the positions in the state: x1, x1', x2, x2'
+_CARRIAGE, _TOOL = 0, 2  # indices of the positions in the state: x1, x1', x2, x2'
 
-# The motion that a block makes, in the order of the kernel.
+# Motion signals of a block, in the order of the kernel.
 _MOTION = ("position", "velocity", "current", "measured", "extension", "extension_velocity", "voltage")
 
 
 @dataclass(frozen=True)
 class Piezo:
-    """The piezo drive on the carriage.
+    """Piezo drive on the carriage.
 
     Attributes:
-        stack: amplifier and ceramics; the drive takes over its state.
+        stack: amplifier and ceramics; its state becomes part of the drive.
         natural_frequency, damping: ω2 [rad/s], ζ2 [1] of the tool on a blocked carriage.
         mass_ratio: r.
         full_voltage: voltage at the full stroke [V].
-        feedback: direct compensation: the measured position of the carriage is taken off the piezo's set point, in the
-            same sample.
-        preload: of the stack [N]; inf: it holds any tension.
+        feedback: direct compensation: the measured position of the carriage is subtracted from the piezo's set point in
+            the same sample.
+        preload: of the stack [N]; inf for a stack that withstands any tension.
     """
 
     stack: Stack
@@ -79,7 +80,7 @@ class Piezo:
 
 
 def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
-    """Return the plant with another state as the first, since `DiscretePlant.response` is that of the first."""
+    """Return a plant with the state at index ``place`` moved to the front, for `DiscretePlant.response`."""
     order = np.roll(np.arange(plant.transition.shape[0]), -place)
     return DiscretePlant(
         plant.transition[np.ix_(order, order)], plant.weights[order], plant.delay, plant.fraction, plant.step
@@ -87,7 +88,7 @@ def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
 
 
 def _check_feedback(fine: DiscretePlant, piezo: Piezo) -> None:
-    """Refuse direct compensation that cannot work, with both masses as the extension moves them."""
+    """Check that direct compensation is stable, with both masses as the extension moves them."""
     within = abs(fine.weights[_CARRIAGE, 0]) * piezo.stack.steepest
     if within >= 0.5:
         raise InputError(
@@ -103,7 +104,7 @@ def _check_feedback(fine: DiscretePlant, piezo: Piezo) -> None:
 
 
 def _feedback_radius(fine: DiscretePlant, stack: StackTable) -> float:
-    """Largest magnitude of the poles under direct compensation, linearised, without creep."""
+    """Return the largest magnitude of the poles under direct compensation, linearised, without creep."""
     # The state is x1, x1', x2, x2', e and the amplifier's input -x1; left·state[n] = right·state[n-1].
     left, right = np.eye(6), np.zeros((6, 6))
     left[:4, 4] = -fine.weights[:, 0]
@@ -114,7 +115,7 @@ def _feedback_radius(fine: DiscretePlant, stack: StackTable) -> float:
 
 
 class ToolDrive:
-    """The drives that carry the tool.
+    """Simulated drives of the tool: an electrodynamic carriage, alone or in series with a piezo.
 
     Args:
         natural_frequency, damping: ω1 [rad/s], ζ1 [1] of the position loop.
@@ -122,16 +123,16 @@ class ToolDrive:
         stroke: end stops at ± this displacement [m].
         moving_mass: m or M [kg].
         force_constant: k of the coil [N/A].
-        radial: ρ, the part of the main cutting force that acts along the drives; 0 for none.
-        coil: current loop; None: the position loop's force is there at once.
-        piezo: what rides on the carriage; None: the tool alone.
+        radial: ρ, fraction of the main cutting force that acts along the drives; 0 for none.
+        coil: current loop; None: the force of the position loop acts at once.
+        piezo: piezo drive on the carriage; None: the carriage alone carries the tool.
         resolution: of the carriage's position sensor [m]; 0 for none.
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
-        kept: samples of which it is kept whether the current loop was limited, a power of two.
+        kept: length of the history of limited samples of the current loop, a power of two.
 
     Attributes:
-        table: for `advance` and `advance_loaded` of `lathe_rc.plants.tool_motion`.
+        table: constants and state for `advance` and `advance_loaded` of `lathe_rc.plants.tool_motion`.
 
     Raises:
         InputError: the current loop is too fast for the step, or it oscillates; direct compensation would oscillate, or
@@ -188,7 +189,7 @@ class ToolDrive:
         self._fine = discretise(a, extends, 0.0, step, method)
         load = discretise(a, loads, 0.0, step, method)
         weights = self._coarse.weights
-        if coil:  # the voltage stands through a step
+        if coil:  # the voltage is held through a step
             weights = np.zeros((order, 3))
             weights[:, 0] = discretise(a, drives, 0.0, step, method).weights.sum(axis=1)
         self.step, self._piezo = step, piezo
@@ -220,27 +221,27 @@ class ToolDrive:
         )
         if coil:
             self._check(coil)
-        if piezo and piezo.feedback:  # judged with a current that is there at once
+        if piezo and piezo.feedback:  # checked without the current loop
             _check_feedback(discretise(servo, extends[: 2 * masses], 0.0, step, method), piezo)
 
     def block(self, cut: CuttingProcess, first: int, given: Mapping[str, Array]) -> dict[str, Array]:
-        """Step drives and cut from sample ``first`` on; at rest at 0 before sample 0.
+        """Step drives and cut through a block, starting at sample ``first``; at rest at 0 before sample 0.
 
         Args:
-            cut: what the tool cuts; its state goes on.
+            cut: cutting process; its state is updated.
             first: index of the first sample.
-            given: by name, of shape (n,): ``command`` [m], ``angle`` [rad], ``speed`` [rad/s] and ``feed_velocity``
-                [m/s]; 0 unless given: ``set_point`` of the piezo [m], ``noise`` of the carriage's sensor [m], ``met``,
-                the form that the blank has already [m], and ``height``, ``cross_position`` and ``allowance`` as in
-                `lathe_rc.plants.cutting.CuttingProcess.block`.
+            given: arrays by name, of shape (n,): ``command`` [m], ``angle`` [rad], ``speed`` [rad/s] and
+                ``feed_velocity`` [m/s]; optional, with a default of 0: ``set_point`` of the piezo [m], ``noise`` of the
+                carriage's sensor [m], ``met``, the present form of the blank [m], and ``height``, ``cross_position``
+                and ``allowance`` as in `lathe_rc.plants.cutting.CuttingProcess.block`.
 
         Returns:
-            By name: ``position``, ``velocity``, ``current`` and ``measured`` of the carriage, ``extension``,
+            Arrays by name: ``position``, ``velocity``, ``current`` and ``measured`` of the carriage, ``extension``,
             ``extension_velocity`` and ``voltage`` of the piezo [m, m/s, A, m, m, m/s, V], and ``force``,
             ``deflection``, ``depth_of_cut``, ``feed`` and ``wear`` of the cut.
 
         Raises:
-            LatheError: drives and cut cannot go on, see `failure`.
+            LatheError: the motion or the cut has failed, see `failure`.
         """
         none = np.zeros_like(given["command"])
         taken = tuple(given.get(name, none) for name in GIVEN)
@@ -253,7 +254,7 @@ class ToolDrive:
         return motion | of_cut
 
     def _check(self, coil: Coil) -> None:
-        """Refuse a current loop that oscillates."""
+        """Check that the current loop does not oscillate."""
         radius = float(np.abs(np.linalg.eigvals(self._closed()[0])).max())
         if radius >= 1.0:
             raise InputError(
@@ -262,7 +263,7 @@ class ToolDrive:
             )
 
     def _closed(self) -> tuple[Array, Array]:
-        """Closed current loop without limits: transition of state and integral, and weight of the wanted position."""
+        """Return transition and set-point weight of the closed current loop (state and integral), without limits."""
         table, coil = self.table, self.table.coil
         order = table.state.size
         # U of the state before: (kp + ki·h)·(i* - i) + ki·integral
@@ -280,7 +281,7 @@ class ToolDrive:
         return closed, weight
 
     def _of(self, place: int, frequency: npt.ArrayLike, *, command: bool) -> Complex:
-        """Response of a state to the command, or to the extension e, without feedback and force."""
+        """Return the response of a state to the command, or to the extension e, without feedback and force."""
         table = self.table
         if not table.coil.on:
             return _seen_at(self._coarse if command else self._fine, place).response(frequency)
@@ -297,25 +298,25 @@ class ToolDrive:
         return np.asarray(np.linalg.solve(left, right[:, :, None])[:, place, 0].reshape(wanted.shape))
 
     def _with_feedback(self, alone: Complex, frequency: npt.ArrayLike) -> Complex:
-        """Response under direct compensation, from the one without it."""
+        """Convert a response without direct compensation to the response under direct compensation."""
         if self._piezo is None or not self._piezo.feedback:
             return alone
         reaction = self._piezo.stack.linear.response(frequency) * self._of(_CARRIAGE, frequency, command=False)
         return np.asarray(alone / (1.0 + reaction))
 
     def coarse_response(self, frequency: npt.ArrayLike) -> Complex:
-        """Carriage over its command at ``frequency`` [rad/s], without limits and force."""
+        """Return the response, carriage over command, at ``frequency`` [rad/s], without limits or force."""
         return self._with_feedback(self._of(_CARRIAGE, frequency, command=True), frequency)
 
     def fine_response(self, frequency: npt.ArrayLike) -> Complex:
-        """Tool over the piezo's set point at ``frequency`` [rad/s], without limits and force."""
+        """Return the response, tool over piezo set point, at ``frequency`` [rad/s], without limits or force."""
         assert self._piezo is not None, "there is one"
         alone = self._piezo.stack.linear.response(frequency) * self._of(_TOOL, frequency, command=False)
         return self._with_feedback(alone, frequency)
 
 
 def _no_stack(step: float) -> Stack:
-    """Stack for the table of a drive without a piezo; the kernels do not step it."""
+    """Return a placeholder stack for the table of a drive without a piezo; the kernels do not step it."""
     return Stack(
         stroke=1.0, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
         step=step, method="foh",
