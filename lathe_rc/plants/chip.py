@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cut for kernels: chip of a sample, its force, deflection of the edge, remembered surface.
+"""Kernels of the cut: chip of a sample, cutting force, deflection of the edge, remembered surface.
 
-The equations are those of `lathe_rc.plants.cutting`. Here they stand sample by sample, so that what moves the edge can
-be solved together with the chip, see `lathe_rc.plants.tool_drive`.
+The equations are those of `lathe_rc.plants.cutting`, here sample by sample, so that the edge's motion can be solved
+together with the chip, see `lathe_rc.plants.tool_drive`.
 
-The surface that the edge leaves is remembered over the angle until it is met again a revolution later: over the angle,
-so that it is found again at any speed. What the edge leaves between two samples goes to the grid points between their
-angles.
+The surface behind the edge is stored until the edge meets it again a revolution later. It is stored as a function of
+the angle, so that it can be looked up at any speed. The surface between two samples is interpolated at the grid points
+between their angles.
 """
 
 from typing import NamedTuple
@@ -21,16 +21,16 @@ from lathe_rc.plants.cutting_force import Flank, SpecificForce, Wear, cutting_st
 from lathe_rc.plants.workpiece import hardness, missing
 from lathe_rc.transfer import System, step
 
-# Places in what is known of the last sample: its place on the grid, what it left, the next grid point.
+# Indices in the data of the last sample: its place on the grid, the surface there, the next grid point.
 _PLACE, _LEFT, _NEXT = 0, 1, 2
 
 
 class SurfaceTable(NamedTuple):
-    """A remembered surface, for kernels.
+    """Remembered surface of the part for kernels.
 
     Attributes:
-        ring: by grid point, modulo its size, which is a power of two [m].
-        last: the last sample's place on the grid, what it left there, and the next grid point; NaN before the first.
+        ring: surface by grid point [m], modulo the size, which is a power of two.
+        last: place of the last sample on the grid, surface there, and next grid point; NaN before the first sample.
     """
 
     ring: Array
@@ -38,20 +38,20 @@ class SurfaceTable(NamedTuple):
 
 
 def blank(grid: int) -> SurfaceTable:
-    """Surface of an uncut part, with ``grid`` points in a revolution."""
+    """Return the surface of an uncut part, with ``grid`` points in a revolution."""
     # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
     return SurfaceTable(np.zeros(1 << (2 * grid + 2).bit_length()), np.array([np.nan, 0.0, 0.0]))
 
 
 @inlined
 def goes_on(last: Array, place: float, grid: int) -> bool:
-    """Whether ``place`` [grid point] is less than a revolution beyond that of the last sample, and not before it."""
+    """Check that ``place`` [grid point] is at or beyond the last sample, by less than a revolution."""
     return bool(0.0 <= place - (place if np.isnan(last[_PLACE]) else last[_PLACE]) < grid)
 
 
 @kernel
 def surface_at(ring: Array, place: float) -> float:
-    """The remembered surface [m] at ``place`` [grid point]."""
+    """Return the remembered surface [m] at ``place`` [grid point]."""
     i = int(np.floor(place))
     mask = ring.size - 1
     left = ring[i & mask]
@@ -60,11 +60,11 @@ def surface_at(ring: Array, place: float) -> float:
 
 @kernel
 def remember(ring: Array, last: Array, place: float, left: float) -> None:
-    """Interpolate the surface that the edge left [m] from the last sample to this one, at ``place`` [grid point]."""
+    """Store the surface ``left`` [m] at ``place`` [grid point], interpolated from the last sample to this one."""
     mask = ring.size - 1
     if np.isnan(last[_PLACE]):
         last[_PLACE], last[_LEFT], last[_NEXT] = place, left, np.ceil(place)
-    # Each grid point between the two samples; at a slow spindle most samples pass none.
+    # Each grid point between the two samples; at a low spindle speed most samples pass none.
     while last[_NEXT] <= place:
         u = 0.0
         if place > last[_PLACE]:
@@ -76,22 +76,22 @@ def remember(ring: Array, last: Array, place: float, left: float) -> None:
 
 _TURN = 2.0 * np.pi
 
-WEAR, _EDGE = 0, 1  #: places in the state
-DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: why a kernel stopped
+WEAR, _EDGE = 0, 1  #: indices in the state
+DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: reasons why a kernel stopped
 
 
 class Process(NamedTuple):
-    """Constants of a `lathe_rc.plants.cutting.CuttingProcess` for its kernel.
+    """Constants of the cutting process for kernels (see `lathe_rc.plants.cutting.CuttingProcess`).
 
     Attributes:
         step: sampling step [s].
         depth: [m].
         overlap: µ.
         sign: σ.
-        material, wear, flank: as given.
+        material, wear, flank: see `lathe_rc.plants.cutting_force`.
         radius: of the part, for the cutting path [m].
-        lag, mode: of F and w.
-        lag_now, mode_now: what a unit of their input changes in their output of the same sample.
+        lag, mode: systems of F and w.
+        lag_now, mode_now: change of the output of each system by a unit of its input in the same sample.
         gaps: shape (m, 2).
         spots: shape (m, 5).
         heights, compliances: shape (m,).
@@ -118,13 +118,13 @@ class Process(NamedTuple):
 
 
 class CutTable(NamedTuple):
-    """A `lathe_rc.plants.cutting.CuttingProcess` for its kernel.
+    """Cutting process with its state, for kernels (see `lathe_rc.plants.cutting.CuttingProcess`).
 
     Attributes:
-        process: its constants.
-        lag_state, mode_state: of F and w.
-        state: VB, and where the edge was; NaN before the first sample.
-        surface: what it left.
+        process: constants.
+        lag_state, mode_state: states of F and w.
+        state: VB, and the last place of the edge; NaN before the first sample.
+        surface: remembered surface.
     """
 
     process: Process
@@ -136,8 +136,8 @@ class CutTable(NamedTuple):
 
 @inlined
 def _free(system: System, state: Array) -> float:
-    """Next output of a system with an input of 0; the state stays."""
-    # `step` would move the state, and the chip needs this output before the force that is the input is known.
+    """Return the next output of a system for an input of 0; the state is unchanged."""
+    # `step` would change the state, and the chip needs this output before the input, the force, is known.
     order = system.now.size
     value = 0.0
     for row in range(order):
@@ -150,7 +150,7 @@ def _free(system: System, state: Array) -> float:
 
 @inlined
 def pressed_by(process: Process, speed: float, wear: float) -> float:
-    """Loss of the flank's force for each metre that the edge moves out of the part in a sample [N/m], times σ."""
+    """Return σ times the decrease of the flank force per metre of outward edge motion in a sample [N/m]."""
     if process.flank.pressure == 0.0:
         return 0.0
     damping = flank_damping(process.flank, process.radius * speed, wear)
@@ -161,7 +161,7 @@ def pressed_by(process: Process, speed: float, wear: float) -> float:
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """Conditions of the cut at ``place`` [grid point]: the reason to stop, feed, K, and σ·c; nothing changes."""
+    """Return the conditions of the cut at ``place`` [grid point]: reason to stop, feed, K, and σ·c."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0
@@ -175,13 +175,13 @@ def meet(
 
 @inlined
 def held(cut: CutTable) -> float:
-    """Force [N] of a sample without a chip, which its lag keeps from before."""
+    """Return the force [N] of a sample without a chip, which decays with the lag of the force."""
     return _free(cut.process.lag, cut.lag_state)
 
 
 @inlined
 def _moved(cut: CutTable, base: float) -> float:
-    """Motion of the edge since the last sample, without its deflection [m]."""
+    """Return the motion of the edge since the last sample, without its deflection [m]."""
     before = cut.state[_EDGE]
     return 0.0 if np.isnan(before) else base - before
 
@@ -199,20 +199,20 @@ def chip_of(
     give: float,
     pressed: float,
 ) -> float:
-    """Depth of cut [m] of a sample, negative where the edge is clear of the part; NaN: it is drawn in without end.
+    """Return the depth of cut [m] of a sample: negative without contact, NaN if the edge is drawn in without bound.
 
-    ``displacement`` of the tool drives is that with the force `held`, to which they give way by ``give`` [m/N] of what
-    the chip adds to it. ``pressed``: see `pressed_by`; where it is not 0, ``give`` is.
+    ``displacement`` is the displacement of the tool drives under the force `held`; they yield by ``give`` [m/N] to the
+    additional force of the chip. ``pressed``: see `pressed_by`; where it is not 0, ``give`` is 0.
     """
     process, lag_now = cut.process, cut.process.lag_now
-    # The chip that a rigid edge would have, then what force and flank of this sample take from it: with contact all of
-    # that is linear in the chip, so that one division solves it. A chip below 0 says that there is no contact.
+    # The chip of a rigid edge, then its decrease by force and flank in this sample: with contact all of that is linear
+    # in the chip, so that one division solves it. A chip below 0 means that there is no contact.
     chip = process.depth + allowance - cross_position - displacement
     if process.overlap > 0.0:
         chip += process.overlap * surface_at(cut.surface.ring, place - process.grid)
     follows = 1.0 + process.mode_now * pressed * compliance
     bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
-    if not 1.0 + bend > 0.0:  # the edge would be drawn in by all of the chip, or more
+    if not 1.0 + bend > 0.0:  # the edge would be drawn in by the whole chip, or more
         return np.nan
     lagging = held(cut) - pressed * _moved(cut, cross_position + displacement)
     chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * lagging) / follows
@@ -224,9 +224,9 @@ def chip_of(
 def press(
     cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float, base: float, pressed: float
 ) -> tuple[float, float]:
-    """Step force [N], deflection [m] and wear of the tool by a sample with a chip of 0 or more.
+    """Step force [N], deflection [m] and wear of the tool through a sample with a chip of 0 or more.
 
-    ``base``: place of the edge but for its deflection [m]; ``pressed``: see `pressed_by`.
+    ``base``: place of the edge without its deflection [m]; ``pressed``: see `pressed_by`.
     """
     process, state = cut.process, cut.state
     free = _free(process.mode, cut.mode_state)
@@ -243,14 +243,14 @@ def press(
 
 @inlined
 def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
-    """Remember the place of the edge [m], and the surface that it left if that is met again."""
+    """Store the place of the edge [m], and with regeneration the surface behind it."""
     if cut.process.overlap > 0.0:
         remember(cut.surface.ring, cut.surface.last, place, edge if chip > 0.0 else 0.0)
     cut.state[_EDGE] = edge
 
 
 def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
-    """Return the error of a cut that cannot go on at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
+    """Return the error for a failed cut at an angle [rad], a speed [rad/s] and a feed [m/rev]."""
     if reason == _STANDS:
         return LatheError(
             f"the spindle's speed is {speed:.6g} rad/s in the cut; allowed: above 0 (reduce its deviation)"

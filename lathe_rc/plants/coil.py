@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The current loop of a voice coil, sampled with the step of the cell: see `lathe_rc.plants.tool_drive`.
+"""Current loop of a voice coil, sampled with the step of the cell (see `lathe_rc.plants.tool_drive`).
 
     U = ωc·(L·(i* - i) + R·∫(i* - i)dt)
 
-so that i/i* is about 1/(1 + p/ωc). i* may be limited in size and slope, U in size; while U is cut off the integral
-stands.
+so that i/i* is about 1/(1 + p/ωc). i* may be limited in size and slope, U in size; while U is clipped the integral is
+frozen.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from lathe_rc.jit import kernel
 
 @dataclass(frozen=True)
 class Coil:
-    """The current loop of a voice coil.
+    """Parameters of a voice coil and its current loop.
 
     Attributes:
         resistance: R [Ω].
         inductance: L [H].
-        bandwidth: ωc of its loop [rad/s].
+        bandwidth: ωc of the current loop [rad/s].
         back_emf: whether the motion induces a voltage.
         current_limit, voltage_limit: of i* and U [A, V]; inf for none.
         slew_rate: largest slope of i* [A/s]; inf for none.
@@ -40,16 +40,16 @@ class Coil:
 
 
 class CoilTable(NamedTuple):
-    """A `Coil` for kernels; without one the position loop's force is there at once.
+    """A coil with its state, for kernels (see `Coil`); without a coil the force of the position loop acts at once.
 
     Attributes:
-        on: whether there is one.
-        proportional, integral: of the current loop [V/A, V/(A·s)].
+        on: whether there is a coil.
+        proportional, integral: gains of the current loop [V/A, V/(A·s)].
         current_limit, voltage_limit: [A, V].
         slew: largest change of i* in a sample [A].
         step: [s].
         state: integral of i* - i [A·s], and i* [A].
-        limited: of each sample whether something was cut off; sample n stands at n modulo the size.
+        limited: ring of flags, 1 where current or voltage was clipped; sample n is at index n modulo the size.
     """
 
     on: bool
@@ -64,12 +64,12 @@ class CoilTable(NamedTuple):
 
 
 def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
-    """Table of a coil at rest.
+    """Return the table of a coil at rest.
 
     Args:
-        coil: None: there is none.
+        coil: parameters of the coil; None for no coil.
         step: sampling step [s].
-        kept: samples of which it is kept whether something was cut off, a power of two.
+        kept: length of the history of limited samples, a power of two.
     """
     values = coil or Coil(0.0, 0.0, 0.0)
     return CoilTable(
@@ -87,7 +87,7 @@ def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
 
 @kernel
 def applied(coil: CoilTable, n: int, asked: float, current: float) -> float:
-    """The voltage of the loop until sample ``n`` [V], from measured and set current [A] of the sample before."""
+    """Return the voltage of the loop until sample ``n`` [V], from measured and set current [A] of the sample before."""
     demand = min(max(asked, coil.state[1] - coil.slew), coil.state[1] + coil.slew)
     demand = min(max(demand, -coil.current_limit), coil.current_limit)
     error = demand - current

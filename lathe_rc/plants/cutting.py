@@ -3,25 +3,24 @@
 
     ap = depth + d - y + µ·y(φ - 2π)          depth of cut, never negative
     y  = x + z + σ·c·w                        the edge: cross feed, tool drive, deflection
-    f  = 2π·v/Ω                               feed a revolution
+    f  = 2π·v/Ω                               feed per revolution
     P  = K(f, VB)·ap                          `lathe_rc.plants.cutting_force`; times the factor of a hard spot
     F  = P/(1 + p·T)                          main cutting force Pz
     w  = F/(1 + b·p + a·p²)                   W3 is c·w
 
-With process damping the flank, worn to a land W, presses on the surface that the edge leaves where it moves into the
-part, and less where it moves out: F = P/(1 + p·T) - σ·Ksp·B·W²/2·(dy/dt)/v, as long as there is a chip. That is a
-damper; B is the width of the flank, v the cutting speed, W the land that it began with and VB.
+With process damping the flank, worn to a land W, presses on the surface behind the edge, more where the edge moves into
+the part and less where it moves out: F = P/(1 + p·T) - σ·Ksp·B·W²/2·(dy/dt)/v, as long as there is a chip. This is a
+damper; B is the width of the flank, v the cutting speed, W the initial land plus VB.
 
-Displacements point out of the part: a positive one takes the edge away from it and makes the chip thinner. Paper 004
-has the cross feed the other way round, F = +W4·x, so its x is -x here; its y = x + W3·F draws the edge into the part
-(σ = -1), and the realistic y = x - W3·F pushes it away (σ = +1).
+Displacements point out of the part: a positive one moves the edge away from it and makes the chip thinner. Paper 004
+uses the opposite sign for the cross feed, F = +W4·x, so its x is -x here; its y = x + W3·F draws the edge into the part
 
-All that happens in a sample is solved together: the force of sample n bends the tool of sample n, whose edge makes the
-chip of sample n. ap is linear in the force as long as there is contact, so that this is one division. Both lags take
-what drives them as linear between samples.
+All interactions within a sample are solved together: the force of sample n bends the tool of sample n, whose edge makes
+the chip of sample n. ap is linear in the force as long as there is contact, so that this takes one division. Both lags
+assume inputs that are linear between samples.
 
-The part's surface is remembered over the angle (`lathe_rc.plants.chip`), and the chip reads it a revolution
-later. Where nothing is cut nothing is left to meet: the blank is there, which depth + d says already.
+The part's surface is stored as a function of the angle (`lathe_rc.plants.chip`), and the chip uses it a revolution
+later. Without a cut the surface is that of the blank, which depth + d already describes.
 
 Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping:
 `lathe_rc.plants.cutting_force`.
@@ -56,14 +55,14 @@ _TURN = 2.0 * np.pi
 _NEW_EDGE, _NO_DAMPING = Wear(), Flank()
 
 
-#: arrays of a block in the order of the kernel: what the cut takes, and what it makes
+#: input and output arrays of a block, in the order of the kernel
 GIVEN = ("angle", "speed", "height", "cross_position", "displacement", "feed_velocity", "allowance")
 MADE = ("force", "deflection", "depth_of_cut", "feed", "wear")
 
 
 @kernel
 def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) -> tuple[int, int]:
-    """Step through a block, see `GIVEN` and `MADE`; returns the sample at which it stopped and why."""
+    """Step the cut through a block, arrays as in `GIVEN` and `MADE`; return the sample where it stopped and why."""
     angle, speed, height, cross_position, displacement, feed_velocity, allowance = given
     force, deflection, depth_of_cut, feed, wear = made
     per_radian = cut.process.grid / _TURN
@@ -87,12 +86,12 @@ def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) 
 
 
 def _instant(system: System) -> float:
-    """Change of the output for a unit of the input in the same sample."""
+    """Return the change of the output for a unit of the input in the same sample."""
     return float(system.through + system.output @ system.now)
 
 
 def _check_edge(material: SpecificForce, wear: Wear, flank: Flank, elasticity: Elasticity) -> None:
-    """Refuse numbers of the edge that are out of their range, or not finite."""
+    """Check that all parameters of the edge are finite and in range."""
     for values in (material, wear, flank, elasticity):
         for name, value in values._asdict().items():
             if not 0.0 <= value < np.inf:
@@ -104,25 +103,25 @@ def _check_edge(material: SpecificForce, wear: Wear, flank: Flank, elasticity: E
 
 
 class CuttingProcess:
-    """The cut as a machine; it has not begun before the first sample.
+    """Simulated cutting process; it starts at the first sample.
 
     Args:
-        material: specific force and what wear does to it.
-        depth: of the cut that cross feed, tool and allowance of 0 give [m].
+        material: specific force and effect of wear on it.
+        depth: of the cut with cross feed, tool and allowance at 0 [m].
         lag: T [s]; 0 for none.
         elasticity: W3.
         wear: of the tool.
         part: keyways, hard spots, compliance along the part.
-        overlap: µ, how much of the last revolution's surface the edge meets again, 0 up to 1; 0: no regeneration.
-        grid: points in a revolution at which the surface is remembered.
+        overlap: µ, fraction of the last revolution's surface that the edge meets again, 0 to 1; 0: no regeneration.
+        grid: number of points per revolution at which the surface is stored.
         flank: process damping.
         step: sampling step [s].
 
     Attributes:
-        table: for `cut_along`.
+        table: constants and state for `cut_along`.
 
     Raises:
-        InputError: a value that is out of its range.
+        InputError: a value out of range.
     """
 
     def __init__(
@@ -153,7 +152,7 @@ class CuttingProcess:
         heights, compliances = part.heights, part.compliances
         if heights is None or compliances is None:
             heights, compliances = np.zeros(1), np.array([elasticity.compliance])
-        # Without damage: each call of `damage` starts from it, so that a repair takes all of it back.
+        # Without damage: each call of `damage` starts from it, so that a repair reverts all damage.
         self._whole = Process(
             step=step,
             depth=depth,
@@ -182,23 +181,24 @@ class CuttingProcess:
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
-        """Shorten the edge [m] against its first length, and add hard spots to those of the part; default: neither."""
+        """Shorten the edge [m] from its initial length, and add hard spots to those of the part; default: neither."""
         all_spots = np.concatenate((self._whole.spots, spot_rows(spots)))
         process = self._whole._replace(depth=self._whole.depth - shorter, spots=all_spots)
         self.table = self.table._replace(process=process)
 
     def block(self, **arrays: Array) -> None:
-        """Step through a block.
+        """Step the cut through a block.
 
         Args:
-            **arrays: of shape (n,), by the names of `GIVEN`: true spindle angle [rad], which must not fall with
-                regeneration, true spindle speed [rad/s], above 0, height of the edge along the part [m], x of the cross
-                feed and z of the tool drive, out of the part [m], velocity of the longitudinal feed [m/s], d [m]; and,
-                filled, of `MADE`: F [N], deflection σ·c·w of the edge out of the part [m], ap [m], f [m/rev], VB [m].
+            **arrays: arrays of shape (n,) by the names of `GIVEN`: true spindle angle [rad], which must not decrease
+                with regeneration, true spindle speed [rad/s], above 0, height of the edge along the part [m], x of the
+                cross feed and z of the tool drive, out of the part [m], velocity of the longitudinal feed [m/s], d [m];
+                and the output arrays of `MADE`: F [N], deflection σ·c·w of the edge out of the part [m], ap [m],
+                f [m/rev], VB [m].
 
         Raises:
-            LatheError: the spindle stands, or turns back or jumps under regeneration; or the force draws the edge into
-                the part faster than it can cut.
+            LatheError: the spindle is at rest, or turns back or jumps under regeneration; or the force draws the edge
+                into the part faster than it can cut.
         """
         made = tuple(arrays[name] for name in MADE)
         reached, reason = cut_along(self.table, tuple(arrays[name] for name in GIVEN), made)

@@ -3,11 +3,11 @@
 
     Pz = kc1·ap·f0·(f/f0)^{1-mc}·(1 + cw·VB),  f0 = 1 mm                        (Kienzle, with wear)
 
-In SI units the force has to name the feed f0 for which kc1 holds; in mm and N/mm² it is 1 and does not show. A flank
-that is worn presses on the surface, which damps (process damping). The force bends the edge: W3 of paper 004.
+In SI units the formula must contain the feed f0 for which kc1 holds; in mm and N/mm² it is 1 and does not appear. A
+worn flank presses on the surface, which damps (process damping). The force bends the edge: W3 of paper 004.
 
-Values are checked where they come from, in the table of the cutting process; `CuttingProcess` checks them again, so
-that they are plain tuples here, which kernels take as they are.
+Values are checked in the parameter table of the cutting process; `CuttingProcess` checks them again. They are plain
+tuples here, which kernels accept directly.
 
 Source: spec/feed-and-force.md, "Cutting process", from the W4 of paper 004: 233.3 N/mm is f = 0.071 mm/rev in steel;
 D. W. Wu, J. Engineering for Industry 111 (1989) 37 (force by the volume that is pressed in); E. Budak, L. T. Tunc, CIRP
@@ -27,8 +27,8 @@ class SpecificForce(NamedTuple):
 
     Attributes:
         kc1: specific force at a feed of 1 mm [Pa].
-        mc: exponent of its fall with the feed [1].
-        wear_factor: cw, relative rise of the force with the wear VB [1/m].
+        mc: exponent of its decrease with the feed [1].
+        wear_factor: cw, relative increase of the force with the wear VB [1/m].
     """
 
     kc1: float = 1.7e9
@@ -36,11 +36,11 @@ class SpecificForce(NamedTuple):
     wear_factor: float = 0.0
 
     def stiffness(self, feed: float, wear: float = 0.0) -> float:
-        """Pz/ap [N/m] at ``feed`` [m/rev] and the wear VB ``wear`` [m]."""
+        """Return the cutting stiffness Pz/ap [N/m] at ``feed`` [m/rev] and the wear VB ``wear`` [m]."""
         return cutting_stiffness(self, feed, wear)
 
     def feed_for(self, stiffness: float, wear: float = 0.0) -> float:
-        """The feed [m/rev] at which Pz/ap is ``stiffness`` [N/m]."""
+        """Return the feed [m/rev] at which the cutting stiffness Pz/ap is ``stiffness`` [N/m]."""
         relative = stiffness / self.stiffness(_REFERENCE_FEED, wear)
         return float(_REFERENCE_FEED * relative ** (1.0 / (1.0 - self.mc)))
 
@@ -50,18 +50,18 @@ STEEL = SpecificForce()
 
 @inlined
 def cutting_stiffness(material: SpecificForce, feed: float, wear: float) -> float:
-    """Pz/ap [N/m]."""
+    """Return the cutting stiffness Pz/ap [N/m] at a feed [m/rev] and a wear VB [m]."""
     relative = (feed / _REFERENCE_FEED) ** (1.0 - material.mc)
     return float(material.kc1 * _REFERENCE_FEED * relative * (1.0 + material.wear_factor * wear))
 
 
 class Wear(NamedTuple):
-    """Wear VB of the tool; it grows while there is a chip.
+    """Wear VB of the tool, which grows while there is a chip.
 
     Attributes:
-        initial: [m].
-        per_metre: for each metre of the cutting path [m/m].
-        per_second: for each second in the cut [m/s].
+        initial: initial wear [m].
+        per_metre: growth per metre of the cutting path [m/m].
+        per_second: growth per second in the cut [m/s].
     """
 
     initial: float = 0.0
@@ -70,11 +70,11 @@ class Wear(NamedTuple):
 
 
 class Flank(NamedTuple):
-    """Process damping: the flank presses on the surface.
+    """Process damping by the flank, which presses on the surface.
 
     Attributes:
-        pressure: Ksp, force by the volume that is pressed in [N/m³]; 0: no process damping.
-        width: B, of the flank along the edge that faces the surface [m].
+        pressure: Ksp, force per displaced volume [N/m³]; 0: no process damping.
+        width: B, width of the flank along the edge that faces the surface [m].
         land: W of a new edge, to which the wear VB is added [m].
     """
 
@@ -85,19 +85,19 @@ class Flank(NamedTuple):
 
 @inlined
 def flank_damping(flank: Flank, speed: float, wear: float) -> float:
-    """Force on the edge by its speed out of the part [N·s/m], at a cutting speed [m/s] and a wear VB [m]."""
+    """Return the flank force per outward speed of the edge [N·s/m], at a cutting speed [m/s] and a wear VB [m]."""
     land = flank.land + wear
     return flank.pressure * flank.width * land * land / (2.0 * speed)
 
 
 class Elasticity(NamedTuple):
-    """W3 = c/(1 + b·p + a·p²): deflection of the edge by the force.
+    """Deflection of the edge by the cutting force, W3 = c/(1 + b·p + a·p²).
 
     Attributes:
         compliance: c [m/N].
         inertia: a [s²]; 0 with b = 0 for a spring alone.
         damping: b [s].
-        away: the force pushes the edge away from the part; False draws it into the part.
+        away: whether the force pushes the edge away from the part; False draws it into the part.
     """
 
     compliance: float
@@ -107,12 +107,12 @@ class Elasticity(NamedTuple):
 
     @property
     def shape(self) -> TransferFunction:
-        """W3/c."""
+        """Transfer function W3/c with a gain of 1."""
         return TransferFunction((1.0,), (self.inertia, self.damping, 1.0))
 
     @property
     def transfer(self) -> TransferFunction:
-        """W3 [m/N]."""
+        """Transfer function W3 from the force to the deflection [m/N]."""
         return TransferFunction((self.compliance,), (self.inertia, self.damping, 1.0))
 
 

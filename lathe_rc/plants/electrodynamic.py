@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coarse electrodynamic (voice-coil) tool drive, closed by its own loops.
+"""Coarse electrodynamic (voice-coil) tool drive with its own closed loops.
 
     Wi(p) = e^{-pτ} / (1 + 2ζp/ωn + p²/ωn²)
 
-Source: papers 000 and 001; parameters identified from the table of 001. The coil current is the one that the
-carriage's acceleration asks for, i = m·x''/k.
+Source: papers 000 and 001; parameters identified from the table of 001. The coil current follows from the acceleration
+of the carriage, i = m·x''/k.
 """
 
 from typing import NamedTuple
@@ -18,9 +18,9 @@ from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, se
 
 @inlined
 def between_stops(position: float, velocity: float, stroke: float) -> tuple[float, float]:
-    """Position [m] and velocity [m/s] between end stops at ± ``stroke`` [m].
+    """Limit a position [m] and its velocity [m/s] to inelastic end stops at ± ``stroke`` [m].
 
-    They are inelastic: the carriage stays there until it is driven back.
+    The carriage stays at the end stop until it is driven back.
     """
     if position > stroke:
         return stroke, min(velocity, 0.0)
@@ -30,15 +30,15 @@ def between_stops(position: float, velocity: float, stroke: float) -> tuple[floa
 
 
 class CoarseTable(NamedTuple):
-    """An `ElectrodynamicDrive` for kernels.
+    """An electrodynamic drive with its state, for kernels (see `ElectrodynamicDrive`).
 
     Attributes:
-        transition, weights, part: of the plant.
-        spring, damper: of its own loops, by the moving mass [1/s², 1/s].
+        transition, weights, part: difference equation of the plant, with the fraction of the delay.
+        spring, damper: gains of the drive's loops divided by the moving mass [1/s², 1/s].
         force_per_current: moving mass over force constant [A·s²/m].
         stroke: [m].
         state: position and velocity.
-        line: the commands before the next block that are still on their way, the oldest first.
+        line: delayed commands from before the next block, the oldest first.
     """
 
     transition: Array
@@ -54,7 +54,7 @@ class CoarseTable(NamedTuple):
 
 @kernel
 def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array) -> None:
-    """Step the drive through a block, see `ElectrodynamicDrive.block`."""
+    """Step the drive through a block (implements `ElectrodynamicDrive.block`)."""
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
     spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
     # Scalars in locals: the compiler cannot know that the output arrays do not overlap the matrices.
@@ -77,7 +77,7 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
 
 
 class ElectrodynamicDrive:
-    """The drive as a machine: command in, motion and current out.
+    """Simulated electrodynamic drive: from the command to motion and current.
 
     Args:
         natural_frequency: ωn [rad/s].
@@ -91,7 +91,7 @@ class ElectrodynamicDrive:
 
     Attributes:
         plant: the difference equation.
-        table: for `advance`.
+        table: constants and state for `advance`.
     """
 
     def __init__(
@@ -121,5 +121,5 @@ class ElectrodynamicDrive:
         )
 
     def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
-        """Step through a block; arrays of shape (n,) [m, m, m/s, A]. At rest at 0 before the first."""
+        """Step the drive through a block of shape (n,) [m, m, m/s, A]; at rest at 0 before the first block."""
         advance(self.table, command, position, velocity, current)

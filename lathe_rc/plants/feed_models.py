@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear models of a feed drive: the motor's position over the command.
+"""Linear models of a feed drive, as transfer functions from the command to the motor's position.
 
 fourth_order   K/(p⁴ + a4·p³ + a3·p² + a2·p + a1)                (paper 002, eq. 1)
 dc_screw       k·(1 + Tz·p)/(p·(1 + T_1·p)·(1 + T_2·p)·…)        (paper 004: W2; the screw of W1)
@@ -22,18 +22,18 @@ FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the
 def fourth_order(
     gain: float = 19.0, a1: float = 21.5, a2: float = 48.0, a3: float = 46.9, a4: float = 10.2
 ) -> TransferFunction:
-    """K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
+    """Return the drive model K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
 
-    The state matrix of eq. 3 has these coefficients with the opposite sign of what is printed.
+    In the state matrix of eq. 3 these coefficients have the opposite sign of the printed ones.
     """
     return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
 
 
 def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
-    """Motor and screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
+    """Return the model of a motor with a screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
 
-    The zero makes room for a lag that another part has: with that of the cutting process, a drive of the lags of W1
-    gives W1 from the command to the force.
+    The zero compensates a lag that another part has: with the lag of the cutting process, a drive with the lags of W1
+    has the response W1 from the command to the force.
 
     Args:
         velocity_gain: k [m/s per unit of the command].
@@ -48,7 +48,7 @@ def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> 
 
 @lru_cache(maxsize=64)
 def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> TransferFunction:
-    """`dc_screw`, cached: each variation of a cell asks for the models of its drives."""
+    """Return the model of a motor with a screw (implements `dc_screw`), cached for repeated models in a sweep."""
     if not all(lag > 0.0 for lag in lags):
         raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
     bottom = np.array([1.0, 0.0])
@@ -58,7 +58,7 @@ def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> Tra
 
 
 def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
-    """K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of the `FeedDrive`.
+    """Return K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of the `FeedDrive`.
 
     Args:
         gain: K [1/s], with the command in the unit of the position.
@@ -68,10 +68,10 @@ def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
 
 
 def realise(model: TransferFunction) -> tuple[Array, Array]:
-    """Matrices a and b of a model, with position and speed as first states.
+    """Return the matrices a and b of a model, with position and speed as first states.
 
-    The others are the further derivatives, each less what the command adds to it at once (the observability form);
-    a zero that cancels a lag is no obstacle.
+    The other states are the further derivatives, each minus the immediate effect of the command on it (observability
+    form); a zero that cancels a lag is allowed.
     """
     top, bottom = (np.trim_zeros(np.array(part), "f") for part in (model.numerator, model.denominator))
     order = bottom.size - 1
@@ -82,14 +82,14 @@ def realise(model: TransferFunction) -> tuple[Array, Array]:
         )
     a = np.diag(np.ones(order - 1), 1)
     a[-1] = -bottom[:0:-1] / bottom[0]
-    # The Markov parameters: the quotient as a series of 1/p, by long division.
+    # Markov parameters: the quotient as a series of 1/p, by long division.
     padded = np.concatenate((np.zeros(bottom.size - top.size), top, np.zeros(order)))
     markov, _ = np.polydiv(padded / bottom[0], bottom / bottom[0])
     return a, markov[1:]
 
 
 def settles(model: TransferFunction) -> tuple[float, bool]:
-    """Return the position or speed that a command of 1 settles at, 0 if neither, and whether it is a speed."""
+    """Return the steady position or speed for a command of 1, 0 if there is neither, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
     divisor = model.denominator[-2 if integrates else -1]
     return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

@@ -2,14 +2,14 @@
 """Friction of a slide, solved together with the speed of the motor within a step.
 
     g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve, of the dry part
-    stribeck   F = g(v)·sgn v + Fv·v; at rest what holds the slide, up to Fs
+    stribeck   F = g(v)·sgn v + Fv·v; at rest the holding force, up to Fs
     lugre      dz/dt = v - σ0·|v|/g(v)·z,  F = σ0·z + σ1·dz/dt + Fv·v
 
 z is the mean deflection of bristles between the surfaces. At a steady speed LuGre gives the Stribeck curve; below Fs
 the slide rests on a spring of σ0 (presliding).
 
 The force of a step is solved together with the speed at its end, which is linear in it: a slide that the force can hold
-stands still to the bit, and no stiffness makes the step unstable. Within a step g is that of the speed at its start.
+is exactly at rest, and no stiffness makes the step unstable. Within a step g is taken at the speed at its start.
 
 Sources: B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083 (Stribeck curve); C. Canudas de
 Wit, H. Olsson, K. J. Åström, P. Lischinsky, IEEE Trans. Automatic Control 40 (1995) 419 (LuGre).
@@ -26,12 +26,12 @@ from lathe_rc.transfer import TransferFunction
 
 Law = Literal["stribeck", "lugre"]
 
-NONE, STRIBECK, LUGRE = 0, 1, 2  #: of a `FrictionTable`
+NONE, STRIBECK, LUGRE = 0, 1, 2  #: laws of a `FrictionTable`
 _LAWS = {"stribeck": STRIBECK, "lugre": LUGRE}
 
 
 class FrictionTable(NamedTuple):
-    """A `Friction` for kernels.
+    """Friction of a slide for kernels (see `Friction`).
 
     Attributes:
         law: `NONE`, `STRIBECK` or `LUGRE`.
@@ -51,20 +51,20 @@ class FrictionTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Friction:
-    """Friction of a slide, as the motor feels it.
+    """Friction of a slide, referred to the motor.
 
     Attributes:
-        law: see the module.
-        mobility: motor position over a force on it [m/N]; see `mobility`.
+        law: friction law, see the module.
+        mobility: transfer function from a force to the motor position [m/N]; see `mobility`.
         coulomb: Fc [N].
         static: Fs [N], not below Fc.
         speed: vs [m/s].
-        viscous: Fv [N·s/m], beside what the lag of the drive contains.
+        viscous: Fv [N·s/m], in addition to the friction in the lag of the drive.
         stiffness: σ0 of the bristles [N/m], ``lugre``.
         damping: σ1 of the bristles [N·s/m], ``lugre``.
 
     Raises:
-        InputError: a value that is out of its range.
+        InputError: a value out of range.
     """
 
     law: Law
@@ -89,52 +89,52 @@ class Friction:
             )
 
     def table(self, step: float) -> FrictionTable:
-        """For kernels, at a sampling step [s]."""
+        """Return the table of the friction for kernels, at a sampling step [s]."""
         return FrictionTable(
             _LAWS[self.law], self.coulomb, self.static, self.speed, self.viscous, self.stiffness, self.damping, step
         )
 
     def steady(self, speed: float) -> float:
-        """Force at a steady speed [N, m/s]; at rest 0."""
+        """Return the friction force [N] at a steady speed [m/s]; 0 at rest."""
         dry = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.speed) ** 2))
         return float(dry * np.sign(speed) + self.viscous * speed)
 
 
 def mobility(velocity_gain: float, lag: float, motor_force: float) -> TransferFunction:
-    """Motor position over a force on it, (k/F1)/(p·(1 + T·p)) [m/N].
+    """Return the transfer function from a force to the motor position, (k/F1)/(p·(1 + T·p)) [m/N].
 
     Args:
         velocity_gain: k, speed at a command of 1 [m/s].
         lag: T of the mechanics [s].
-        motor_force: F1 at a command of 1, at rest [N]. The mass that the motor moves is F1·T/k.
+        motor_force: F1, force at rest for a command of 1 [N]. The mass moved by the motor is F1·T/k.
     """
     return TransferFunction((velocity_gain / motor_force,), (lag, 1.0, 0.0))
 
 
 def no_friction(step: float) -> FrictionTable:
-    """Table of a slide without friction."""
+    """Return the table of a slide without friction."""
     return FrictionTable(NONE, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, step)
 
 
 @inlined
 def _dry(table: FrictionTable, speed: float) -> float:
-    """g(v) [N]."""
+    """Return the dry friction g(v) [N] of the Stribeck curve."""
     relative = speed / table.speed
     return float(table.coulomb + (table.static - table.coulomb) * np.exp(-relative * relative))
 
 
 @inlined
 def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tuple[float, bool]:
-    """Force of a step by the Stribeck curve [N], and whether it brings or keeps the slide at rest.
+    """Return the Stribeck friction force of a step [N], and whether the slide is at rest after it.
 
     Args:
-        table: of the friction.
-        gained: speed that 1 N, held over the step, gives [m/(s·N)].
+        table: constants of the friction.
+        gained: speed change by 1 N, held over the step [m/(s·N)].
         speed: at the beginning of the step [m/s].
-        free: at its end if there were no friction [m/s].
+        free: speed at the end of the step without friction [m/s].
     """
     level = _dry(table, speed)
-    # A force that can bring the speed to 0 in this step does just that: the slide never swings about its rest.
+    # If the force can bring the speed to 0 in this step, it does exactly that: the slide never oscillates about rest.
     if abs(free) <= gained * level:
         return free / gained, True
     force = level if free > 0.0 else -level
@@ -143,7 +143,7 @@ def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tup
 
 @inlined
 def bend(table: FrictionTable, gained: float, speed: float, free: float, bristle: float) -> tuple[float, float]:
-    """Force of a step by LuGre [N], and the bristles at its end [m]; arguments as of `slide`, and z at its start."""
+    """Return LuGre force [N] of a step and z at its end [m]; ``bristle``: z at its start, the rest as in `slide`."""
     # Implicit Euler in the bristles, with |v|/g of the start: stable at any stiffness, and F linear in the new speed.
     relaxed = 1.0 / (1.0 + table.step * table.stiffness * abs(speed) / _dry(table, speed))
     hard = table.stiffness + table.damping / table.step

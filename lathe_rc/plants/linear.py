@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear drives behind a delay, discretised so that nothing of the delay is rounded away."""
+"""Linear drives behind a delay, discretised without rounding the delay to whole samples."""
 
 import math
 from dataclasses import dataclass
@@ -18,18 +18,20 @@ Discretisation = Literal["foh", "tustin"]
 
 
 class Constant:
-    """Base of objects that consist of constants; caches share one object between all that are alike."""
+    """Base of immutable objects without state; caches share one object between equal ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiscretePlant(Constant):
-    """x[n] = Φ·x[n-1] + w0·u[n-k] + w1·u[n-k-1] + w2·u[n-k-2], with the position as first state.
+    """Difference equation of a delayed plant, with the position as first state.
+
+    x[n] = Φ·x[n-1] + w0·u[n-k] + w1·u[n-k-1] + w2·u[n-k-2]
 
     Attributes:
         transition: Φ, shape (m, m).
         weights: columns w0, w1, w2, shape (m, 3).
-        delay: whole samples k of the delay.
-        fraction: the rest of the delay in samples, 0 up to 1; the weights contain it.
+        delay: k, whole samples of the delay.
+        fraction: remaining fraction of the delay in samples, 0 to 1; it is included in the weights.
         step: sampling step [s].
     """
 
@@ -40,20 +42,20 @@ class DiscretePlant(Constant):
     step: float
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Response of the position to the command at ``frequency`` [rad/s], of the difference equation itself."""
+        """Return the frequency response of the difference equation, position over command, at ``frequency`` [rad/s]."""
         wanted = np.asarray(frequency, dtype=np.float64)
         return _response(self, wanted.tobytes()).reshape(wanted.shape)
 
 
 @inlined
 def _square(number: complex) -> float:
-    """Squared magnitude, without the square root of ``abs``."""
+    """Return the squared magnitude of a complex number, without the square root of ``abs``."""
     return number.real * number.real + number.imag * number.imag
 
 
 @inlined
 def _quotient(above: complex, below: complex) -> complex:
-    """Quotient of complex numbers; not finite where ``below`` is 0."""
+    """Return the quotient of complex numbers; not finite where ``below`` is 0."""
     square = _square(below)
     real = above.real * below.real + above.imag * below.imag
     return complex(real / square, (above.imag * below.real - above.real * below.imag) / square)
@@ -68,7 +70,7 @@ def _respond(transition: Array, weights: Array, back: Complex, late: Complex, in
         weights: w, shape (m, 3).
         back: 1/z, shape (n,).
         late: z⁻ᵏ, shape (n,).
-        into: filled.
+        into: output array, shape (n,).
     """
     order = weights.shape[0]
     left, right = np.empty((order, order), np.complex128), np.empty(order, np.complex128)
@@ -78,7 +80,7 @@ def _respond(transition: Array, weights: Array, back: Complex, late: Complex, in
             right[i] = weights[i, 0] + step * (weights[i, 1] + step * weights[i, 2])
             for j in range(order):
                 left[i, j] = (1.0 if i == j else 0.0) - transition[i, j] * step
-        # From the last state up, so that the position is what remains.
+        # From the last state up, so that the position remains.
         for last in range(order - 1, 0, -1):
             pivot = last
             for i in range(last):
@@ -96,7 +98,7 @@ def _respond(transition: Array, weights: Array, back: Complex, late: Complex, in
 
 @lru_cache(maxsize=64)
 def _response(plant: DiscretePlant, content: bytes) -> Complex:
-    """Response at frequencies given as bytes, cached: the checks of cells that are alike ask for the same."""
+    """Return the response of a plant at frequencies given as bytes, cached for the checks of similar cells."""
     back = _delayed(content, plant.step)
     found = np.empty_like(back)
     _respond(plant.transition, plant.weights, back, _delayed(content, plant.step * plant.delay), found)
@@ -105,30 +107,30 @@ def _response(plant: DiscretePlant, content: bytes) -> Complex:
 
 @lru_cache(maxsize=64)
 def _delayed(content: bytes, time: float) -> Complex:
-    """exp(-jω·time) at frequencies given as bytes, cached: many plants share step and delay."""
+    """Return exp(-jω·time) at frequencies given as bytes, cached, since many plants share step and delay."""
     return np.asarray(np.exp(-1j * time * np.frombuffer(content)))
 
 
 def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisation) -> DiscretePlant:
-    """Discretise x' = a·x + b·u(t - delay).
+    """Discretise a linear plant with a delayed input, x' = a·x + b·u(t - delay).
 
     Args:
         a: shape (m, m) [1/s].
         b: shape (m,) [1/s].
         delay: [s]; need not be a whole number of steps.
         step: sampling step [s].
-        method: ``foh`` is exact for a command that is linear between its samples, also within the fraction of
-            a step that the delay leaves; ``tustin`` is the bilinear rule with that fraction interpolated.
+        method: ``foh`` is exact for a command that is linear between its samples, including the fractional part of
+            the delay; ``tustin`` is the bilinear rule with linear interpolation for the fractional part.
     """
     return _discretised(a.tobytes(), b.tobytes(), delay, step, method)
 
 
 @lru_cache(maxsize=64)
 def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, method: Discretisation) -> DiscretePlant:
-    """`discretise` of matrices given as bytes, cached: cells that are alike share a plant and its responses."""
+    """Discretise a plant given as bytes (implements `discretise`), cached so that similar cells share the plant."""
     b = np.frombuffer(b_bytes)
     a, samples = np.frombuffer(a_bytes).reshape(b.size, b.size), delay / step
-    # Less than a billionth of a step is rounding, on either side, and its inverse would overflow.
+    # A remainder below a billionth of a step is rounding, on either side, and its inverse would overflow.
     whole = math.floor(samples + 1e-9)
     part = samples - whole if samples - whole > 1e-9 else 0.0
     weights = np.zeros((a.shape[0], 3))
@@ -148,6 +150,6 @@ def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, meth
 
 
 def second_order(natural_frequency: float, damping: float) -> tuple[Array, Array]:
-    """Matrices a, b of 1/(1 + 2ζp/ωn + p²/ωn²) with states position and velocity; ``natural_frequency`` in rad/s."""
+    """Return a, b of 1/(1 + 2ζp/ωn + p²/ωn²), states position and velocity; ``natural_frequency`` in rad/s."""
     square = natural_frequency**2
     return np.array([[0.0, 1.0], [-square, -2.0 * damping * natural_frequency]]), np.array([0.0, square])

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The screw of a feed drive: position of its nut when the motor is at x.
+"""Screw of a feed drive with pitch errors and thermal growth: position of the nut for a motor position x.
 
     nut = x + s·x + a·(sin(2π·x/P + ψ) - sin ψ) + α·ΔT·(x - x0)
     T·dΔT/dt = R·|v| + A - ΔT
 
-The pitch is wrong by a part s everywhere, and by a wave that repeats with the lead P. The screw warms with the way that
-the nut rubs along and with its surroundings, and grows from its fixed bearing x0. At sample 0 it is as warm as it was
-when the axis was set to 0, so the nut stands where the motor says.
+The pitch has a constant relative error s, and a periodic error with the lead P as its period. The screw is heated by
+the friction of the moving nut and by its surroundings, and grows from its fixed bearing x0. At sample 0 its temperature
+is that at the zeroing of the axis, so the nut is at the position of the motor.
 
-Within a step ΔT is exact for a speed that does not change in it. Source: ISO 230-2 (periodic and cumulative positioning
-error) and ISO 230-3 (thermal effects) name the errors; the law of warming is that of a body of one temperature.
+Within a step ΔT is exact for a constant speed. Source: ISO 230-2 (periodic and cumulative positioning error) and ISO
+230-3 (thermal effects) name the errors; the heating law is that of a body of uniform temperature.
 """
 
 from typing import NamedTuple
@@ -23,18 +23,18 @@ _TURN = 2.0 * np.pi
 
 
 class Screw(NamedTuple):
-    """Errors of a screw.
+    """Errors of a feed screw.
 
     Attributes:
-        slope: s [m/m].
+        slope: s, relative pitch error [m/m].
         lead: P [m].
-        amplitude: a [m].
+        amplitude: a, of the periodic error [m].
         phase: ψ [rad].
         expansion: α [1/K].
         heating: R [K·s/m].
-        surroundings: A, rise of the temperature at rest in the end [K].
+        surroundings: A, final temperature rise at rest [K].
         time: T [s].
-        anchor: x0, where the bearing stands that holds the screw [m].
+        anchor: x0, position of the fixed bearing of the screw [m].
     """
 
     slope: float = 0.0
@@ -48,10 +48,10 @@ class Screw(NamedTuple):
     anchor: float = 0.0
 
     def check(self) -> None:
-        """Refuse values that no screw has.
+        """Check that the values describe a possible screw.
 
         Raises:
-            InputError: a value that is out of its range, or a wave so steep that the nut would go back.
+            InputError: a value out of range, or a periodic error so steep that the nut would move backwards.
         """
         for name, value in (("lead", self.lead), ("time", self.time)):
             if not 0.0 < value < np.inf:
@@ -64,7 +64,7 @@ class Screw(NamedTuple):
             )
 
     def table(self, step: float) -> "ScrewTable":
-        """For kernels, at a sampling step [s]; raises as `check`."""
+        """Return the table of the screw for kernels, at a sampling step [s]; raises the errors of `check`."""
         self.check()
         return ScrewTable(
             self,
@@ -76,14 +76,14 @@ class Screw(NamedTuple):
 
 
 class ScrewTable(NamedTuple):
-    """A `Screw` for kernels.
+    """Errors of a feed screw for kernels (see `Screw`).
 
     Attributes:
-        errors: of the screw.
-        real: whether it has an error at all.
+        errors: parameters of the screw.
+        real: whether there is any error.
         wave: 2π/P [rad/m].
         offset: sin ψ.
-        nears: part of what is missing that ΔT makes up in a step.
+        nears: fraction of its remaining difference by which ΔT changes in a step.
     """
 
     errors: Screw
@@ -95,14 +95,14 @@ class ScrewTable(NamedTuple):
 
 @inlined
 def warm(table: ScrewTable, rise: float, speed: float) -> float:
-    """ΔT at the end of a step [K]."""
+    """Return the temperature rise ΔT of the screw at the end of a step [K]."""
     errors = table.errors
     return rise + table.nears * (errors.heating * abs(speed) + errors.surroundings - rise)
 
 
 @inlined
 def nut(table: ScrewTable, rise: float, place: float) -> float:
-    """Position of the nut [m] when the motor is at ``place`` [m]; ``rise`` is ΔT [K]."""
+    """Return the position of the nut [m] for a motor position ``place`` [m] and a temperature rise ``rise`` [K]."""
     errors = table.errors
     wave = errors.amplitude * (np.sin(table.wave * place + errors.phase) - table.offset)
     return float(place + errors.slope * place + wave + errors.expansion * rise * (place - errors.anchor))
@@ -110,7 +110,7 @@ def nut(table: ScrewTable, rise: float, place: float) -> float:
 
 @inlined
 def nut_speed(table: ScrewTable, rise: float, place: float, speed: float) -> float:
-    """Speed of the nut [m/s]."""
+    """Return the speed of the nut [m/s] for a motor at ``place`` [m] with a ``speed`` [m/s]."""
     errors = table.errors
     pitch = errors.slope + errors.amplitude * table.wave * np.cos(table.wave * place + errors.phase)
     rising = (errors.heating * abs(speed) + errors.surroundings - rise) / errors.time

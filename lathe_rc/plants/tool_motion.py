@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of tool drives, sample by sample, in air or together with the chip that they cut; for kernels.
+"""Kernels of the motion of tool drives, sample by sample, in air or together with the chip that they cut.
 
 The equations are those of `lathe_rc.plants.tool_drive`.
 """
@@ -29,9 +29,9 @@ from lathe_rc.plants.electrodynamic import between_stops
 from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
 from lathe_rc.signals.noise import quantise
 
-_ROUNDS = 32  # at most, to find the carriage's position and the extension of the same sample
+_ROUNDS = 32  # maximum iterations for the carriage's position and the extension of the same sample
 _TURN = 2.0 * np.pi
-_TORN_OFF = DRAWN_IN + 1  # why the kernel stopped, beside the reasons of the cut
+_TORN_OFF = DRAWN_IN + 1  # reason why the kernel stopped, in addition to those of the cut
 
 
 @sized
@@ -39,9 +39,9 @@ class Weights(NamedTuple):
     """Weights of the motion in a sample.
 
     Attributes:
-        transition: of positions, velocities and, with a current loop, the current, shape (m, m).
-        coarse: of the command, or of the voltage, shape (m, 3).
-        fine, load: of the extension e and of the radial force, shape (m, 3).
+        transition: transition matrix of positions, velocities and, with a current loop, the current, shape (m, m).
+        coarse: weights of the command, or of the voltage, shape (m, 3).
+        fine, load: weights of the extension e and of the radial force, shape (m, 3).
     """
 
     transition: Array
@@ -51,26 +51,26 @@ class Weights(NamedTuple):
 
 
 class MotionTable(NamedTuple):
-    """A `lathe_rc.plants.tool_drive.ToolDrive` for kernels.
+    """Tool drives with their state, for kernels (see `lathe_rc.plants.tool_drive.ToolDrive`).
 
     Attributes:
         series: whether a piezo rides on the carriage.
         weights: see `Weights`.
-        tool: place of the tool's position.
-        delay, part: of the command [sample].
-        spring, damper, force_per_current: of the position loop.
+        tool: index of the tool's position in the state.
+        delay, part: delay of the command: whole samples and fraction [sample].
+        spring, damper, force_per_current: constants of the position loop.
         carriage_stroke: [m].
-        stack, memory, full_voltage: of the piezo.
-        feedback: whether the carriage's measured position is taken off the set point of the piezo.
+        stack, memory, full_voltage: constants, state and full voltage of the piezo.
+        feedback: whether the carriage's measured position is subtracted from the set point of the piezo.
         resolution: of the carriage's position sensor [m].
         stiff, loss: ω2², 2ζ2ω2.
-        tension: largest q before the stack is torn off its preload [m/s²]; inf for any.
+        tension: q at which the stack exceeds its preload [m/s²]; inf for no limit.
         radial: ρ.
-        coil: its current loop.
+        coil: current loop.
         state: shape (m,).
         before: e [m] and radial force [N] of the last sample.
-        reading: of the carriage's sensor in the last sample [m], shape (1,).
-        line: a ring of past commands: sample n stands at n modulo its length.
+        reading: reading of the carriage's sensor in the last sample [m], shape (1,).
+        line: ring of past commands: sample n is at index n modulo its length.
     """
 
     series: bool
@@ -100,7 +100,7 @@ class MotionTable(NamedTuple):
 
 @inlined
 def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
-    """Fill the motion without extension and force of sample ``n``; returns the delayed command [m]."""
+    """Fill the motion of sample ``n`` without extension and force; return the delayed command [m]."""
     line, weights, state = drive.line, drive.weights, drive.state
     transition, coarse, fine, load = weights.transition, weights.coarse, weights.fine, weights.load
     size, delay, part = line.size, drive.delay, drive.part
@@ -110,11 +110,11 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     if drive.coil.on:
         wanted = (1.0 - part) * u1 + part * u2
         asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
-        # The voltage stands through the step: its whole effect is that of one weight.
+        # The voltage is held through the step: its whole effect is that of one weight.
         d0, d1, d2 = applied(drive.coil, n, asked, state[state.size - 1]), 0.0, 0.0
-    order = transition.shape[0]  # known to the compiler, as that of `free` is not
+    order = transition.shape[0]  # known to the compiler, unlike the size of `free`
     for i in range(order):
-        # In the order of the drives that feel no force, for the same bits.
+        # In the order of operations of drives without force, for bit-identical results.
         free[i] = 0.0
         if drive.series:
             free[i] = coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2 + fine[i, 1] * drive.before[0]
@@ -128,7 +128,7 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
 
 @inlined
 def _carriage(drive: MotionTable, free: Array, e: float, pushes: float) -> float:
-    """Position of the carriage [m] with an extension and a radial force, between its end stops."""
+    """Return the position of the carriage [m] for an extension and a radial force, limited by its end stops."""
     stroke = drive.carriage_stroke
     return float(min(max(free[0] + drive.weights.fine[0, 0] * e + drive.weights.load[0, 0] * pushes, -stroke), stroke))
 
@@ -137,11 +137,14 @@ def _carriage(drive: MotionTable, free: Array, e: float, pushes: float) -> float
 def _chip(
     drive: MotionTable, cut: CutTable, free: Array, e: float, here: tuple[float, ...], stiffness: float, c: float
 ) -> float:
-    """Depth of cut with an extension, see `chip_of`; ``here``: place, angle, cross position, met form, allowance."""
+    """Return the depth of cut [m] for an extension (see `chip_of`).
+
+    ``here``: place, angle, cross position, met form, allowance.
+    """
     place, angle, cross_position, met, allowance = here
     kept, tool = drive.radial * held(cut), drive.tool
     displacement = free[tool] + drive.weights.fine[tool, 0] * e + drive.weights.load[tool, 0] * kept
-    if drive.series:  # in the rounding of two states that are added
+    if drive.series:  # in the rounding of the sum of two states
         x1 = _carriage(drive, free, e, kept)
         displacement = x1 + (displacement - x1)
     give = drive.radial * drive.weights.load[tool, 0]
@@ -150,7 +153,7 @@ def _chip(
         x1 = free[0] + drive.weights.load[0, 0] * (
             kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0)
         )
-        if abs(x1) > drive.carriage_stroke:  # an end stop holds it, and it does not give way
+        if abs(x1) > drive.carriage_stroke:  # an end stop holds the carriage, without compliance
             x1 = drive.carriage_stroke if x1 > 0.0 else -drive.carriage_stroke
             chip = chip_of(cut, place, angle, cross_position, x1 - met, allowance, stiffness, c, 0.0, 0.0)
     return chip
@@ -168,9 +171,10 @@ def _solve(
     stiffness: float,
     c: float,
 ) -> tuple[float, float]:
-    """Extension [m] and depth of cut [m] of a sample, in air without one; with feedback they are found by iteration.
+    """Solve for the extension [m] and the depth of cut [m] of a sample; in air the depth is 0.
 
-    The extension then needs the carriage's position of this sample and moves it by a thousandth of itself.
+    With feedback the solution is iterated, since the extension depends on the carriage's position of the same sample
+    and moves the carriage by a thousandth of itself.
     """
     memory, e, chip = drive.memory, 0.0, 0.0
     if not drive.feedback:
@@ -179,8 +183,8 @@ def _solve(
         if cut is not None:
             chip = _chip(drive, cut, free, e, here, stiffness, c)
         return e, chip
-    # Each round shrinks the error by the coupling within a sample, which `ToolDrive` keeps below a half; the last one
-    # changes no bit. The stack has a memory: a round begins from that of the sample before, not from its predecessor's.
+    # Each iteration shrinks the error by the coupling within a sample, which `ToolDrive` keeps below a half; the last
+    # one is bit-identical to the one before. Each iteration starts at the stack's state of the previous sample.
     x1 = _carriage(drive, free, drive.before[0], 0.0)
     for _ in range(_ROUNDS):
         guess = x1
@@ -200,19 +204,19 @@ def _solve(
 
 @inlined
 def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: float) -> None:
-    """Set the state of the drives at the end of a sample, by its extension and its radial force."""
+    """Update the state of the drives at the end of a sample, for a given extension and radial force."""
     state, fine, load = drive.state, drive.weights.fine, drive.weights.load
     for i in range(fine.shape[0]):
         state[i] = free[i] + fine[i, 0] * e + load[i, 0] * pushes
     drive.before[0], drive.before[1] = e, pushes
-    state[0], state[1] = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool swings on
+    state[0], state[1] = between_stops(state[0], state[1], drive.carriage_stroke)  # the tool keeps its own motion
     if not drive.feedback:
         drive.reading[0] = quantise(state[0] + noise, drive.resolution)
 
 
 @inlined
 def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, float, float, float, float]:
-    """Position, velocity, current and measured position of the carriage; extension, its velocity, voltage."""
+    """Return the carriage's position, velocity, current and reading; the piezo's extension, its velocity, voltage."""
     state, extension, rate, voltage = drive.state, 0.0, 0.0, 0.0
     current = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
     if drive.coil.on:
@@ -230,12 +234,13 @@ def advance(
     """Step drives in air through a block.
 
     Args:
-        drive: its state goes on; at rest at 0 before sample 0.
+        drive: drives; their state is updated; at rest at 0 before sample 0.
         first: index of the first sample.
-        command: set point of the carriage [m], shape (n,) as all that follow.
-        set_point: of the piezo, without what the feedback takes off [m].
+        command: set point of the carriage [m], shape (n,), as of all following arrays.
+        set_point: of the piezo, before direct compensation [m].
         noise: of the carriage's position sensor [m].
-        motion: filled: true position [m] and velocity [m/s] of the carriage, current of the coil [A], position as the
+        motion: output arrays: true position [m] and velocity [m/s] of the carriage, current of the coil [A], position
+            reading of the carriage's sensor [m]; extension of the piezo (tool relative to carriage) [m], its velocity
             carriage's sensor reads it [m]; extension of the piezo, the tool against the carriage [m], its velocity
             [m/s], voltage at the piezo [V].
     """
@@ -249,7 +254,7 @@ def advance(
         position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
 
 
-#: arrays of a block that `advance_loaded` takes, in its order
+#: input arrays of a block for `advance_loaded`, in its order
 GIVEN = (
     "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
 )  # fmt: skip
@@ -264,18 +269,18 @@ def advance_loaded(
     motion: tuple[Array, ...],
     of_cut: tuple[Array, ...],
 ) -> tuple[int, int]:
-    """Step drives and cut through a block, see `lathe_rc.plants.tool_drive.ToolDrive.block`.
+    """Step drives and cut through a block (implements `lathe_rc.plants.tool_drive.ToolDrive.block`).
 
     Args:
-        drive: see `advance`.
-        cut: what the tool cuts; its state goes on.
+        drive: drives, see `advance`.
+        cut: cutting process; its state is updated.
         first: index of the first sample.
-        given: see `GIVEN`.
-        motion: filled, see `advance`.
-        of_cut: filled, see `lathe_rc.plants.cutting.MADE`.
+        given: input arrays, see `GIVEN`.
+        motion: output arrays, see `advance`.
+        of_cut: output arrays, see `lathe_rc.plants.cutting.MADE`.
 
     Returns:
-        The sample where it stopped, and why.
+        Index of the sample where the kernel stopped, and the reason.
     """
     command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance = given
     position, velocity, current, measured, extension, rate, voltage = motion
@@ -308,7 +313,7 @@ def advance_loaded(
 
 
 def failure(reason: int, angle: float, speed: float, feed: float) -> LatheError:
-    """Return the error of drives and cut that cannot go on, see `lathe_rc.plants.chip.failure`."""
+    """Return the error for a failed motion or cut, see `lathe_rc.plants.chip.failure`."""
     if reason == _TORN_OFF:
         return LatheError(
             f"the tool's acceleration tears the stack off its preload at {angle:.6g} rad; allowed: more preload, or a "

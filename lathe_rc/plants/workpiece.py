@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part's effect on the cut: keyways, hard spots, compliance along it."""
+"""Properties of the part that affect the cut: keyways, hard spots, compliance along the part."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
@@ -16,12 +16,12 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class HardSpot:
-    """Place in the part where the force is multiplied.
+    """Region of the part where the cutting force is multiplied by a factor.
 
     Attributes:
         start, width: angular window [rad].
-        bottom, top: its heights along the part [m].
-        factor: of the force.
+        bottom, top: range of heights along the part [m].
+        factor: multiplier of the force.
     """
 
     start: float
@@ -39,12 +39,12 @@ class HardSpot:
 
 
 def spot_rows(spots: Sequence[HardSpot]) -> Array:
-    """Hard spots for `hardness`, shape (n, 5)."""
+    """Convert hard spots to an array for `hardness`, shape (n, 5)."""
     return np.array([astuple(spot) for spot in spots], dtype=np.float64).reshape(-1, 5)
 
 
 def _check_window(what: str, start: float, width: float) -> None:
-    """Refuse an angular window that is not a part of a revolution."""
+    """Check that an angular window is narrower than a revolution and not empty."""
     if not (np.isfinite(start) and 0.0 < width < _TURN):
         raise InputError(
             f"{what}: window at {start:g} rad of {width:g} rad; allowed: a width above 0 and below a revolution"
@@ -53,17 +53,17 @@ def _check_window(what: str, start: float, width: float) -> None:
 
 @dataclass(frozen=True)
 class Part:
-    """The part's effect on the cut.
+    """Properties of the part that affect the cut.
 
     Attributes:
-        radius: at which the cutting path is reckoned [m].
+        radius: of the part, for the length of the cutting path [m].
         gaps: angular windows without material (keyways): start and width of each [rad].
-        hard_spots: where spots overlap their factors multiply.
-        heights, compliances: c along the part [m, m/N], instead of that of the elasticity, linear between heights and
-            the same beyond the ends; ``None`` where it does not change. See `lathe_rc.analysis.shaft`.
+        hard_spots: the factors of overlapping spots multiply.
+        heights, compliances: c along the part [m, m/N], instead of that of the elasticity; linear between heights and
+            constant beyond the ends; ``None`` if it does not change. See `lathe_rc.analysis.shaft`.
 
     Raises:
-        InputError: a window or table that is none.
+        InputError: an invalid window or table.
     """
 
     radius: float = 0.05
@@ -89,14 +89,14 @@ class Part:
 
 @inlined
 def _within(angle: float, start: float, width: float) -> bool:
-    """Whether an angle lies in a window [rad]; windows may lie across the zero."""
+    """Check whether an angle is in a window [rad]; windows may extend across 0."""
     since = (angle - start) / _TURN
     return bool((since - np.floor(since)) * _TURN < width)
 
 
 @inlined
 def missing(gaps: Array, angle: float) -> bool:
-    """Whether there is no material at an angle [rad]."""
+    """Check whether there is no material at an angle [rad]."""
     found = False
     for i in range(gaps.shape[0]):
         found |= _within(angle, gaps[i, 0], gaps[i, 1])
@@ -105,7 +105,7 @@ def missing(gaps: Array, angle: float) -> bool:
 
 @inlined
 def hardness(spots: Array, angle: float, height: float) -> float:
-    """Factor of the force at an angle [rad] and a height [m], see `spot_rows`."""
+    """Return the force factor of the hard spots at an angle [rad] and a height [m], see `spot_rows`."""
     factor = 1.0
     for i in range(spots.shape[0]):
         if spots[i, 2] <= height <= spots[i, 3] and _within(angle, spots[i, 0], spots[i, 1]):
