@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part that a run has turned, as the workshop measures it."""
+"""Metrology of the turned part: form errors, roughness and tolerance from a recording of a run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,18 +21,18 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
 
 _CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
-_TOGETHER = 16  # revolutions that are looked at at once
+_TOGETHER = 16  # revolutions that are evaluated together
 
 
 def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
-    """Measure the part that a run has turned; see `lathe_rc.analysis.metrology.measure`.
+    """Measure the turned part of a run (see `lathe_rc.analysis.metrology.measure`).
 
     Args:
-        recording: of the run; with a tool.
+        recording: recording of the run, with an encoder and a tool.
         cutoff: of the filters for roundness and roughness [undulations per revolution].
 
     Raises:
-        InputError: it has no tool, or not one complete revolution.
+        InputError: the recording has no encoder or tool, or not one complete revolution.
     """
     if not {messages.TOOL, messages.ENCODER} <= set(recording.types.values()):
         raise InputError("nothing to measure: the recording has no encoder and tool; record both")
@@ -46,7 +46,7 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
 
 
 def tolerances(scenario: Scenario) -> dict[str, float]:
-    """Return the tolerance [m] by relative topic of each tool that has one."""
+    """Return the tolerance [m] of each tool that has one, by relative topic."""
     tools = [table for table in scenario.nodes.values() if isinstance(table, ToolParameters)]
     return {remapped(table, "tool"): table.tolerance for table in tools if table.tolerance}
 
@@ -61,22 +61,22 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
 
 
 def error_growth(recording: Recording) -> Growth | None:
-    """Return the growth of the form error of a run; see `lathe_rc.analysis.tolerance.growth`."""
+    """Return the growth of the form error of a run (see `lathe_rc.analysis.tolerance.growth`)."""
     return growth(recording.errors.largest, _turns_before(recording))
 
 
 def _turns_before(recording: Recording) -> int:
-    """Revolutions before the first of the form errors."""
+    """Return the number of revolutions before the first form error."""
     return recording.turns_before if recording.errors.rms.size else 0
 
 
 def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay:
-    """Measure the surface along the part that a run has turned; see `lathe_rc.analysis.metrology.lay`.
+    """Measure the surface along the turned part (see `lathe_rc.analysis.metrology.lay`).
 
     Args:
-        recording: of the run.
-        found: what `measured` has found in it.
-        nose_radius: of the tool in the plane of the feed [m].
+        recording: recording of the run.
+        found: measurement of the same recording by `measured`.
+        nose_radius: radius of the tool in the plane of the feed [m].
     """
     angle = recording.of_type(messages.ENCODER)["angle_true"]
     height = evenly(angle - 2.0 * np.pi * turns_before(angle), recording.of_type(messages.TOOL)["height"])
@@ -84,7 +84,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
 
 
 def along(found: Lay) -> dict[str, Any]:
-    """Figures of the surface along the part; lengths in µm, the feed in µm a revolution."""
+    """Return the figures of the surface along the part; lengths in µm, the feed in µm per revolution."""
     rt, ra = found.rt * 1e6, found.ra * 1e6
     return {
         "revolutions": found.revolutions,
@@ -97,7 +97,7 @@ def along(found: Lay) -> dict[str, Any]:
 
 
 def along_in_words(found: Lay) -> str:
-    """Figures of the surface along the part as a line of text."""
+    """Format the figures of the surface along the part as one line of text."""
     told = along(found)
     return (
         f"along the part, last {told['revolutions']} revolutions at {told['feed']:.4g} µm/rev: Ra {told['ra']:.3g} µm, "
@@ -106,9 +106,9 @@ def along_in_words(found: Lay) -> str:
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
-    """The figures of one revolution, counted from 0; lengths in µm."""
+    """Return the figures of one revolution, counted from 0; lengths in µm."""
     around, waves = found.roundness, found.undulations.amplitude[revolution]
-    largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its place
+    largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its eccentricity
 
     def um(values: np.ndarray) -> float:
         return float(values[revolution]) * 1e6
@@ -127,13 +127,13 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
 
 
 def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
-    """Topics of encoder and tool, the first of each; None where there is none."""
+    """Return the first topics of encoder and tool; None where there is none."""
     kinds = (messages.ENCODER, messages.TOOL)
     return [next((topic for topic, found in types.items() if found == kind), None) for kind in kinds]
 
 
 class ErrorsByRevolution:
-    """Form error by revolution of a run that comes in pieces; a sink of the engine and `lathe_rc.bag.reading.stream`.
+    """Form error by revolution of a run, chunk by chunk; a sink of the engine and `lathe_rc.bag.reading.stream`.
 
     Args:
         types: message type by fully qualified topic.
@@ -144,7 +144,7 @@ class ErrorsByRevolution:
         self._errors: RunningErrors | None = None
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a piece of the run, see `lathe_rc.cell.engine.Sink`."""
+        """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
         encoder, tool = self._topics
         if encoder is None or tool is None:
             return
@@ -155,12 +155,12 @@ class ErrorsByRevolution:
         self._errors.add(angle, error)
 
     def rms(self) -> np.ndarray:
-        """RMS form error of each complete revolution [m], shape (revolutions,), if the run ends here."""
+        """Return the RMS form error of each complete revolution so far [m], shape (revolutions,)."""
         return (self._errors or RunningErrors()).found().rms
 
 
 class FirstAndLast:
-    """The first and the last revolution of a run that comes in pieces, with some around them; a sink.
+    """First and last revolutions of a run, collected chunk by chunk with some around them; a sink of the engine.
 
     Args:
         types: message type by fully qualified topic; with an encoder and a tool.
@@ -176,7 +176,7 @@ class FirstAndLast:
         self._before = 0  # revolutions before the tail
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a piece of the run, see `lathe_rc.cell.engine.Sink`."""
+        """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
         named = {full(topic): signals for topic, signals in dense.items()}
         angle, error = named[self._encoder]["angle_true"], named[self._tool]["error"]
         piece = np.stack([angle, error])[:, that_count(angle, error)]
@@ -186,14 +186,14 @@ class FirstAndLast:
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)
         self._tail = np.concatenate([self._tail, piece], axis=1)
-        # Filters need the revolutions before the last one; older ones are dropped, so that memory does not grow.
+        # Filters need the revolutions before the last one; older ones are dropped to bound the memory.
         past = int(self._tail[0, -1] / (2.0 * np.pi)) - _TOGETHER
         if past > self._before:
             self._before = past
             self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
 
     def numbers(self) -> dict[str, Any] | None:
-        """Revolutions, and the figures of the first and the last; None if there is no complete one."""
+        """Return the number of revolutions and the figures of the first and the last; None without a complete one."""
         head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None
@@ -207,7 +207,7 @@ class FirstAndLast:
 
 
 def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:
-    """Write radius deviations as CSV, with the heights along the part if it was fed."""
+    """Write the radius deviations of revolutions as CSV, with the heights along the part if it was fed."""
     heights = None
     if len(revolutions) > 1:
         height = recording.of_type(messages.TOOL)["height"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear systems given by transfer functions: a rational function of p, stepped sample by sample.
 
-Blocks of any length give the same bits. Inner loops that hold other things than one linear system (a limit, a play)
-step a `System` themselves with `step`.
+Blocks of any length give bit-identical results. Inner loops with nonlinear elements (a limit, a play operator) step a
+`System` themselves with `step`.
 """
 
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ Hold = Literal["zoh", "foh", "tustin"]
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """numerator(p)/denominator(p).
+    """Proper rational transfer function numerator(p)/denominator(p).
 
     Attributes:
-        numerator, denominator: coefficients by falling powers of p, as numpy.polyval takes them.
+        numerator, denominator: coefficients by falling powers of p, as for numpy.polyval.
 
     Raises:
-        InputError: it is not proper, or a coefficient is not finite.
+        InputError: the function is not proper, or a coefficient is not finite.
     """
 
     numerator: tuple[float, ...]
@@ -50,11 +50,11 @@ class TransferFunction:
             )
 
     def __str__(self) -> str:
-        """Coefficients, falling powers of p."""
+        """Return the coefficients as a string, by falling powers of p."""
         return f"{list(map(float, self.numerator))}/{list(map(float, self.denominator))}"
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Response at ``frequency`` [rad/s], any shape."""
+        """Return the frequency response at ``frequency`` [rad/s], any shape."""
         p = 1j * np.asarray(frequency, dtype=np.float64)
         return np.asarray(np.polyval(self.numerator, p) / np.polyval(self.denominator, p))
 
@@ -64,7 +64,7 @@ class TransferFunction:
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)
 
     def __mul__(self, other: "TransferFunction") -> "TransferFunction":
-        """Both one after the other; nothing is cancelled."""
+        """Return the series connection of two transfer functions; poles and zeros are not cancelled."""
         return TransferFunction(
             tuple(np.polymul(self.numerator, other.numerator)), tuple(np.polymul(self.denominator, other.denominator))
         )
@@ -72,7 +72,9 @@ class TransferFunction:
 
 @sized
 class System(NamedTuple):
-    """x[n] = Φ·x[n-1] + g0·u[n-1] + g1·u[n], y[n] = c·x[n] + d·u[n].
+    """Difference equation of a linear system.
+
+    x[n] = Φ·x[n-1] + g0·u[n-1] + g1·u[n], y[n] = c·x[n] + d·u[n]
 
     Attributes:
         transition: Φ, shape (m, m).
@@ -90,9 +92,9 @@ class System(NamedTuple):
 
 @inlined
 def step(system: System, state: Array, command: float) -> float:
-    """The output after one more sample of the input.
+    """Step a linear system by one sample and return its output.
 
-    ``state`` is of shape (2m + 1,): x, then u[n-1], then room for the new x.
+    ``state`` has the shape (2m + 1,): x, then u[n-1], then space for the new x.
     """
     order = system.now.size
     previous = state[order]
@@ -116,16 +118,17 @@ def _block(system: System, state: Array, command: Array, output: Array) -> None:
 
 
 def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
-    """A balanced realisation x' = a·x + b·u, y = c·x + d·u, shapes (m, m), (m,), (m,): a companion matrix, scaled.
+    """Return a balanced realisation x' = a·x + b·u, y = c·x + d·u, shapes (m, m), (m,), (m,).
 
-    `scipy.signal` has it as tf2ss; to import that takes half as long as all else that a cell needs before its start.
+    The matrix a is a scaled companion matrix. `scipy.signal` provides this function as tf2ss, but its import takes half
+    as long as everything else before the start of a cell.
     """
     top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
     if bottom.size == 1 or not top.size:  # a gain alone
         return np.empty((0, 0)), np.empty(0), np.empty(0), float(top[0] / bottom[0]) if top.size else 0.0
     top = np.concatenate((np.zeros(bottom.size - top.size), top)) / bottom[0]
     bottom = bottom / bottom[0]
-    # Poles far apart make a companion matrix of coefficients that differ by many powers of ten.
+    # Poles far apart give a companion matrix whose coefficients differ by many powers of ten.
     companion = scipy.linalg.companion(bottom)
     a, (scale, _) = scipy.linalg.matrix_balance(companion, permute=False, separate=True)
     b: Array = np.eye(1, bottom.size - 1)[0] / scale
@@ -134,7 +137,7 @@ def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
 
 
 def hold_response(a: Array, b: Array, step_s: float) -> tuple[Array, Array, Array]:
-    """Φ of a step of x' = a·x + b·u, and what u = 1 adds to x in it, held, and as a ramp from 0 to 1; step in s."""
+    """Return Φ of a step of x' = a·x + b·u, and the response to a held u = 1 and to a ramp from 0 to 1; step in s."""
     order = a.shape[0]
     block = np.zeros((order + 2, order + 2))
     block[:order, :order], block[:order, order] = a, b
@@ -144,7 +147,7 @@ def hold_response(a: Array, b: Array, step_s: float) -> tuple[Array, Array, Arra
 
 
 def bilinear(a: Array, b: Array, step_s: float) -> tuple[Array, Array]:
-    """Φ of x' = a·x + b·u by the bilinear rule, and the weight of u at both ends of a step [s]."""
+    """Discretise x' = a·x + b·u by the bilinear rule: return Φ and the weight of u at both ends of a step [s]."""
     one = np.eye(a.shape[0])
     left = np.linalg.inv(one - a * step_s / 2.0)
     return left @ (one + a * step_s / 2.0), left @ b * (step_s / 2.0)
@@ -154,7 +157,7 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
     """Discretise a transfer function.
 
     Args:
-        transfer: of the continuous system.
+        transfer: transfer function of the continuous system.
         step_s: sampling step [s].
         hold: ``zoh``: exact for an input that is constant from sample to sample; ``foh``: exact for one that is
             linear between samples; ``tustin``: the bilinear rule.
@@ -176,15 +179,15 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
 
 
 def rest(system: System) -> Array:
-    """The state for `step` of a system that has rested at 0."""
+    """Return the state for `step` of a system at rest at 0."""
     return np.zeros(2 * system.now.size + 1)
 
 
 class LinearSystem:
-    """One linear system that remembers its state.
+    """Linear system with its state.
 
     Args:
-        transfer: of the continuous system.
+        transfer: transfer function of the continuous system.
         step_s: sampling step [s].
         hold: see `discretise`.
 
@@ -197,5 +200,5 @@ class LinearSystem:
         self._state = rest(self.system)
 
     def block(self, command: Array, output: Array) -> None:
-        """Step through a block, shape (n,) each; at rest at 0 before the first."""
+        """Step the system through a block, shape (n,) each; at rest at 0 before the first block."""
         _block(self.system, self._state, command, output)

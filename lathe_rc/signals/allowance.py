@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Allowance: distance of the blank's surface beyond its nominal place.
+"""Allowance: distance of the blank's surface beyond its nominal position.
 
     d(t) = w(t) + Σ a_i·sin(n_i·φ(t) + ψ_i)
 
-w is a slow random walk, the sum the run-out of the blank, which turns with the spindle: order 1 is eccentricity, the
-others are its form. Sources: paper 004, whose disturbance of the force is 4.83 N RMS; spec/feed-and-force.md, by which
-that is an allowance of 20.7 µm RMS at 233.3 N/mm.
+w is a slow random walk, the sum is the run-out of the blank, which turns with the spindle: order 1 is eccentricity, the
+higher orders are its form. Sources: paper 004, whose disturbance of the force is 4.83 N RMS; spec/feed-and-force.md,
+by which that is an allowance of 20.7 µm RMS at 233.3 N/mm.
 """
 
 from typing import NamedTuple
@@ -22,11 +22,11 @@ PAPER_RMS = 20.7e-6  #: [m]
 
 
 class Walk(NamedTuple):
-    """w[n] = keep·w[n-1] + kick·ξ[n], ξ normal with mean 0 and RMS 1.
+    """Constants of a random walk, w[n] = keep·w[n-1] + kick·ξ[n], with ξ normal of mean 0 and RMS 1.
 
     Attributes:
-        keep: 1 for a walk without bounds.
-        kick: [m].
+        keep: factor per sample, 1 for an unbounded walk.
+        kick: RMS of the increment [m].
         start: RMS of the first value [m].
     """
 
@@ -36,12 +36,12 @@ class Walk(NamedTuple):
 
 
 def mean_reverting(rms: float, correlation_time: float, step: float) -> Walk:
-    """A walk that is drawn back to 0, stationary from its first sample on (Ornstein-Uhlenbeck).
+    """Return a mean-reverting walk, stationary from its first sample (Ornstein-Uhlenbeck).
 
     Its autocorrelation is rms²·e^{-|t|/correlation_time}, at any sampling step.
 
     Args:
-        rms: [m].
+        rms: RMS of the walk [m].
         correlation_time: [s].
         step: sampling step [s].
 
@@ -61,7 +61,7 @@ def mean_reverting(rms: float, correlation_time: float, step: float) -> Walk:
 
 
 def unbounded(rate: float, step: float) -> Walk:
-    """A walk from 0 whose RMS after t seconds is rate·√t; ``rate`` in m/√s, ``step`` in s.
+    """Return a walk that starts at 0 with an RMS of rate·√t after t seconds; ``rate`` in m/√s, ``step`` in s.
 
     Raises:
         InputError: a negative rate.
@@ -72,12 +72,12 @@ def unbounded(rate: float, step: float) -> Walk:
 
 
 class AllowanceTable(NamedTuple):
-    """An `Allowance` for kernels.
+    """Random walk and run-out of the blank for kernels (see `Allowance`).
 
     Attributes:
-        walk: its constants.
+        walk: constants of the random walk.
         run_out: rows n_i, a_i, ψ_i, shape (3, m).
-        normal: what drives the walk.
+        normal: normal numbers for the walk.
         state: w, and whether there was a sample.
     """
 
@@ -89,13 +89,13 @@ class AllowanceTable(NamedTuple):
 
 @kernel
 def allow(made: AllowanceTable, angle: Array, allowance: Array) -> None:
-    """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,), and as many numbers drawn."""
+    """Fill ``allowance`` [m] at the true spindle ``angle`` [rad], both of shape (n,); uses n drawn numbers."""
     walk, run_out, state, place = made.walk, made.run_out, made.state, made.normal.used[0]
     made.normal.used[0] += angle.size
     w, begun = state[0], state[1]
     for k in range(angle.size):
         normal = made.normal.values[place + k]
-        # The first value has the RMS of the stationary walk, so that no run starts with a transient.
+        # The first value has the RMS of the stationary walk, so that a run starts without a transient.
         w = walk.keep * w + walk.kick * normal if begun else walk.start * normal
         begun = 1.0
         total = w
@@ -106,21 +106,21 @@ def allow(made: AllowanceTable, angle: Array, allowance: Array) -> None:
 
 
 class Allowance:
-    """Random walk and run-out.
+    """Allowance of the blank: random walk and run-out.
 
     Args:
         walk: see `mean_reverting` and `unbounded`.
-        order: n_i of the run-out, whole numbers from 1, shape (m,).
+        order: n_i of the run-out, integers from 1, shape (m,).
         amplitude: a_i [m], shape (m,).
         phase: ψ_i [rad], shape (m,).
         seed: the scenario's seed.
-        name: of the node; makes the walk its own.
+        name: name of the node; selects an independent random stream.
 
     Attributes:
-        table: for `allow`.
+        table: constants and state for `allow`.
 
     Raises:
-        InputError: arrays of different lengths, or an order that is no whole number from 1.
+        InputError: arrays of different lengths, or an order that is not an integer from 1.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Allowance:
         self.table = AllowanceTable(walk, run_out, self._stream.drawn, np.zeros(2))
 
     def draw(self, samples: int) -> None:
-        """Draw the numbers of the next samples, up to 8192."""
+        """Draw the random numbers of the next samples, up to 8192."""
         self._stream.draw(samples)
 
     def block(self, angle: Array, allowance: Array) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the arrays that a scenario or a third-party class gives."""
+"""Checks of arrays from a scenario or a third-party class."""
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +10,11 @@ Array = npt.NDArray[np.float64]
 
 
 def stacked(what: str, **arrays: Array) -> Array:
-    """Stack arrays of one length, shape (m, n).
+    """Stack arrays of equal length, shape (m, n).
 
     Args:
         what: the subject of the message.
-        **arrays: by their names in the message; shape (n,).
+        **arrays: arrays by their names in the message; shape (n,).
 
     Raises:
         InputError: arrays of different lengths.
@@ -26,16 +26,16 @@ def stacked(what: str, **arrays: Array) -> Array:
 
 
 def real_numbers(call: str, result: object, argument: str, like: Array) -> Array:
-    """The result of a formula in plain Python, if it is a real number for each argument.
+    """Check that a formula in plain Python returns a real number for each argument, and return these numbers.
 
     Args:
-        call: of the formula, for the message.
-        result: shape (n,).
-        argument: plural of what the formula takes, for the message.
+        call: call of the formula, for the message.
+        result: return value of the formula, shape (n,).
+        argument: plural name of the argument, for the message.
         like: the arguments, shape (n,).
 
     Raises:
-        InputError: another shape or type; numbers that are not finite pass.
+        InputError: another shape or type; numbers that are not finite are accepted.
     """
     numbers = np.asarray(result)
     if numbers.shape != like.shape or numbers.dtype.kind not in "fiu":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of a real encoder: their sources, and the spindle angle at any time between two of them.
+"""Sources of encoder counts, and the spindle angle at any time between two readings.
 
-A reading is a time [ns] and the counter at that time. Between two readings the angle is linear.
+A reading is a time [ns] and the counter value at that time. Between two readings the angle is linear.
 """
 
 import os
@@ -21,44 +21,44 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.table import read_text
 
 Array = npt.NDArray[np.float64]
-Reading = tuple[int, int | float]  #: time [ns] and counter; a whole one as int, for a double has 53 bits
+Reading = tuple[int, int | float]  #: time [ns] and counter; an integer counter as int, since a double has 53 bits
 
 _READING = re.compile(r"\s*([-+]?[0-9.eE+-]+)\s*(?:[,;]|\s)\s*([-+]?[0-9.eE+-]+)\s*")
-_HEADERS = {"time_ns,counts": 1, "time_s,counts": 10**9}  # and nanoseconds in a unit of the first column
-_MOST_TIME = 2**63  # [ns]
-_MOST_COUNT = 2.0**64  # of any counter
+_HEADERS = {"time_ns,counts": 1, "time_s,counts": 10**9}  # header, and nanoseconds per unit of the first column
+_MOST_TIME = 2**63  # [ns], exclusive
+_MOST_COUNT = 2.0**64  # largest magnitude of a counter
 _LONGEST_LINE = 256
-_GOES_ON = 3600  # [s]
-_PIECE = 65536  # bytes that are read at once
+_GOES_ON = 3600  # [s] of extrapolation
+_PIECE = 65536  # bytes per read
 _BAUD = {int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r"B[1-9][0-9]+", name)}
-_IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # places in what termios gives
+_IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # indices in the list of termios.tcgetattr
 
 
 class Reader(ABC):
-    """Source of readings.
+    """Base of sources of encoder readings.
 
     Attributes:
-        ended: no more will come.
+        ended: whether the source has ended.
     """
 
     ended = False
 
     @abstractmethod
     def read(self) -> Iterator[Reading]:
-        """Yield the readings that have come since the last call, without waiting.
+        """Yield the readings that have arrived since the last call, without waiting.
 
         Raises:
-            LatheError: what has come is no reading, or the source has failed.
+            LatheError: the received data are no reading, or the source has failed.
         """
 
 
 def _count(text: str) -> int | float:
-    """Read a counter; an integer with more digits than any counter has becomes infinite, as a double."""
+    """Parse a counter value; an integer with more digits than any counter becomes infinite, as a double."""
     return int(text) if text.lstrip("+-").isdigit() and len(text) < _LONGEST_LINE else float(text)
 
 
 def _reading(text: str, unit: int, where: str) -> Reading:
-    """Read a time in a unit of so many nanoseconds and a counter; ``where`` they stand, for the message."""
+    """Parse a time, in units of ``unit`` nanoseconds, and a counter; ``where`` locates the text in error messages."""
     found = _READING.fullmatch(text)
     try:
         if found:
@@ -72,13 +72,13 @@ def _reading(text: str, unit: int, where: str) -> Reading:
 
 
 class CsvReader(Reader):
-    """All readings of a CSV file with the header ``time_ns,counts`` or ``time_s,counts``; lines with # are left out.
+    """Reader of a CSV file with the header ``time_ns,counts`` or ``time_s,counts``; ignores lines starting with #.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
-        InputError: the file cannot be read, or has another header; `read` names lines that are no readings.
+        InputError: the file cannot be read, or has another header; `read` raises it for malformed lines.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,15 +98,15 @@ class CsvReader(Reader):
 
 
 class LineReader(Reader):
-    """Readings as lines of text, a time in ns and a counter each, from a serial line, a pipe or any other file.
+    """Reader of lines of text, with a time in ns and a counter each, from a serial line, a pipe or any other file.
 
-    Empty lines, those with #, and a header are left out.
+    Empty lines, lines starting with #, and a header are ignored.
 
     Args:
-        stream: opened for bytes, without a buffer; its ``read`` gives None where nothing has come yet.
-        name: of the stream, for messages.
-        joins: whether the first line may lack its beginning, and is left out.
-        waits: whether it has not ended as long as nothing has come: nobody writes to a pipe yet.
+        stream: opened in binary mode, unbuffered; its ``read`` returns None if no data have arrived.
+        name: name of the stream, for messages.
+        joins: whether the first line may be incomplete, and is ignored.
+        waits: whether an empty read before the first data is no end of the stream, as in a pipe without a writer.
     """
 
     def __init__(self, stream: IO[bytes], name: str, *, joins: bool = False, waits: bool = False) -> None:
@@ -115,10 +115,10 @@ class LineReader(Reader):
 
     @classmethod
     def open(cls, path: Path, baud: int) -> "LineReader":
-        """Open a terminal, which gets its speed, a pipe or a file.
+        """Open a terminal, whose speed is set to ``baud``, a pipe or a file.
 
         Raises:
-            InputError: it cannot be opened, or has no such speed.
+            InputError: it cannot be opened, or does not support the speed.
         """
         try:
             number = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
@@ -135,12 +135,12 @@ class LineReader(Reader):
         self._stream.close()
 
     def read(self) -> Iterator[Reading]:
-        """Yield the readings of the lines that are complete."""
+        """Yield the readings of all complete lines."""
         while not self.ended:
             try:
                 data = self._stream.read(_PIECE)
             except OSError:
-                data = b""  # a terminal whose other end is closed fails instead of giving nothing
+                data = b""  # a terminal whose other end is closed raises an error instead of returning no data
             if data is None or (self._waits and not data):
                 return
             self.ended, self._waits = not data, False
@@ -159,32 +159,32 @@ class LineReader(Reader):
 
 
 def _make_raw(number: int, path: Path, baud: int) -> None:
-    """Set a terminal to raw bytes at a speed."""
+    """Set a terminal to raw mode and to a speed."""
     if baud not in _BAUD:
         raise InputError(f"{path}: {baud} baud; allowed: {', '.join(map(str, sorted(_BAUD)))}")
     state = termios.tcgetattr(number)
     state[_IFLAG] = state[_OFLAG] = state[_LFLAG] = 0
     state[_CFLAG] = termios.CS8 | termios.CREAD | termios.CLOCAL
     state[_ISPEED] = state[_OSPEED] = _BAUD[baud]
-    state[_CC][termios.VMIN], state[_CC][termios.VTIME] = 1, 0  # with 0, 0 nothing would look like the end
+    state[_CC][termios.VMIN], state[_CC][termios.VTIME] = 1, 0  # with 0, 0 a read without data would look like the end
     termios.tcsetattr(number, termios.TCSANOW, state)
 
 
 class CountedAngle:
-    """The spindle angle of a real encoder, sample by sample.
+    """Spindle angle at the sample times, interpolated from the readings of a real encoder.
 
-    Sample 0 is at the first reading. Whole revolutions that the counter has made before are left out.
+    Sample 0 is at the first reading. Whole revolutions counted before it are ignored.
 
     Args:
-        counts: in a revolution.
+        counts: counts per revolution.
         step_ns: sampling step [ns].
-        wraps: the counter begins anew after so many counts; 0: it does not.
-        inverted: it counts down while the spindle turns forward.
-        max_reverse: counts that it may go back by; the angle stands still meanwhile.
+        wraps: number of counts after which the counter restarts at 0; 0: never.
+        inverted: whether it counts down while the spindle turns forward.
+        max_reverse: largest backward motion [counts]; the angle is constant during it.
         max_gap: longest time between readings [s].
 
     Attributes:
-        late: readings that came after a younger one, and were left out.
+        late: number of ignored readings, which arrived after a more recent one.
     """
 
     def __init__(
@@ -195,31 +195,31 @@ class CountedAngle:
         self._start_ns = 0
         self._newest: Reading | None = None
         self._turned = self._highest = 0.0  # [count]
-        self._times: list[float] = []  # [ns] after sample 0, of readings that have been added since
+        self._times: list[float] = []  # [ns] after sample 0, of readings added since the last `_gather`
         self._angles: list[float] = []
-        self._time, self._angle = np.empty(0), np.empty(0)  # those before
+        self._time, self._angle = np.empty(0), np.empty(0)  # readings before them
         self.late = 0
 
     @property
     def time(self) -> float:
-        """Time of the newest reading after sample 0 [s]."""
+        """Time of the most recent reading after sample 0 [s]."""
         return 0.0 if self._newest is None else (self._newest[0] - self._start_ns) * 1e-9
 
     @property
     def angle(self) -> float:
-        """Angle at the newest reading [rad]."""
+        """Angle at the most recent reading [rad]."""
         return self._highest * 2.0 * np.pi / self._counts
 
     @property
     def available(self) -> int:
-        """Number of samples whose angle the readings give."""
+        """Number of samples for which the readings determine the angle."""
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
     def add(self, time_ns: int, count: float) -> None:
-        """Take a reading.
+        """Add a reading.
 
         Raises:
-            LatheError: the last one was too long ago, the counter has gone back, or the number is none of a counter.
+            LatheError: the last reading was too long ago, the counter has moved back too far, or the value is invalid.
         """
         if not abs(count) <= _MOST_COUNT:
             raise LatheError(f"counter of {count:.6g} at {time_ns} ns; allowed: finite numbers up to 2^64")
@@ -237,7 +237,7 @@ class CountedAngle:
                 f"no counts from {self.time:.9g} to {self.time + since * 1e-9:.9g} s, for {since * 1e-6:.4g} ms; "
                 f"allowed: up to max_gap = {self._max_gap_ns * 1e-6:.4g} ms"
             )
-        moved = count - self._newest[1]  # of integers, before anything is rounded
+        moved = count - self._newest[1]  # between integers, before any rounding
         if self._wraps:
             moved = ((2 * moved + self._wraps) % (2 * self._wraps) - self._wraps) / 2
         self._newest = time_ns, count
@@ -251,38 +251,38 @@ class CountedAngle:
         self._keep()
 
     def go_on(self, speed: float) -> None:
-        """Extrapolate the newest reading by an hour at ``speed`` [rad/s]."""
+        """Extrapolate the most recent reading by an hour at ``speed`` [rad/s]."""
         assert self._newest is not None, "a reading has come"
         self._newest = self._newest[0] + _GOES_ON * 10**9, self._newest[1]
         self._highest += speed * _GOES_ON * self._counts / (2.0 * np.pi)
         self._keep()
 
     def _keep(self) -> None:
-        """Store the newest reading; lists grow cheaply, and `_gather` makes arrays of them."""
+        """Append the most recent reading to the lists, which grow faster than the arrays made by `_gather`."""
         assert self._newest is not None, "a reading has come"
         self._times.append(float(self._newest[0] - self._start_ns))
         self._angles.append(self.angle)
 
     def _gather(self) -> None:
-        """Append the stored readings to the arrays."""
+        """Move the readings from the lists to the arrays."""
         if self._times:
             self._time, self._angle = np.append(self._time, self._times), np.append(self._angle, self._angles)
             self._times, self._angles = [], []
 
     def take(self, first: int, samples: int) -> Array:
-        """The angle [rad] of the samples ``first`` on, shape (n,), up to `available`; those before are forgotten."""
+        """Return angles [rad] of samples starting at ``first``, below `available`, shape (n,); drop old readings."""
         self._gather()
         at: Array = self._step_ns * np.arange(first, first + samples, dtype=np.float64)
         if not samples:
             return at
         begin = max(int(np.searchsorted(self._time, at[0], side="right")) - 1, 0)
         self._time, self._angle = self._time[begin:], self._angle[begin:]
-        # `np.interp` looks at all points that it gets: those of later samples may be a whole file.
+        # `np.interp` checks all given points, and those of later samples may be a whole file.
         end = int(np.searchsorted(self._time, at[-1])) + 1
         return np.interp(at, self._time[:end], self._angle[:end])
 
     def reached(self, angle: float) -> int | None:
-        """Return the first sample at which the angle [rad] is at least so large; None if there is none yet."""
+        """Return the first sample at which the angle [rad] is at least ``angle``; None if there is none yet."""
         self._gather()
         if not self._time.size or angle > self._angle[-1]:
             return None
@@ -293,6 +293,6 @@ class CountedAngle:
         at = np.interp(
             self._step_ns * np.arange(first, last + 1, dtype=np.float64), self._time[begin:end], self._angle[begin:end]
         )
-        # By the interpolation of `take`, sample by sample, so that both agree to the bit.
+        # With the interpolation of `take`, so that both give bit-identical results.
         found = first + int(np.searchsorted(at, angle))
         return found if found < self.available else None

@@ -15,24 +15,24 @@ _MOST = 2**22  # points of a tachogram
 
 
 class DeviationLaw(ABC):
-    """A law of the relative speed deviation; its constructor takes the numbers that a scenario gives it."""
+    """Base of laws of the relative speed deviation; the constructor takes the numbers given in the scenario."""
 
     @abstractmethod
     def deviation(self, time: Array) -> Array:
-        """Deviation relative to the nominal speed [1] at ``time`` [s] from sample 0 on, both of shape (n,)."""
+        """Return the deviation relative to the nominal speed [1] at ``time`` [s] after sample 0, both of shape (n,)."""
 
 
 def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> SpeedLaw:
-    """A law as a piecewise-linear tachogram, held after its end.
+    """Tabulate a deviation law as a piecewise-linear tachogram, held after its end.
 
     Args:
-        nominal: speed [rad/s].
-        law: of the deviation.
-        step: between its points [s].
-        end: of the tachogram [s], rounded up to a whole number of steps.
+        nominal: nominal speed [rad/s].
+        law: law of the deviation.
+        step: time between two points [s].
+        end: end of the tachogram [s], rounded up to a whole number of steps.
 
     Raises:
-        InputError: more points than allowed, or the law gives something else than a finite number for each time.
+        InputError: more points than allowed, or the law returns a value that is not a finite number.
     """
     points = int(np.ceil(end / step)) + 1
     if points > _MOST:

@@ -18,15 +18,15 @@ _PERFECT = EncoderErrors()
 
 
 class EncoderTable(NamedTuple):
-    """An `Encoder` for kernels.
+    """A spindle encoder with its state, for kernels (see `Encoder`).
 
     Attributes:
         step: sampling step [s].
-        nominal, lines, tachogram: of the speed law.
-        counts: per revolution; 0 for an ideal encoder.
-        errors: of its disc and signals.
-        history: the last angles, shape (speed_window,); sample n stands at n modulo its length.
-        revolution: of the last sample, shape (1,).
+        nominal, lines, tachogram: constants of the speed law.
+        counts: counts per revolution; 0 for an ideal encoder.
+        errors: errors of disc and signals.
+        history: the last angles, shape (speed_window,); sample n is at index n modulo its length.
+        revolution: revolution of the last sample, shape (1,).
     """
 
     step: float
@@ -41,20 +41,20 @@ class EncoderTable(NamedTuple):
 
 @kernel
 def encode(encoder: EncoderTable, first: int, samples: Fields) -> None:
-    """Fill the samples from index ``first`` on, see `Encoder.block`."""
+    """Fill the encoder signals of a block, starting at sample ``first`` (implements `Encoder.block`)."""
     follow_law(encoder, first, samples[3], samples[4])
     read_off(encoder, first, samples)
 
 
 @kernel
 def follow_law(encoder: EncoderTable, first: int, angle_true: Array, speed_true: Array) -> None:
-    """Fill true angle and speed of the samples from index ``first`` on by the speed law."""
+    """Fill true angle and speed of a block by the speed law, starting at sample ``first``."""
     evaluate_along(first, encoder.step, encoder.nominal, encoder.lines, encoder.tachogram, angle_true, speed_true)
 
 
 @kernel
 def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
-    """Fill measured angle, speed and index pulse from the true angle and speed, see `Encoder.block`."""
+    """Fill measured angle, speed and index pulse from the true angle and speed (see `Encoder.block`)."""
     angle, speed, index_pulse, angle_true, speed_true = samples
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
     before = revolution[0]
@@ -74,11 +74,11 @@ def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
         window = history.size
         place = first % window
         for k in range(angle.size):
-            # Whole revolutions apart, so that they are exact whatever the counts are.
+            # Whole revolutions separately, so that they are exact for any number of counts.
             count = np.floor(angle[k] * counts / _TURN)
             whole = np.floor(count / counts)
             angle[k] = whole * _TURN + (count - whole * counts) * _TURN / counts
-            # The oldest angle of the ring stands where the new one goes.
+            # The oldest angle of the ring is at the index of the new one.
             speed[k] = (angle[k] - history[place]) / (window * step)
             history[place] = angle[k]
             place = place + 1 if place + 1 < window else 0
@@ -88,19 +88,19 @@ def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
 
 
 class Encoder:
-    """An incremental encoder on a spindle that follows a speed law.
+    """Simulated incremental encoder on a spindle that follows a speed law.
 
     Args:
         law: spindle speed law.
         step: sampling step [s].
-        counts: counts per revolution after quadrature; 0 for an encoder that does not round: without errors its
-            angle and speed are true.
-        speed_window: samples over which the measured speed is a difference of the measured angle; it lags
-            by half of them. Before sample 0 the spindle is taken to have turned at its nominal speed.
-        errors: of its disc and signals; none by default.
+        counts: counts per revolution after quadrature; 0 for an encoder without quantisation, whose angle and speed are
+            the true ones if it has no errors.
+        speed_window: number of samples over which the measured speed is a difference of the measured angle; it lags
+            by half of them. Before sample 0 the spindle is assumed to have turned at its nominal speed.
+        errors: errors of disc and signals; none by default.
 
     Attributes:
-        table: for `encode`.
+        table: constants and state for `encode`.
     """
 
     def __init__(
@@ -115,10 +115,10 @@ class Encoder:
         self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, table, history, np.array([-1.0]))
 
     def block(self, first: int, *samples: npt.NDArray[Any]) -> None:
-        """Fill the samples from index ``first`` on.
+        """Fill the encoder signals of a block, starting at sample ``first``.
 
         Args:
-            first: see above.
+            first: index of the first sample.
             samples: measured angle and speed, index pulse, true angle and speed, shape (n,) each [rad, rad/s, 1, rad,
                 rad/s].
         """

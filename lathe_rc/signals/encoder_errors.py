@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of an encoder: its disc sits beside the axis, its signals are not a circle.
+"""Encoder errors: eccentricity of the disc, and offset, amplitude and phase errors of the signals.
 
     φ' = φ + e·sin(φ + ψ)                                       eccentricity, once a revolution
     x = cos(N·φ') + p,   y = (1 + g)·sin(N·φ' + a) + q          the two signals, N periods a revolution
-    seen = φ' + wrapped(atan2(y, x) - N·φ')/N - what that gives at φ = 0
+    seen = φ' + wrapped(atan2(y, x) - N·φ')/N - value of the same at φ = 0
 
-e is the disc's eccentricity over the radius of its track. Offsets p and q give an error of one wave in a signal period,
-amplitude √(p² + q²)/N; unlike amplitudes g and a phase a that is not 90° one of two waves, √(g² + a²)/(2N), all to
+e is the disc's eccentricity over the radius of its track. Offsets p and q cause an error with one wave in a signal
+period, of amplitude √(p² + q²)/N; unequal amplitudes g and a phase error a one of two waves, √(g² + a²)/(2N), all to
 first order. The index mark is on the disc, so the angle is 0 there.
 
 Source: P. L. M. Heydemann, Applied Optics 20 (1981) 3382 (the ellipse of two signals in quadrature).
@@ -21,7 +21,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 
 _TURN = 2.0 * np.pi
-_GREATEST = 0.5  # of the sum of a signal's errors, and of the eccentricity: the angle that is seen still rises
+_GREATEST = 0.5  # limit of the signals' errors and of the eccentricity, below which the reading is monotone
 
 
 class EncoderErrors(NamedTuple):
@@ -31,9 +31,9 @@ class EncoderErrors(NamedTuple):
         eccentricity: e [rad].
         phase: ψ [rad].
         periods: N, signal periods in a revolution.
-        cosine_offset, sine_offset: p and q, as parts of the amplitude.
-        mismatch: g, how much larger the sine is than the cosine, as a part of it.
-        skew: a [rad].
+        cosine_offset, sine_offset: p and q, relative to the amplitude.
+        mismatch: g, relative excess of the sine's amplitude over the cosine's.
+        skew: a, phase error [rad].
     """
 
     eccentricity: float = 0.0
@@ -45,10 +45,10 @@ class EncoderErrors(NamedTuple):
     skew: float = 0.0
 
     def check(self) -> None:
-        """Refuse errors of no encoder.
+        """Check that the errors are small enough for a monotone reading.
 
         Raises:
-            InputError: no signal period, or errors so large that the angle that is seen could fall.
+            InputError: no signal period, or errors so large that the reading could decrease with a rising angle.
         """
         if not self.periods >= 1:
             raise InputError(f"encoder: {self.periods} signal periods in a revolution; allowed: 1 or more")
@@ -63,12 +63,12 @@ class EncoderErrors(NamedTuple):
 
     @property
     def _signals(self) -> tuple[float, float, float, float]:
-        """Errors of the two signals."""
+        """Offsets, mismatch and skew of the two signals."""
         return self.cosine_offset, self.sine_offset, self.mismatch, self.skew
 
     @property
     def table(self) -> "ErrorsTable":
-        """For kernels; raises as `check`."""
+        """Table of the errors for kernels; raises the errors of `check`."""
         self.check()
         table = ErrorsTable(self, real=bool(self.eccentricity) or any(self._signals), zero=0.0)
         zero = np.zeros(1)
@@ -77,12 +77,12 @@ class EncoderErrors(NamedTuple):
 
 
 class ErrorsTable(NamedTuple):
-    """`EncoderErrors` for kernels.
+    """Encoder errors for kernels (see `EncoderErrors`).
 
     Attributes:
-        errors: of disc and signals.
-        real: whether there are any.
-        zero: what is seen at the angle 0, before it is set to 0 [rad].
+        errors: errors of disc and signals.
+        real: whether there are any errors.
+        zero: reading at the angle 0 before zeroing [rad].
     """
 
     errors: EncoderErrors
@@ -92,25 +92,25 @@ class ErrorsTable(NamedTuple):
 
 @inlined
 def _raw(errors: EncoderErrors, angle: float) -> float:
-    """The encoder's angle [rad], before it is set to 0 at the angle 0."""
+    """Return the encoder's angle [rad] before zeroing."""
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
     cosine, sine = np.cos(place), np.sin(place)
     x = cosine + errors.cosine_offset
     y = (1.0 + errors.mismatch) * np.sin(place + errors.skew) + errors.sine_offset
-    # The angle between the two signals and what they should be is small: it needs no counting of periods.
+    # The angle between the actual and the ideal signals is small: no periods have to be counted.
     return float(turned + np.arctan2(y * cosine - x * sine, x * cosine + y * sine) / errors.periods)
 
 
 @inlined
 def seen(table: ErrorsTable, angle: float) -> float:
-    """The encoder's reading of an angle [rad]."""
+    """Return the encoder's reading of an angle [rad]."""
     return _raw(table.errors, angle) - table.zero
 
 
 @inlined
 def rate(table: ErrorsTable, angle: float) -> float:
-    """Derivative of the reading with respect to the angle."""
+    """Return the derivative of the encoder's reading with respect to the angle."""
     errors = table.errors
     turned = angle + errors.eccentricity * np.sin(angle + errors.phase)
     place = errors.periods * turned
@@ -124,6 +124,6 @@ def rate(table: ErrorsTable, angle: float) -> float:
 
 @kernel
 def seen_along(table: ErrorsTable, angle: Array, found: Array) -> None:
-    """Fill the encoder's readings of angles, shape (n,)."""
+    """Fill ``found`` with the encoder's readings of angles [rad], shape (n,)."""
     for k in range(angle.size):
         found[k] = seen(table, angle[k])

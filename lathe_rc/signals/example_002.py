@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The example of paper 002: reference and disturbance of its drive.
+"""Example of paper 002: reference and disturbance of its drive.
 
     r(t) = 1.1 - 0.1·e^{-t} - |cos 0.04πt|³      (17)
     f(t) = 0.5·(sin 0.04πt)²                     (18)
 
-Both have the period of 25 s but for the term that decays.
+Both have a period of 25 s, except for the decaying term.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ OMEGA = 0.04 * np.pi  #: [rad/s]
 
 @kernel
 def fill_reference(first: int, step: float, reference: Array) -> None:
-    """Eq. 17 from sample ``first`` on, shape (n,); ``step`` in s."""
+    """Fill the reference of eq. 17, starting at sample ``first``, shape (n,); ``step`` in s."""
     for k in range(reference.size):
         time = (first + k) * step
         reference[k] = 1.1 - 0.1 * np.exp(-time) - np.abs(np.cos(OMEGA * time)) ** 3
@@ -26,6 +26,6 @@ def fill_reference(first: int, step: float, reference: Array) -> None:
 
 @kernel
 def fill_disturbance(first: int, step: float, amplitude: float, disturbance: Array) -> None:
-    """Eq. 18, with ``amplitude`` for 0.5, from sample ``first`` on, shape (n,); ``step`` in s."""
+    """Fill the disturbance of eq. 18, with ``amplitude`` for 0.5, starting at sample ``first``; ``step`` in s."""
     for k in range(disturbance.size):
         disturbance[k] = amplitude * np.sin(OMEGA * ((first + k) * step)) ** 2

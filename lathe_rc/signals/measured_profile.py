@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A part profile from measured points, and the CSV file that it is read from."""
+"""Part profile from measured points, read from a CSV file."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,20 +16,20 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
-_FLATTEST = 0.01  # [µm] peak to valley: no lathe turns a flatter form
-_MILLIMETRES = 2.0  # [µm] a form with less is perhaps in mm: few forms have 2 mm
-_METRES = 0.1  # [mm] heights over less are perhaps in m
-_WIDE, _WIDER = 3.0, 15.0  # of the median step, and [°]: more than both between two angles is a gap
-_WIDEST = 120.0  # [°] a gap wider than that is no form
-_SAME = 1e-3  # [µm] that the radius at 360° may be off the one at 0°
-_FARTHEST = 10_000.0  # [µm] that all of a form may be away from the middle
-_TURN_OF_RADIANS = 6.3  # [°] a column that spans no more is in another unit
-_CLOSEST = 1e-6  # [°, mm] between two points: closer ones are a slip, and their slope overflows
+_FLATTEST = 0.01  # [µm] smallest height from peak to valley, except 0: no lathe turns a flatter form
+_MILLIMETRES = 2.0  # [µm] a smaller form may be in mm: few forms have 2 mm
+_METRES = 0.1  # [mm] a smaller range of heights may be in m
+_WIDE, _WIDER = 3.0, 15.0  # times the median step, and [°]: a gap is wider than both
+_WIDEST = 120.0  # [°] widest gap of a valid form
+_SAME = 1e-3  # [µm] tolerance between the radius at 360° and at 0°
+_FARTHEST = 10_000.0  # [µm] largest offset of a whole form from the mean radius
+_TURN_OF_RADIANS = 6.3  # [°] a column with a smaller range is in another unit
+_CLOSEST = 1e-6  # [°, mm] smallest distance of two points: closer ones are errors, and their slope overflows
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A profile from points: a periodic cubic spline through each row, linear between rows.
+    """Profile through measured points: a periodic cubic spline through each row, linear between rows.
 
     Args:
         angle: increasing angles [rad] in [0, 2π), shape (n,).
@@ -42,7 +42,7 @@ class Measured:
     radius: Array
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Radius deviation [m] on the spline through the points, see `lathe_rc.signals.profile.Profile`."""
+        """Return the radius deviation [m] on the spline through the points (implements `Profile.deviation`)."""
         rows = [np.interp(height, self.heights, column) for column in self.radius.T]
         closed = np.append(rows, rows[0])
         spline = scipy.interpolate.CubicSpline(np.append(self.angle, self.angle[0] + _TURN), closed, bc_type="periodic")
@@ -50,7 +50,7 @@ class Measured:
 
 
 def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
-    """Refuse places that are nearly the same."""
+    """Check that no two positions are nearly the same."""
     near = np.flatnonzero(np.diff(places) < _CLOSEST)
     if near.size:
         a, b = places[near[0]], places[near[0] + 1]
@@ -60,7 +60,7 @@ def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
 
 
 def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
-    """Refuse columns that are most likely in another unit than their names say."""
+    """Check that the columns are not in another unit than their names state."""
     low, high = angle_deg[0], angle_deg[-1]
     if high - low <= _TURN_OF_RADIANS:
         unit = "radians" if high > 1.0 else "revolutions"
@@ -83,17 +83,17 @@ def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
 
 
 def _gap(angle_deg: Array) -> tuple[float, float, float]:
-    """Start and width of the widest step between two angles of a turn, and the median step [°]."""
+    """Return start and width of the widest step between two angles of a revolution, and the median step [°]."""
     steps = np.diff(np.append(angle_deg, angle_deg[0] + 360.0))
     place = int(np.argmax(steps))
     return float(angle_deg[place]), float(steps[place]), float(np.median(steps))
 
 
 def _closed(path: Path, rows: Array) -> Array:
-    """Move the points at 360° to 0°, or leave them out where 0° has the same.
+    """Move the points at 360° to 0°, or drop them if 0° has the same value.
 
     Raises:
-        InputError: the two differ.
+        InputError: the values at 0° and 360° differ.
     """
     start = {height: radius for angle, height, radius in rows.tolist() if angle == 0.0}
     kept = []
@@ -111,7 +111,7 @@ def _closed(path: Path, rows: Array) -> Array:
 
 
 def doubts(form: Measured) -> list[str]:
-    """List doubts about a possible form, one line each: a gap in its angles, values as in another unit."""
+    """List suspicious properties of a form, one line each: a gap in its angles, values as if in another unit."""
     said = []
     start, width, median = _gap(np.rad2deg(form.angle))
     if width > max(_WIDE * median, _WIDER):
@@ -134,19 +134,19 @@ def doubts(form: Measured) -> list[str]:
 def read_csv(path: Path) -> Measured:
     """Read a profile from a CSV file.
 
-    Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], in any
-    order of rows. Every height must have the same angles. A row at 360° may repeat the one at 0°.
+    Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], with rows in any
+    order. Every height must have the same angles. A row at 360° may repeat the row at 0°.
 
     Raises:
-        InputError: the file is missing, malformed, in other units, holds a number that is not finite, repeats an
-            angle, or covers a part of the turn.
+        InputError: the file is missing, malformed, in other units, contains a number that is not finite, repeats an
+            angle, or covers only part of a revolution.
     """
     return _measured(read_text(path, "profile"), path)
 
 
 @lru_cache(maxsize=8)
 def _measured(text: str, path: Path) -> Measured:
-    """Return the profile in a text; cached, since it takes longer to make than some cells run, and never changes."""
+    """Parse a profile from CSV text; cached, since parsing takes longer than some cells run and is deterministic."""
     header, rows = parse_table(text, path, _HEADERS)
     if not rows.size:
         raise InputError(f"{path}: no points; give at least three angles")

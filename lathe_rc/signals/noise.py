@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers of a run: noise and quantisation of sensors, lines of a random disturbance."""
+"""Random numbers of a run: sensor noise, quantisation, and the lines of random disturbances."""
 
 import zlib
 from collections.abc import Iterator
@@ -13,23 +13,23 @@ from lathe_rc.jit import inlined, kernel
 
 Integers = npt.NDArray[np.int64]
 
-DRAWN = 8192  #: numbers that a stream draws at a time, at most
+DRAWN = 8192  #: maximum count of numbers that a stream draws at once
 
 
 @inlined
 def quantise(value: float, resolution: float) -> float:
-    """A value as a converter or sensor of a ``resolution`` gives it, in the same unit; 0 for none."""
+    """Round a value to a ``resolution`` in the same unit, as a converter or sensor does; 0 for no rounding."""
     if resolution > 0.0:
         return float(np.rint(value / resolution) * resolution)
     return value
 
 
 class Drawn(NamedTuple):
-    """Normal numbers for kernels, mean 0 and RMS 1.
+    """Normal random numbers with mean 0 and RMS 1, for kernels.
 
     Attributes:
-        values: drawn in advance.
-        used: how many of them have been, shape (1,).
+        values: numbers drawn in advance.
+        used: how many of them have been used, shape (1,).
     """
 
     values: Array
@@ -37,15 +37,15 @@ class Drawn(NamedTuple):
 
 
 class NormalStream:
-    """A stream of normal numbers; the lengths in which it is drawn leave no trace.
+    """Stream of normal random numbers; the values do not depend on how many are drawn at a time.
 
     Args:
         seed: the scenario's seed.
-        name: makes the stream its owner's own.
-        on: without, nothing is ever drawn.
+        name: name of the owner; selects an independent stream.
+        on: whether numbers are drawn at all.
 
     Attributes:
-        drawn: for kernels, which take the next numbers from it.
+        drawn: numbers drawn in advance, for kernels.
     """
 
     def __init__(self, seed: int, name: str, *, on: bool = True) -> None:
@@ -55,17 +55,17 @@ class NormalStream:
         self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
 
     def draw(self, numbers: int) -> None:
-        """Have so many numbers in advance, up to 8192."""
+        """Ensure that the given count of numbers is drawn in advance, up to 8192."""
         values, used = self.drawn
         if values.size and used[0] + numbers > values.size:
-            # Unused numbers move to the front: the order of use is that of drawing, whatever the blocks.
+            # Unused numbers move to the front, so that the order of use is the order of drawing for any block length.
             left = values.size - used[0]
             values[:left] = values[used[0] :].copy()
             self._random.standard_normal(out=values[left:])
             used[0] = 0
 
     def draw_along(self, samples: int) -> Iterator[slice]:
-        """Pieces of a block of any length, each with its numbers drawn."""
+        """Yield slices of a block of any length, each after drawing the numbers for it."""
         for start in range(0, samples, DRAWN):
             piece = slice(start, min(start + DRAWN, samples))
             self.draw(piece.stop - start)
@@ -73,10 +73,11 @@ class NormalStream:
 
 
 def random_lines(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
-    """Amplitude, frequency [rad/s] and phase [rad] of sines with an RMS between two frequencies, shape (3, lines).
+    """Return amplitude, frequency [rad/s] and phase [rad] of random sines of a given RMS, shape (3, lines).
 
-    The lines are equal, one in each of as many equal parts of the band, with frequency and phase drawn from
-    ``random``: the sum repeats only after many periods and nears a normal distribution.
+    All lines have the same amplitude. The band from ``low`` to ``high`` is divided into as many equal sections, with
+    one line in each, whose frequency and phase are drawn from ``random``: the sum repeats only after many periods and
+    is nearly normally distributed.
     """
     frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
     phase = random.uniform(0.0, 2.0 * np.pi, lines)
@@ -84,10 +85,10 @@ def random_lines(rms: float, low: float, high: float, lines: int, random: np.ran
 
 
 class SensorTable(NamedTuple):
-    """A `Sensor` for kernels.
+    """Noise and resolution of a sensor for kernels (see `Sensor`).
 
     Attributes:
-        noise: for its noise.
+        noise: random numbers for the noise.
         rms: of the noise, in the unit of the signal.
         resolution: quantisation step, in the unit of the signal.
     """
@@ -99,7 +100,7 @@ class SensorTable(NamedTuple):
 
 @kernel
 def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
-    """Fill ``measured`` from ``true``; both of shape (n,), and as many numbers drawn if there is noise."""
+    """Fill ``measured`` from ``true``, both of shape (n,), with noise and rounding; noise uses n drawn numbers."""
     if sensor.rms > 0.0:
         noise, place = sensor.noise.values, sensor.noise.used[0]
         for k in range(true.size):
@@ -113,16 +114,16 @@ def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
 
 
 class Sensor:
-    """Adds white noise and rounds to a resolution; both off when 0.
+    """Sensor that adds white noise and rounds to a resolution; both are disabled by 0.
 
     Args:
         noise_rms: root mean square of the noise, in the unit of the signal.
         resolution: quantisation step, in the unit of the signal.
         seed: the scenario's seed.
-        name: who measures; makes the noise of each sensor its own.
+        name: name of the sensor; selects an independent noise.
 
     Attributes:
-        table: for `measure`.
+        table: constants and random numbers for `measure`.
     """
 
     def __init__(self, noise_rms: float, resolution: float, seed: int, name: str) -> None:
@@ -134,6 +135,6 @@ class Sensor:
         self._stream.draw(samples)
 
     def measure(self, true: Array, measured: Array) -> None:
-        """Fill ``measured`` from ``true``; both of shape (n,)."""
+        """Fill ``measured`` from ``true``, both of shape (n,), with noise and rounding."""
         for piece in self._stream.draw_along(true.size):
             measure(self.table, true[piece], measured[piece])

@@ -11,23 +11,23 @@ from lathe_rc.signals.profile import Array
 from lathe_rc.signals.profile_table import ProfileTable, tabulated
 
 _TURN = 2.0 * np.pi
-_CLOSED = 1e-9  # how far both ends of a revolution may be apart, by the largest deviation
+_CLOSED = 1e-9  # largest jump from 2π to 0, relative to the largest deviation
 
 
 class PartProfile(ABC):
-    """A desired form; its constructor takes the numbers that a scenario gives it.
+    """Base of desired forms; the constructor takes the numbers given in the scenario.
 
-    It is a `lathe_rc.signals.profile.Profile`, without heights of its own the same all along the part.
+    It implements `lathe_rc.signals.profile.Profile`; without heights of its own the form is constant along the part.
     """
 
     @property
     def heights(self) -> Array:
-        """Positions along the part [m], increasing, between which linear interpolation is good; shape (m,)."""
+        """Positions along the part [m], increasing, dense enough for linear interpolation; shape (m,)."""
         return np.zeros(1)
 
     @abstractmethod
     def deviation(self, angle: Array, height: float) -> Array:
-        """Radius deviation [m] at ``angle`` [rad] (shape (n,)) and ``height`` [m]; 2π-periodic, shape (n,)."""
+        """Return the radius deviation [m] at ``angle`` [rad] and ``height`` [m]; 2π-periodic, arrays of shape (n,)."""
 
 
 def checked(profile: PartProfile) -> ProfileTable:

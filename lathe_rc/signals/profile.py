@@ -15,19 +15,19 @@ Array = npt.NDArray[np.float64]
 
 
 class Profile(Protocol):
-    """A desired form."""
+    """Protocol of desired forms of a part."""
 
     @property
     def heights(self) -> Array:
-        """Positions along the part [m], increasing, between which linear interpolation is good; shape (m,)."""
+        """Positions along the part [m], increasing, dense enough for linear interpolation; shape (m,)."""
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Radius deviation [m] at ``angle`` [rad] (shape (n,)) and ``height`` [m]; 2π-periodic."""
+        """Return the radius deviation [m] at ``angle`` [rad] (shape (n,)) and ``height`` [m]; 2π-periodic."""
 
 
 @dataclass(frozen=True)
 class Harmonics:
-    """Sum of harmonics, Σ A_i·sin(i·φ + φ_i) (paper 000, eq. 5)."""
+    """Part form as a sum of harmonics, Σ A_i·sin(i·φ + φ_i) (paper 000, eq. 5)."""
 
     order: Array
     amplitude: Array
@@ -38,11 +38,11 @@ class Harmonics:
 
     @property
     def heights(self) -> Array:
-        """One height, since the form is the same all along the part."""
+        """Single height 0, since the form is constant along the part."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Radius deviation [m] of the sum, see `Profile`."""
+        """Return the radius deviation [m] of the sum of harmonics (implements `Profile.deviation`)."""
         waves = self.amplitude[:, None] * np.sin(np.outer(self.order, angle) + self.phase[:, None])
         return np.asarray(waves.sum(axis=0))
 
@@ -53,10 +53,10 @@ class Piston:
 
     Args:
         ovality: difference of the two diameters at the ends of the skirt [m].
-        ovality_middle: the same at the widest place [m].
-        barrel: radius lost at the ends of the skirt against the widest place [m].
+        ovality_middle: difference of the two diameters at the widest place [m].
+        barrel: decrease of the radius from the widest place to the farther end of the skirt [m].
         length: length of the skirt [m].
-        widest: widest place from the start of the skirt [m].
+        widest: position of the widest place, from the start of the skirt [m].
     """
 
     ovality: float
@@ -67,11 +67,11 @@ class Piston:
 
     @property
     def heights(self) -> Array:
-        """65 places along the skirt: linear interpolation between them errs by less than 3e-4 barrel."""
+        """65 positions along the skirt, where linear interpolation has an error of less than 3e-4 barrel."""
         return np.linspace(0.0, self.length, 65)
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """-barrel·z² - (ovality(z)/4)·(1 - cos 2φ), z = 0 at the widest place and 1 at the farther end."""
+        """Return -barrel·z² - (ovality(z)/4)·(1 - cos 2φ), with z = 0 at the widest place and 1 at the farther end."""
         z = (height - self.widest) / max(self.widest, self.length - self.widest)
         ovality = self.ovality_middle + (self.ovality - self.ovality_middle) * z * z
         return np.asarray(-self.barrel * z * z - ovality / 4.0 * (1.0 - np.cos(2.0 * angle)))
@@ -79,7 +79,7 @@ class Piston:
 
 @dataclass(frozen=True)
 class Polygon:
-    """Regular polygon with rounded corners, as the deviation from the middle between its circles.
+    """Regular polygon with rounded corners, as the deviation from the mean of its smallest and largest radius.
 
     Args:
         sides: number of sides, 3 or more.
@@ -102,14 +102,14 @@ class Polygon:
 
     @property
     def heights(self) -> Array:
-        """One height, since the part is a prism."""
+        """Single height 0, since the part is a prism."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Distance of the outline from the axis less the mean of its extremes; a side faces angle 0."""
+        """Return the radius of the outline less the mean of its extremes [m]; angle 0 is the middle of a side."""
         half = math.pi / self.sides
         from_side = np.abs(np.mod(angle + half, 2 * half) - half)
-        # The corner's circle touches the side where the normal through its centre meets it.
+        # The corner's circle touches the side at the foot of the normal through its centre.
         centre = (self.inscribed_radius - self.corner_radius) / math.cos(half)
         touch = math.atan2((self.inscribed_radius - self.corner_radius) * math.tan(half), self.inscribed_radius)
         from_corner = half - from_side

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A part profile as the cell runs it: a table, and what it asks of a drive.
+"""Part profiles tabulated for the control cell, and their demand on a drive.
 
 The table is a periodic cubic spline in the angle with linear interpolation along the part, which also gives the
-derivatives for the feasibility check. That of a file is kept on the disk beside the compiled code: to load SciPy's
-interpolation takes a sixth of the time in which `lathe run` reaches its first block, and it is only needed to make the
-table, the same one each time.
+derivatives for the feasibility check. The table of a profile file is cached on disk beside the compiled code: loading
+SciPy's interpolation takes a sixth of the time that `lathe run` needs until its first block, and is only required to
+compute the table, which is always the same.
 """
 
 import hashlib
@@ -25,14 +25,14 @@ from lathe_rc.jit import cache_folder, inlined, kernel, read_kept
 from lathe_rc.signals.measured_profile import Measured
 from lathe_rc.signals.profile import Profile
 
-_MOST = 32  # tables, the newest
+_MOST = 32  # maximum number of cached tables
 
 
 def kept(content: bytes, make: Callable[[], Array]) -> Array:
-    """Return the array that ``make`` makes of some content, from the disk where the same libraries have stored it.
+    """Return the array that ``make`` computes from ``content``, or a copy cached on disk by the same libraries.
 
-    Results are those of such a processor alone: libraries choose their instructions by it, and so the last bits. A
-    damaged file is reported and made anew; if the disk cannot be written, nothing is stored.
+    Results are valid for this type of processor only: the libraries select their instructions by it, which affects the
+    last bits. A damaged file is reported and computed again; if the disk cannot be written, nothing is cached.
     """
     made_by = f"{np.__version__} {scipy.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
     path = cache_folder() / "tables" / f"{hashlib.sha256(made_by + content).hexdigest()}.npy"
@@ -55,7 +55,7 @@ _TURN = 2.0 * np.pi
 
 @inlined
 def _height(feed: float, start: float, part: int, angle: float) -> float:
-    """Place along the part [m] at a spindle angle [rad], see `height_along`."""
+    """Return the position along the part [m] at a spindle angle [rad], see `height_along`."""
     turns = angle / _TURN
     if part > 0:
         turns -= part * np.floor(turns / part)
@@ -64,14 +64,14 @@ def _height(feed: float, start: float, part: int, angle: float) -> float:
 
 @kernel
 def height_along(feed: float, start: float, part: int, angle: Array, height: Array) -> None:
-    """Fill the place along the part [m] at a spindle angle [rad], shape (n,).
+    """Fill the position along the part [m] at spindle angles [rad], shape (n,).
 
     Args:
         feed: [m/rev].
-        start: where the part begins [m].
+        start: position where the part begins [m].
         part: revolutions after which the next part begins; 0 for one endless part.
-        angle: see above.
-        height: see above.
+        angle: spindle angles [rad].
+        height: output array [m].
     """
     for k in range(angle.size):
         height[k] = _height(feed, start, part, angle[k])
@@ -79,7 +79,7 @@ def height_along(feed: float, start: float, part: int, angle: Array, height: Arr
 
 @inlined
 def _cubic(row: Array, place: float) -> float:
-    """A row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
+    """Evaluate a row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
     whole = np.floor(place)
     # Unsigned, since Numba checks signed indices for negative ones.
     j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
@@ -89,7 +89,7 @@ def _cubic(row: Array, place: float) -> float:
 
 @inlined
 def _cubic_derivatives(c: Array, u: float) -> tuple[float, float, float]:
-    """A cubic, highest power first, and its first two derivatives at ``u``."""
+    """Evaluate a cubic polynomial, highest power first, and its first two derivatives at ``u``."""
     return (
         ((c[0] * u + c[1]) * u + c[2]) * u + c[3],
         (3.0 * c[0] * u + 2.0 * c[1]) * u + c[2],
@@ -99,7 +99,7 @@ def _cubic_derivatives(c: Array, u: float) -> tuple[float, float, float]:
 
 @kernel
 def deviation_along(heights: Array, table: Array, angle: Array, height: Array, deviation: Array) -> None:
-    """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from a `ProfileTable`.
+    """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from the arrays of a `ProfileTable`.
 
     Cubic in the angle, linear in the height, and beyond the ends of the part as at its ends.
     """
@@ -107,7 +107,7 @@ def deviation_along(heights: Array, table: Array, angle: Array, height: Array, d
     last = heights.size - 1
     row = start = 0
     while start < angle.size:
-        # Neighbours are mostly between the same two rows: take them together.
+        # Neighbouring samples are mostly between the same two rows, so they are processed together.
         while row > 0 and not height[start] >= heights[row]:
             row -= 1
         while row < last and height[start] >= heights[row + 1]:
@@ -137,7 +137,7 @@ def deviation_along(heights: Array, table: Array, angle: Array, height: Array, d
 def derivatives_at(
     heights: Array, table: Array, feed: float, start: float, part: int, angle: float
 ) -> tuple[float, float, float]:
-    """Radius deviation [m] at an angle [rad], and its first two derivatives over the angle along the tool's path.
+    """Return the radius deviation [m] at an angle [rad] and its first two derivatives along the tool's path.
 
     Args:
         heights: see `deviation_along`.
@@ -148,7 +148,7 @@ def derivatives_at(
         angle: [rad].
 
     Returns:
-        r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The slope along the part counts in the first derivative.
+        r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The first derivative includes the slope along the part.
     """
     height = _height(feed, start, part, angle)
     row, last = 0, heights.size - 1
@@ -173,7 +173,7 @@ def derivatives_at(
 
 @dataclass(frozen=True)
 class Demand:
-    """Demand of a profile on a drive at its worst place."""
+    """Demand of a profile on a drive, as the maximum over the part."""
 
     stroke: float  #: largest displacement from the middle [m]
     velocity: float  #: [m/s]
@@ -181,10 +181,10 @@ class Demand:
 
 
 class _ByContent:
-    """Profile that is equal to others of the same content, as the key of a cache.
+    """Cache key of a profile, equal for profiles of equal content.
 
     Args:
-        profile: what it stands for.
+        profile: the profile.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -200,28 +200,28 @@ class _ByContent:
 
 @lru_cache(maxsize=8)
 def _table(given: _ByContent) -> "ProfileTable":
-    """Return the table of a profile; that of a file is stored on the disk too."""
+    """Return the table of a profile; the table of a file is also cached on disk."""
     if isinstance(given.profile, Measured):  # a file: others vary with parameters, and a sweep would keep thousands
         return ProfileTable(given.profile, made=partial(kept, given.content))
     return ProfileTable(given.profile)
 
 
 def tabulated(profile: Profile) -> "ProfileTable":
-    """Return the table of a profile; equal profiles share one, which is read-only: to make it takes 20 ms and more."""
+    """Return the table of a profile, which equal profiles share; it is read-only and takes 20 ms or more to make."""
     return _table(_ByContent(profile))
 
 
 class ProfileTable:
-    """A profile as the cell runs it.
+    """Part profile as a table of cubic splines, for the control cell.
 
     Args:
-        profile: the form.
+        profile: desired form.
         points: intervals of the periodic cubic spline per revolution, a power of two.
-        made: gives what a function makes, which it may have from before; None: the function is called.
+        made: returns the array of a given function, possibly from a cache; None: the function is called.
 
     Attributes:
-        heights: [m], shape (m,).
-        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4); not to be written.
+        heights: positions along the part [m], shape (m,).
+        table: polynomial coefficients of each interval, highest power first, shape (m, points, 4); read-only.
     """
 
     def __init__(
@@ -233,12 +233,12 @@ class ProfileTable:
         self.table.flags.writeable = False
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
-        """The profile's demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], ``feed`` in m/rev."""
+        """Return the demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], with ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
 
 
 def _splines(profile: Profile, points: int) -> Array:
-    """Coefficients of the splines, see `ProfileTable.table`."""
+    """Return the coefficients of the splines of a profile (see `ProfileTable.table`)."""
     angle = np.linspace(0.0, _TURN, points + 1)
     table = np.empty((profile.heights.size, points, 4))
     for row, height in zip(table, profile.heights, strict=True):
@@ -251,7 +251,7 @@ def _splines(profile: Profile, points: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _demand(form: ProfileTable, speed: float, acceleration: float, feed: float) -> Demand:
-    """Return `ProfileTable.demand`; cached, since the checks of cells that are alike ask for the same."""
+    """Return the demand of a table (implements `ProfileTable.demand`), cached for the checks of similar cells."""
     per_radian = form.table.shape[1] / _TURN
     value, slope = form.table[..., 3], form.table[..., 2] * per_radian
     curvature = 2.0 * form.table[..., 1] * per_radian**2

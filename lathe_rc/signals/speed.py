@@ -4,7 +4,7 @@
 Every law is a closed form of time, so angle, speed and acceleration at sample n do not depend on the
 samples before it:
 
-    Ω(t) = Ω0·(1 + Σ a_i·sin(ω_i·(t − t_i) + ψ_i) + d(t)),   lines i only from t_i on,
+    Ω(t) = Ω0·(1 + Σ a_i·sin(ω_i·(t − t_i) + ψ_i) + d(t)),   line i starting at t_i,
 
 where d(t) is a piecewise-linear tachogram. A band-limited random deviation is a sum of such lines with
 seeded phases. Source: paper 000, eq. (11) and the deviation of its Fig. 6.
@@ -21,13 +21,13 @@ from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.checks import stacked
 from lathe_rc.signals.noise import random_lines
 
-_MOST_SAMPLES = 2**53  # that a double counts
+_MOST_SAMPLES = 2**53  # largest integer range of a double
 _PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], phase [rad], start [s]
 
 
 @inlined
 def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[float, float, float]:
-    """Angle [rad], speed [rad/s] and acceleration [rad/s²] at time ``t`` [s].
+    """Return angle [rad], speed [rad/s] and acceleration [rad/s²] at time ``t`` [s].
 
     ``lines`` is (4, n): relative amplitude, frequency, phase, start. ``tachogram`` is (3, m): time,
     relative deviation, its integral up to that time.
@@ -63,8 +63,8 @@ def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[
 def evaluate_along(
     first: int, step: float, nominal: float, lines: Array, tachogram: Array, angle: Array, speed: Array
 ) -> None:
-    """Fill angle [rad] and speed [rad/s] of the samples ``first`` on, shape (n,); see `evaluate`."""
-    if lines.shape[1] == 0 and tachogram.shape[1] == 0:  # the bits of `evaluate`, without its branches
+    """Fill angle [rad] and speed [rad/s], starting at sample ``first``, shape (n,); see `evaluate`."""
+    if lines.shape[1] == 0 and tachogram.shape[1] == 0:  # bit-identical to `evaluate`, without its branches
         for k in range(angle.size):
             angle[k] = nominal * ((first + k) * step)
             speed[k] = nominal
@@ -75,7 +75,7 @@ def evaluate_along(
 
 @kernel
 def _evaluate_many(t: Array, nominal: float, lines: Array, tachogram: Array) -> Array:
-    """Rows angle, speed and acceleration at times, shape (3, n)."""
+    """Return the rows angle [rad], speed [rad/s] and acceleration [rad/s²] at times [s], shape (3, n)."""
     out = np.empty((3, t.size))
     for n in range(t.size):
         out[0, n], out[1, n], out[2, n] = evaluate(t[n], nominal, lines, tachogram)
@@ -84,12 +84,12 @@ def _evaluate_many(t: Array, nominal: float, lines: Array, tachogram: Array) -> 
 
 @dataclass(frozen=True)
 class SpeedLaw:
-    """A spindle speed law.
+    """Spindle speed law: a nominal speed with harmonic and tabulated deviations.
 
     Args:
         nominal: nominal speed Ω0 [rad/s].
-        lines: (4, n) rows relative amplitude [1], frequency [rad/s], phase [rad], start [s].
-        tachogram: (3, m) rows time [s], relative deviation [1], its integral from time 0 [s].
+        lines: rows relative amplitude [1], frequency [rad/s], phase [rad], start [s], shape (4, n).
+        tachogram: rows time [s], relative deviation [1], its integral from time 0 [s], shape (3, m).
     """
 
     nominal: float
@@ -97,7 +97,7 @@ class SpeedLaw:
     tachogram: Array = field(default_factory=lambda: np.empty((3, 0)))
 
     def __add__(self, other: "SpeedLaw") -> "SpeedLaw":
-        """Sum of the deviations of two laws with the same nominal speed; at most one has a tachogram."""
+        """Add the deviations of two laws with the same nominal speed; at most one has a tachogram."""
         if self.nominal != other.nominal:
             raise InputError(f"speed laws of {self.nominal} and {other.nominal} rad/s cannot be added")
         if self.tachogram.size and other.tachogram.size:
@@ -106,7 +106,7 @@ class SpeedLaw:
         return SpeedLaw(self.nominal, lines, self.tachogram if self.tachogram.size else other.tachogram)
 
     def at(self, t: npt.ArrayLike) -> Array:
-        """Rows angle [rad], speed [rad/s], acceleration [rad/s²] at the times ``t`` [s], shape (3, n)."""
+        """Return the rows angle [rad], speed [rad/s], acceleration [rad/s²] at times ``t`` [s], shape (3, n)."""
         times = np.atleast_1d(np.asarray(t, dtype=np.float64))
         return _evaluate_many(times, self.nominal, self.lines, self.tachogram)
 
@@ -121,26 +121,26 @@ class SpeedLaw:
         if not lines.size or not points < 1e7:
             return bound
         times = np.linspace(0.0, duration, int(points) + 2)
-        # A line that starts at a phase makes the speed jump: look on both sides.
+        # A line that starts at a phase makes the speed jump: evaluate it on both sides.
         kinks = np.concatenate((tachogram[0], lines[3], np.nextafter(lines[3], 0.0)))
         speed = self.at(np.union1d(times, kinks[kinks < duration]))[1]
-        # Between two points a sum of lines leaves their chord by at most h²/8 of its second derivative.
+        # Between two points a sum of lines differs from their chord by at most h²/8 of its second derivative.
         sag = self.nominal * float(np.abs(lines[0] * lines[1] ** 2).sum()) * (times[1] - times[0]) ** 2 / 8
         return max(bound[0], speed.min() - sag), min(bound[1], speed.max() + sag)
 
     def largest_acceleration(self) -> float:
-        """Upper bound of the magnitude of dΩ/dt [rad/s²]."""
+        """Return an upper bound of the magnitude of dΩ/dt [rad/s²]."""
         bound = float(np.abs(self.lines[0] * self.lines[1]).sum())
         if self.tachogram.shape[1] > 1:
             bound += float(np.abs(np.diff(self.tachogram[1]) / np.diff(self.tachogram[0])).max())
         return self.nominal * bound
 
     def samples_until(self, angle: float, step: float) -> int:
-        """First sample index at which the true angle has reached ``angle`` [rad]; ``step`` in s.
+        """Return the first sample index at which the true angle reaches ``angle`` [rad]; ``step`` in s.
 
         Raises:
-            InputError: the spindle may stand still or turn back, so the angle may never be reached; or it takes so long
-                that samples could no longer be counted.
+            InputError: the spindle may stop or turn back, so the angle may never be reached; or the number of
+                samples is too large to be counted.
         """
         lowest = self.speed_range()[0]
         horizon = angle / lowest if lowest > 0.0 else 2.0 * angle / self.nominal
@@ -151,7 +151,7 @@ class SpeedLaw:
             raise InputError(f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)")
         if not horizon / step < _MOST_SAMPLES:
             raise InputError(f"that takes up to {horizon / step:.3g} samples; allowed: below {_MOST_SAMPLES}")
-        # The angle only rises up to the horizon, so that it can be searched by halves.
+        # The angle is increasing up to the horizon, so that bisection is possible.
         low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2
@@ -163,12 +163,12 @@ class SpeedLaw:
 
 
 def constant(nominal: float) -> SpeedLaw:
-    """Constant speed ``nominal`` [rad/s]."""
+    """Return a law of constant speed ``nominal`` [rad/s]."""
     return SpeedLaw(nominal)
 
 
 def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, start: float = 0.0) -> SpeedLaw:
-    """Harmonic deviations: relative ``amplitude`` [1], ``frequency`` [rad/s], ``phase`` [rad], from ``start`` [s].
+    """Return a law with harmonic deviations from ``start`` [s].
 
     All arrays have the shape (n,). Paper 000, Fig. 6: ΔΩ = 10.5·sin(ωd·t).
     """
@@ -179,7 +179,7 @@ def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, s
 
 
 def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
-    """Piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s], held before and after; shape (n,)."""
+    """Return a law with a piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s], held outside."""
     stacked("tachogram", times=time, deviations=deviation)
     if time.size and (time[0] < 0.0 or np.any(np.diff(time) <= 0.0)):
         raise InputError("tachogram: times must start at 0 s or later and increase; sort them and drop repeats")
@@ -191,7 +191,7 @@ def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
 
 
 def band_limited_random(nominal: float, rms: float, low: float, high: float, lines: int, seed: int) -> SpeedLaw:
-    """Random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
+    """Return a law with a random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
 
     Frequencies and phases of the ``lines`` are drawn from ``seed``, see `lathe_rc.signals.noise.random_lines`.
     """

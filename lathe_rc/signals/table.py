@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers in CSV files: one reader, so that every bad file is refused in the same way."""
+"""Tables of numbers in CSV files, with the same error messages for all readers."""
 
 import csv
 import errno
@@ -18,10 +18,10 @@ Array = npt.NDArray[np.float64]
 
 
 def read_text(path: Path, what: str) -> str:
-    """Return the text of a CSV file that holds ``what``.
+    """Return the text of a CSV file; ``what`` names the content in error messages.
 
     Raises:
-        InputError: the file is missing, far too large, or none of text.
+        InputError: the file is missing, far too large, or not a text file.
     """
     try:
         return files.contents(path).decode("utf-8-sig")
@@ -34,7 +34,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _number(text: str, path: Path, line: int) -> float:
-    """Read a finite number."""
+    """Parse a finite number."""
     try:
         number = float(text)
     except ValueError:
@@ -47,10 +47,10 @@ def _number(text: str, path: Path, line: int) -> float:
 def read_table(
     path: Path, headers: Sequence[Sequence[str]], what: str, *, since_first: bool = False
 ) -> tuple[list[str], Array]:
-    """Read a CSV file of numbers; see `parse_table`.
+    """Read a CSV file of numbers (see `parse_table`).
 
     Raises:
-        InputError: the file is missing, far too large, malformed, or holds a number that is not finite.
+        InputError: the file is missing, far too large, malformed, or contains a number that is not finite.
     """
     return parse_table(read_text(path, what), path, headers, since_first=since_first)
 
@@ -58,20 +58,20 @@ def read_table(
 def parse_table(
     text: str, path: Path, headers: Sequence[Sequence[str]], *, since_first: bool = False
 ) -> tuple[list[str], Array]:
-    """Read CSV with numbers; empty lines and those that start with # are left out.
+    """Parse CSV text with numbers; empty lines and lines starting with # are ignored.
 
     Args:
-        text: of the file.
-        path: of the file, for messages.
-        headers: the headers of which it must have one.
-        since_first: the first column is taken less its first value, before it is rounded to a double: seconds since
-            1970 leave a double 0.2 µs.
+        text: content of the file.
+        path: path of the file, for messages.
+        headers: allowed headers.
+        since_first: whether the first value of the first column is subtracted from the column before rounding to a
+            double: for seconds since 1970 a double has a resolution of 0.2 µs.
 
     Returns:
-        The header and the rows, shape (n, columns).
+        Header and rows, shape (n, columns).
 
     Raises:
-        InputError: the file is malformed, or holds a number that is not finite.
+        InputError: the file is malformed, or contains a number that is not finite.
     """
     rows: list[tuple[int, list[str]]] = []
     for n, line in enumerate(text.splitlines(), 1):
@@ -99,17 +99,17 @@ def parse_table(
 
 
 def write_table(path: Path, header: str, rows: Array, comment: str = "", *, digits: int = 15) -> None:
-    """Write a CSV file that `read_table` takes, whole or not at all.
+    """Write a CSV file atomically, in the format of `read_table`.
 
     Args:
-        path: of the file; an existing one is replaced.
-        header: names of the columns, with commas between.
+        path: path of the file; an existing file is replaced.
+        header: names of the columns, separated by commas.
         rows: shape (n, columns).
-        comment: a line at the top; empty: none.
-        digits: significant ones of a number.
+        comment: first line of the file; empty for none.
+        digits: significant digits of a number.
 
     Raises:
-        InputError: a place that cannot be written to.
+        InputError: the path is not writable.
     """
     if comment:
         header = f"# {' '.join(comment.split())}\n{header}"

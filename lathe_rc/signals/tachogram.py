@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tachograms: spindle speed over time as a CSV file with the columns time_s and rpm, linear between its rows.
+"""Tachogram files: spindle speed over time in CSV with the columns time_s and rpm, linear between the rows.
 
-Time 0 is at the first row, as that of counts is at the first reading: the clock of the file does not matter.
+Time 0 is at the first row, as that of counts is at the first reading: the absolute time of the file is ignored.
 """
 
 from pathlib import Path
@@ -16,16 +16,16 @@ Array = npt.NDArray[np.float64]
 
 _COLUMNS = ("time_s", "rpm")
 _UNITS = {"revolutions per second (Hz)": 60.0, "rad/s": 30.0 / np.pi, "degrees per second": 1.0 / 6.0}  # in rpm
-_NEAR = 1.2  # a typical speed that is this near to the nominal one in another unit, and so far off in rpm, is in that
-_ROOM = 1e-6  # share of the tolerance that is kept for the rounding of the file
-_FIRST_LOOK = 256  # points that are looked at together; twice as many after each look that finds no end
+_NEAR = 1.2  # largest ratio of the typical speed in another unit to the nominal speed at which that unit is suspected
+_ROOM = 1e-6  # share of the tolerance reserved for the rounding of the file
+_FIRST_LOOK = 256  # points that are checked together; doubled after each check without an end of the line
 
 
 def read(path: Path) -> tuple[Array, Array]:
-    """Return times after the first row [s] and speeds [1/min] of a file, shape (n,) each.
+    """Read times after the first row [s] and speeds [1/min] from a tachogram file, shape (n,) each.
 
     Raises:
-        InputError: the file is missing or malformed, times do not rise, or a speed is not above 0.
+        InputError: the file is missing or malformed, times do not increase, or a speed is not above 0.
     """
     _, rows = read_table(path, [_COLUMNS], "tachogram", since_first=True)
     time, rpm = rows[:, 0].copy(), rows[:, 1].copy()
@@ -49,15 +49,15 @@ def read(path: Path) -> tuple[Array, Array]:
 
 
 def check_unit(path: Path, rpm: Array, nominal_rpm: float) -> None:
-    """Refuse speeds that are most likely not in 1/min.
+    """Check that speeds are not in another unit than 1/min.
 
     Args:
-        path: of the file, for the message.
-        rpm: its speeds, shape (n,).
-        nominal_rpm: speed that they deviate from [1/min].
+        path: path of the file, for the message.
+        rpm: speeds of the file, shape (n,).
+        nominal_rpm: nominal speed [1/min].
 
     Raises:
-        InputError: the median is the nominal speed in another unit.
+        InputError: the median speed is close to the nominal speed in another unit.
     """
     typical = float(np.median(rpm))
     for unit, scale in _UNITS.items():
@@ -69,25 +69,25 @@ def check_unit(path: Path, rpm: Array, nominal_rpm: float) -> None:
 
 
 def write(path: Path, time: Array, rpm: Array, comment: str) -> None:
-    """Write a file that `read` takes.
+    """Write a tachogram file (see `read`).
 
     Args:
-        path: of the file; an existing one is replaced.
-        time: of its rows [s], shape (n,).
-        rpm: speed [1/min], shape (n,).
-        comment: a line at the top.
+        path: path of the file; an existing file is replaced.
+        time: times of the rows [s], shape (n,).
+        rpm: speeds [1/min], shape (n,).
+        comment: first line of the file.
 
     Raises:
-        InputError: a place that cannot be written to.
+        InputError: the path is not writable.
     """
     write_table(path, ",".join(_COLUMNS), np.stack((time, rpm), axis=1), comment)
 
 
 class Thinner:
-    """Picks points of a long record, piece by piece, between which straight lines stay near to all others.
+    """Downsample a long record, chunk by chunk, so that straight lines between the points stay within a tolerance.
 
-    From the point that was picked last it goes as far as one line can: the next is the last point that a line reaches
-    which passes all points in between within the tolerance.
+    Each line, starting at the last selected point, is as long as possible: the next selected point is the last one that
+    a line can reach while it passes all points in between within the tolerance.
 
     Args:
         tolerance: greatest distance of the lines from any point, in the unit of the values; above 0.
@@ -96,12 +96,12 @@ class Thinner:
     def __init__(self, tolerance: float) -> None:
         self._tolerance = tolerance * (1.0 - _ROOM)
         self._picked: list[tuple[float, float]] = []
-        self._reached: tuple[float, float] | None = None  # the last point that a line reaches from the picked one
-        self._time, self._value = np.empty(0), np.empty(0)  # after that, or after the picked one
+        self._reached: tuple[float, float] | None = None  # the last point that a line from the selected point can reach
+        self._time, self._value = np.empty(0), np.empty(0)  # points after that, or after the selected point
         self._open()
 
     def add(self, time: Array, value: Array) -> None:
-        """Take further points, shape (n,); their times rise."""
+        """Add further points with increasing times, shape (n,)."""
         self._time, self._value = np.append(self._time, time), np.append(self._value, value)
         if not self._picked and self._time.size:
             self._picked.append((float(self._time[0]), float(self._value[0])))
@@ -109,7 +109,7 @@ class Thinner:
         self._look()
 
     def finish(self) -> tuple[Array, Array]:
-        """Return times and values of the picked points, the first and the last point among them; shape (m,) each."""
+        """Return times and values of the selected points, including the first and the last point; shape (m,) each."""
         while self._reached is not None:
             self._pick()
             self._look()
@@ -117,22 +117,22 @@ class Thinner:
         return found[:, 0], found[:, 1]
 
     def _open(self) -> None:
-        """Allow any slope: no point after the picked one has been looked at yet."""
+        """Allow any slope, since no point after the selected one has been checked yet."""
         self._seen, self._low, self._high = 0, -np.inf, np.inf
 
     def _drop(self, count: int) -> None:
-        """Forget the first points after the picked or the reached one."""
+        """Drop the given number of points after the selected or the reachable one."""
         self._time, self._value = self._time[count:], self._value[count:]
 
     def _pick(self) -> None:
-        """Begin the next line at the last point that this one reaches."""
+        """Start the next line at the last reachable point."""
         assert self._reached is not None, "the first point after the picked one can be reached"
         self._picked.append(self._reached)
         self._reached = None
         self._open()
 
     def _look(self) -> None:
-        """Go through the points that have not been looked at, and pick one wherever no line passes all."""
+        """Check the remaining points, and select one wherever no line passes all of them."""
         count = _FIRST_LOOK
         while self._seen < self._time.size:
             time, value = self._time[self._seen :][:count], self._value[self._seen :][:count]
@@ -141,7 +141,7 @@ class Thinner:
             high = np.minimum(np.minimum.accumulate((rise + self._tolerance) / since), self._high)
             closed = np.flatnonzero(low > high)
             end = int(closed[0]) if closed.size else since.size
-            # A line to a point passes those before it if its slope is between the ``low`` and ``high`` of that point.
+            # A line to a point passes the earlier points if its slope is between ``low`` and ``high`` of that point.
             slope = rise[:end] / since[:end]
             fits = np.flatnonzero((low[:end] <= slope) & (slope <= high[:end]))
             self._seen += end

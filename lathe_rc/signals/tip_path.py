@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The path of a tool whose tip is round across the spindle axis, and the slope at which its flank would rub.
+"""Path of a tool with a tip that is round across the spindle axis, and the slope at which its flank would rub.
 
 A form of radius r = R + deviation falls or rises by the angle β, tan β = r'/r. A round tip of radius ρ touches it
-beside its foremost point, where both have the same normal. So its centre runs on the parallel curve of the form,
+beside its foremost point, where both have the same normal. So its centre follows the parallel curve of the form,
 
     centre at the polar angle  φ + atan2(-ρ·sin β, r + ρ·cos β),  radius  √((r + ρ·cos β)² + (ρ·sin β)²)
 
-and the path is that radius less R + ρ. A tip that follows the form itself cuts ρ·(1/cos β - 1) too deep, where ρ is
+and the path is that radius less R + ρ. A tip that follows the form itself cuts too deep by ρ·(1/cos β - 1), if ρ is
 small against the radius of curvature.
 
-The flank behind the edge leaves the cut surface by the clearance angle. The surface that has just been cut lies behind
-the edge too, and is higher where the form falls towards the edge: the flank rubs where tan β < -tan(clearance).
+The clearance angle is between the flank behind the edge and the cut surface. The fresh surface is behind the edge
+too, and is higher where the form falls towards the edge: the flank rubs where tan β < -tan(clearance).
 """
 
 import math
@@ -25,20 +25,20 @@ from lathe_rc.signals.profile import Profile
 from lathe_rc.signals.profile_table import ProfileTable
 
 _TURN = 2.0 * np.pi
-_POINTS = 8192  # of the form, between which its path is interpolated
+_POINTS = 8192  # points of the form, between which its path is interpolated
 
 
 @dataclass(frozen=True)
 class TipPath:
-    """Path of a round tip that turns a form; itself a `Profile`.
+    """Path of a round tip that turns a form (implements `Profile`).
 
     Attributes:
-        form: of the part.
-        radius: R, from which the form deviates [m].
-        tip: ρ [m].
+        form: form of the part.
+        radius: R, reference radius of the form [m].
+        tip: ρ, radius of the tip [m].
 
     Raises:
-        InputError: a radius that is not positive; `deviation`: the form has a hollow that the tip does not get into.
+        InputError: a radius that is not positive; in `deviation`: the form has a concavity too narrow for the tip.
     """
 
     form: Profile
@@ -53,18 +53,18 @@ class TipPath:
 
     @property
     def heights(self) -> Array:
-        """Heights of the form."""
+        """Heights of the form [m]."""
         return self.form.heights
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Displacement [m] of the tip's foremost point from R, see `Profile`."""
+        """Return the displacement [m] of the tip's foremost point from R (implements `Profile.deviation`)."""
         at = np.linspace(0.0, _TURN, _POINTS + 1)
         values = self.form.deviation(at, height)
         values[-1] = values[0]
         spline = scipy.interpolate.CubicSpline(at, self.radius + values, bc_type="periodic")
         r, slope, bend = spline(at), spline(at, 1), spline(at, 2)
         long = np.hypot(r, slope)
-        hollow = -(r * r + 2.0 * slope * slope - r * bend) / long**3  # curvature, above 0 where the tip has to get in
+        hollow = -(r * r + 2.0 * slope * slope - r * bend) / long**3  # curvature, positive in concavities
         if self.tip * hollow.max() >= 1.0:
             worst = int(np.argmax(hollow))
             raise InputError(
@@ -81,12 +81,12 @@ class TipPath:
 
 @dataclass(frozen=True)
 class Fall:
-    """Steepest fall of a form.
+    """Steepest fall of a form towards the edge.
 
     Attributes:
-        slope: -tan β, above 0 where it falls.
-        angle: [rad].
-        height: [m].
+        slope: -tan β, positive where the form falls.
+        angle: angle of the steepest fall [rad].
+        height: height of the steepest fall [m].
     """
 
     slope: float
@@ -95,7 +95,7 @@ class Fall:
 
     @property
     def clearance(self) -> float:
-        """Clearance angle that a tool needs here [rad]."""
+        """Clearance angle that a tool requires for this slope [rad]."""
         return math.atan(self.slope)
 
 

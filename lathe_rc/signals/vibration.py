@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vibration of the tool against the part.
+"""Vibration between tool and part.
 
 A closed form of time, so that sample n does not depend on the samples before it:
 
@@ -20,7 +20,7 @@ from lathe_rc.signals.noise import random_lines
 
 @kernel
 def evaluate(first: int, step: float, lines: Array, position: Array, velocity: Array) -> None:
-    """Fill displacement [m] and velocity [m/s] from sample ``first`` on, shape (n,); ``step`` in s.
+    """Fill displacement [m] and velocity [m/s] of a vibration, starting at sample ``first``, shape (n,); ``step`` in s.
 
     ``lines`` is (3, m): amplitude [m], frequency [rad/s], phase [rad].
     """
@@ -36,7 +36,7 @@ def evaluate(first: int, step: float, lines: Array, position: Array, velocity: A
 
 
 def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
-    """Lines of given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], each of shape (n,); (3, n).
+    """Return lines of given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], each (n,), as (3, n).
 
     Raises:
         InputError: arrays of different lengths.
@@ -45,10 +45,10 @@ def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
 
 
 def band_limited_random(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
-    """Random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s]: `random_lines`, none without an RMS.
+    """Return lines of a random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s], see `random_lines`.
 
     Raises:
-        InputError: a band that is none.
+        InputError: an invalid band.
     """
     if rms == 0.0:
         return np.empty((3, 0))
