@@ -133,7 +133,7 @@ def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
 
 
 class ErrorsByRevolution:
-    """Form error by revolution of a run, chunk by chunk; a sink of the engine and `lathe_rc.bag.reading.stream`.
+    """Form error of each revolution, chunk by chunk; a sink of the engine and of `lathe_rc.bag.reading.stream`.
 
     Args:
         types: message type by fully qualified topic.
@@ -160,7 +160,7 @@ class ErrorsByRevolution:
 
 
 class FirstAndLast:
-    """First and last revolutions of a run, collected chunk by chunk with some around them; a sink of the engine.
+    """Sink of the engine that collects the first and the last revolutions of a run, chunk by chunk.
 
     Args:
         types: message type by fully qualified topic; with an encoder and a tool.
@@ -193,7 +193,7 @@ class FirstAndLast:
             self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
 
     def numbers(self) -> dict[str, Any] | None:
-        """Return the number of revolutions and the figures of the first and the last; None without a complete one."""
+        """Return the number of revolutions and the figures of first and last; None without a complete revolution."""
         head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None

@@ -60,7 +60,7 @@ class TransferFunction:
 
     @property
     def poles(self) -> Complex:
-        """Poles [rad/s]."""
+        """Poles of the transfer function [rad/s]."""
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)
 
     def __mul__(self, other: "TransferFunction") -> "TransferFunction":
@@ -184,7 +184,7 @@ def rest(system: System) -> Array:
 
 
 class LinearSystem:
-    """Linear system with its state.
+    """Discretised linear system with its state.
 
     Args:
         transfer: transfer function of the continuous system.

@@ -161,7 +161,7 @@ def pressed_by(process: Process, speed: float, wear: float) -> float:
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """Return the conditions of the cut at ``place`` [grid point]: reason to stop, feed, K, and σ·c."""
+    """Return the conditions of the cut at ``place`` [grid point]: stop reason, feed, cutting stiffness K, and σ·c."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0

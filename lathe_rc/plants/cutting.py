@@ -181,7 +181,7 @@ class CuttingProcess:
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
-        """Shorten the edge [m] from its initial length, and add hard spots to those of the part; default: neither."""
+        """Shorten the edge [m] from its initial length, and add hard spots to those of the part; default: unchanged."""
         all_spots = np.concatenate((self._whole.spots, spot_rows(spots)))
         process = self._whole._replace(depth=self._whole.depth - shorter, spots=all_spots)
         self.table = self.table._replace(process=process)

@@ -54,7 +54,7 @@ class CoarseTable(NamedTuple):
 
 @kernel
 def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array) -> None:
-    """Step the drive through a block (implements `ElectrodynamicDrive.block`)."""
+    """Step an electrodynamic drive through a block (implements `ElectrodynamicDrive.block`)."""
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
     spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
     # Scalars in locals: the compiler cannot know that the output arrays do not overlap the matrices.
@@ -121,5 +121,8 @@ class ElectrodynamicDrive:
         )
 
     def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
-        """Step the drive through a block of shape (n,) [m, m, m/s, A]; at rest at 0 before the first block."""
+        """Step the drive through a block: fill position [m], velocity [m/s] and current [A] for a command [m].
+
+        All arrays have the shape (n,). The drive is at rest at 0 before the first block.
+        """
         advance(self.table, command, position, velocity, current)

@@ -13,7 +13,7 @@ command. The position of a sample does not depend on the command of the same sam
 
 The states are the position of the motor and its derivatives, so that a speed limit can be applied to them: a motor
 that would exceed its maximum speed stays at it without acceleration, as if its command were no larger than that speed
-requires. No windup has to decay when the command falls.
+requires. So there is no windup when the command falls.
 
 The limits of the command are limits of the requested motion, which is the steady state of the model for the command u:
 the speed k·u for a model that integrates, the position k·u for any other, with the gain k of the model.

@@ -297,7 +297,7 @@ class PrandtlIshlinskiiInverse(Hysteresis):
 
 
 class BoucWen(Hysteresis):
-    """Bouc-Wen with n = 1 in the form y = g·(u - h).
+    """Bouc-Wen hysteresis operator with n = 1 in the form y = g·(u - h).
 
     Args:
         a: A, initial slope of h; 0.33 with the others makes a loop of 13 %.

@@ -323,5 +323,8 @@ class PiezoDrive:
         return int(self.table.saturated[0])
 
     def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
-        """Step the drive through a block of shape (n,) [m, m, m/s, V]; at rest at 0 before the first block."""
+        """Step the drive through a block: fill position [m], velocity [m/s] and voltage [V] for a set point [m].
+
+        All arrays have the shape (n,). The drive is at rest at 0 before the first block.
+        """
         advance_fine(self.table, set_point, position, velocity, voltage)

@@ -23,7 +23,7 @@ _TURN = 2.0 * np.pi
 
 
 class Screw(NamedTuple):
-    """Errors of a feed screw.
+    """Errors of a feed screw: pitch, periodic error and thermal growth.
 
     Attributes:
         slope: s, relative pitch error [m/m].

@@ -44,7 +44,7 @@ class Belt:
 
 @dataclass(frozen=True)
 class SpeedLoop:
-    """PI control of the motor speed.
+    """PI control of the speed of the spindle motor.
 
     Attributes:
         bandwidth: Kp divided by the sum of both inertias [rad/s].
@@ -100,7 +100,7 @@ class SpindleTable(NamedTuple):
 
 @kernel
 def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: Array, torque: Array) -> tuple[int, int]:
-    """Apply the load to a block of the speed law (implements `LoadedSpindle.block`); return last index and reason."""
+    """Apply the load to a block of the speed law (implements `LoadedSpindle.block`); return stop index and reason."""
     state, loop, transition, step = spindle.state, spindle.loop, spindle.transition, spindle.step
     order, new = state.size, np.empty(state.size)
     for k in range(angle.size):
@@ -202,7 +202,7 @@ class LoadedSpindle:
             )
 
     def _largest_pole(self) -> float:
-        """Return the largest pole of the loop without its limit; δ is left out, since the loop does not control it."""
+        """Return the largest pole of the speed loop without its limit; δ is excluded, since it is uncontrolled."""
         table = self.table
         order = table.state.size
         row = np.zeros(order + 1)

@@ -58,7 +58,7 @@ _MOTION = ("position", "velocity", "current", "measured", "extension", "extensio
 
 @dataclass(frozen=True)
 class Piezo:
-    """Piezo drive on the carriage.
+    """Piezo drive on the carriage of an electrodynamic drive.
 
     Attributes:
         stack: amplifier and ceramics; its state becomes part of the drive.
@@ -225,7 +225,7 @@ class ToolDrive:
             _check_feedback(discretise(servo, extends[: 2 * masses], 0.0, step, method), piezo)
 
     def block(self, cut: CuttingProcess, first: int, given: Mapping[str, Array]) -> dict[str, Array]:
-        """Step drives and cut through a block, starting at sample ``first``; at rest at 0 before sample 0.
+        """Step tool drives and cut through a block, starting at sample ``first``; at rest at 0 before sample 0.
 
         Args:
             cut: cutting process; its state is updated.

@@ -36,7 +36,7 @@ _TORN_OFF = DRAWN_IN + 1  # reason why the kernel stopped, in addition to those 
 
 @sized
 class Weights(NamedTuple):
-    """Weights of the motion in a sample.
+    """Weights of state, command, extension and force in the motion of a sample.
 
     Attributes:
         transition: transition matrix of positions, velocities and, with a current loop, the current, shape (m, m).
@@ -231,7 +231,7 @@ def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, fl
 def advance(
     drive: MotionTable, first: int, command: Array, set_point: Array, noise: Array, motion: tuple[Array, ...]
 ) -> None:
-    """Step drives in air through a block.
+    """Step tool drives in air through a block.
 
     Args:
         drive: drives; their state is updated; at rest at 0 before sample 0.
@@ -269,7 +269,7 @@ def advance_loaded(
     motion: tuple[Array, ...],
     of_cut: tuple[Array, ...],
 ) -> tuple[int, int]:
-    """Step drives and cut through a block (implements `lathe_rc.plants.tool_drive.ToolDrive.block`).
+    """Step tool drives and cut through a block (implements `lathe_rc.plants.tool_drive.ToolDrive.block`).
 
     Args:
         drive: drives, see `advance`.

@@ -44,7 +44,7 @@ def spot_rows(spots: Sequence[HardSpot]) -> Array:
 
 
 def _check_window(what: str, start: float, width: float) -> None:
-    """Check that an angular window is narrower than a revolution and not empty."""
+    """Check that an angular window has a width above 0 and below a revolution."""
     if not (np.isfinite(start) and 0.0 < width < _TURN):
         raise InputError(
             f"{what}: window at {start:g} rad of {width:g} rad; allowed: a width above 0 and below a revolution"

@@ -134,7 +134,7 @@ class Allowance:
         self.table = AllowanceTable(walk, run_out, self._stream.drawn, np.zeros(2))
 
     def draw(self, samples: int) -> None:
-        """Draw the random numbers of the next samples, up to 8192."""
+        """Draw the random numbers for the next ``samples`` samples, up to 8192."""
         self._stream.draw(samples)
 
     def block(self, angle: Array, allowance: Array) -> None:

@@ -35,7 +35,7 @@ def real_numbers(call: str, result: object, argument: str, like: Array) -> Array
         like: the arguments, shape (n,).
 
     Raises:
-        InputError: another shape or type; numbers that are not finite are accepted.
+        InputError: the result has another shape or type. Numbers that are not finite are accepted.
     """
     numbers = np.asarray(result)
     if numbers.shape != like.shape or numbers.dtype.kind not in "fiu":

@@ -48,7 +48,7 @@ class Reader(ABC):
         """Yield the readings that have arrived since the last call, without waiting.
 
         Raises:
-            LatheError: the received data are no reading, or the source has failed.
+            LatheError: the received data are not a reading, or the source has failed.
         """
 
 
@@ -106,7 +106,7 @@ class LineReader(Reader):
         stream: opened in binary mode, unbuffered; its ``read`` returns None if no data have arrived.
         name: name of the stream, for messages.
         joins: whether the first line may be incomplete, and is ignored.
-        waits: whether an empty read before the first data is no end of the stream, as in a pipe without a writer.
+        waits: whether an empty read before the first data does not end the stream, as in a pipe without a writer.
     """
 
     def __init__(self, stream: IO[bytes], name: str, *, joins: bool = False, waits: bool = False) -> None:
@@ -131,7 +131,7 @@ class LineReader(Reader):
         return cls(stream, str(path), joins=terminal, waits=stat.S_ISFIFO(os.fstat(number).st_mode))
 
     def close(self) -> None:
-        """Close the stream."""
+        """Close the stream of readings."""
         self._stream.close()
 
     def read(self) -> Iterator[Reading]:
@@ -179,7 +179,7 @@ class CountedAngle:
         counts: counts per revolution.
         step_ns: sampling step [ns].
         wraps: number of counts after which the counter restarts at 0; 0: never.
-        inverted: whether it counts down while the spindle turns forward.
+        inverted: whether the counter counts down while the spindle turns forward.
         max_reverse: largest backward motion [counts]; the angle is constant during it.
         max_gap: longest time between readings [s].
 
@@ -216,7 +216,7 @@ class CountedAngle:
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
     def add(self, time_ns: int, count: float) -> None:
-        """Add a reading.
+        """Add a reading of the encoder.
 
         Raises:
             LatheError: the last reading was too long ago, the counter has moved back too far, or the value is invalid.
@@ -258,13 +258,13 @@ class CountedAngle:
         self._keep()
 
     def _keep(self) -> None:
-        """Append the most recent reading to the lists, which grow faster than the arrays made by `_gather`."""
+        """Append the most recent reading to lists, which is faster than appending to arrays (see `_gather`)."""
         assert self._newest is not None, "a reading has come"
         self._times.append(float(self._newest[0] - self._start_ns))
         self._angles.append(self.angle)
 
     def _gather(self) -> None:
-        """Move the readings from the lists to the arrays."""
+        """Move the stored readings from lists to arrays."""
         if self._times:
             self._time, self._angle = np.append(self._time, self._times), np.append(self._angle, self._angles)
             self._times, self._angles = [], []

@@ -15,7 +15,7 @@ _MOST = 2**22  # points of a tachogram
 
 
 class DeviationLaw(ABC):
-    """Base of laws of the relative speed deviation; the constructor takes the numbers given in the scenario."""
+    """Base of laws of the spindle's speed deviation; the constructor takes the numbers given in the scenario."""
 
     @abstractmethod
     def deviation(self, time: Array) -> Array:

@@ -3,7 +3,7 @@
 
     φ' = φ + e·sin(φ + ψ)                                       eccentricity, once a revolution
     x = cos(N·φ') + p,   y = (1 + g)·sin(N·φ' + a) + q          the two signals, N periods a revolution
-    seen = φ' + wrapped(atan2(y, x) - N·φ')/N - value of the same at φ = 0
+    seen = φ' + wrapped(atan2(y, x) - N·φ')/N - s0              s0 so that seen = 0 at φ = 0
 
 e is the disc's eccentricity over the radius of its track. Offsets p and q cause an error with one wave in a signal
 period, of amplitude √(p² + q²)/N; unequal amplitudes g and a phase error a one of two waves, √(g² + a²)/(2N), all to
@@ -63,12 +63,12 @@ class EncoderErrors(NamedTuple):
 
     @property
     def _signals(self) -> tuple[float, float, float, float]:
-        """Offsets, mismatch and skew of the two signals."""
+        """Offsets, amplitude mismatch and phase skew of the two encoder signals."""
         return self.cosine_offset, self.sine_offset, self.mismatch, self.skew
 
     @property
     def table(self) -> "ErrorsTable":
-        """Table of the errors for kernels; raises the errors of `check`."""
+        """Table of the encoder errors for kernels; raises the errors of `check`."""
         self.check()
         table = ErrorsTable(self, real=bool(self.eccentricity) or any(self._signals), zero=0.0)
         zero = np.zeros(1)

@@ -132,7 +132,7 @@ def doubts(form: Measured) -> list[str]:
 
 
 def read_csv(path: Path) -> Measured:
-    """Read a profile from a CSV file.
+    """Read a part profile from a CSV file.
 
     Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], with rows in any
     order. Every height must have the same angles. A row at 360° may repeat the row at 0°.

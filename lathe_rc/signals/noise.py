@@ -55,7 +55,7 @@ class NormalStream:
         self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
 
     def draw(self, numbers: int) -> None:
-        """Ensure that the given count of numbers is drawn in advance, up to 8192."""
+        """Ensure that ``numbers`` random numbers are drawn in advance, up to 8192."""
         values, used = self.drawn
         if values.size and used[0] + numbers > values.size:
             # Unused numbers move to the front, so that the order of use is the order of drawing for any block length.
@@ -131,7 +131,7 @@ class Sensor:
         self.table = SensorTable(self._stream.drawn, noise_rms, resolution)
 
     def draw(self, samples: int) -> None:
-        """Draw the noise of the next samples, up to 8192."""
+        """Draw the noise for the next ``samples`` samples, up to 8192."""
         self._stream.draw(samples)
 
     def measure(self, true: Array, measured: Array) -> None:

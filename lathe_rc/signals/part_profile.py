@@ -15,7 +15,7 @@ _CLOSED = 1e-9  # largest jump from 2π to 0, relative to the largest deviation
 
 
 class PartProfile(ABC):
-    """Base of desired forms; the constructor takes the numbers given in the scenario.
+    """Base of part forms in plain Python; the constructor takes the numbers given in the scenario.
 
     It implements `lathe_rc.signals.profile.Profile`; without heights of its own the form is constant along the part.
     """
@@ -31,7 +31,7 @@ class PartProfile(ABC):
 
 
 def checked(profile: PartProfile) -> ProfileTable:
-    """Check a profile and return its table.
+    """Check a part profile and return its table.
 
     Raises:
         InputError: heights out of order, or a deviation that is not finite, of another shape, or not periodic.

@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Profile(Protocol):
-    """Protocol of desired forms of a part."""
+    """Protocol of the desired form of a part."""
 
     @property
     def heights(self) -> Array:
@@ -38,7 +38,7 @@ class Harmonics:
 
     @property
     def heights(self) -> Array:
-        """Single height 0, since the form is constant along the part."""
+        """Heights of the form [m]: only 0, since the form is constant along the part."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:
@@ -49,7 +49,7 @@ class Harmonics:
 
 @dataclass(frozen=True)
 class Piston:
-    """Oval-barrel piston skirt.
+    """Part form of an oval-barrel piston skirt.
 
     Args:
         ovality: difference of the two diameters at the ends of the skirt [m].
@@ -67,7 +67,7 @@ class Piston:
 
     @property
     def heights(self) -> Array:
-        """65 positions along the skirt, where linear interpolation has an error of less than 3e-4 barrel."""
+        """65 heights along the skirt [m]; linear interpolation between them has an error of less than 3e-4 barrel."""
         return np.linspace(0.0, self.length, 65)
 
     def deviation(self, angle: Array, height: float) -> Array:
@@ -102,7 +102,7 @@ class Polygon:
 
     @property
     def heights(self) -> Array:
-        """Single height 0, since the part is a prism."""
+        """Heights of the form [m]: only 0, since the part is a prism."""
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spindle speed laws.
+"""Spindle speed laws as closed forms of time.
 
-Every law is a closed form of time, so angle, speed and acceleration at sample n do not depend on the
+A closed form depends on time alone, so angle, speed and acceleration at sample n do not depend on the
 samples before it:
 
     Ω(t) = Ω0·(1 + Σ a_i·sin(ω_i·(t − t_i) + ψ_i) + d(t)),   line i starting at t_i,
@@ -163,14 +163,15 @@ class SpeedLaw:
 
 
 def constant(nominal: float) -> SpeedLaw:
-    """Return a law of constant speed ``nominal`` [rad/s]."""
+    """Return a speed law of constant speed ``nominal`` [rad/s]."""
     return SpeedLaw(nominal)
 
 
 def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, start: float = 0.0) -> SpeedLaw:
-    """Return a law with harmonic deviations from ``start`` [s].
+    """Return a law with harmonic speed deviations, starting at ``start`` [s].
 
-    All arrays have the shape (n,). Paper 000, Fig. 6: ΔΩ = 10.5·sin(ωd·t).
+    The arrays are relative ``amplitude`` [1], ``frequency`` [rad/s] and ``phase`` [rad], shape (n,).
+    Paper 000, Fig. 6: ΔΩ = 10.5·sin(ωd·t).
     """
     lines = stacked("harmonic deviation", amplitudes=amplitude, frequencies=frequency, phases=phase)
     if np.any(frequency <= 0.0):
@@ -179,7 +180,10 @@ def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, s
 
 
 def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
-    """Return a law with a piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s], held outside."""
+    """Return a law with a piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s].
+
+    The arrays have the shape (n,). The deviation is held before the first and after the last time.
+    """
     stacked("tachogram", times=time, deviations=deviation)
     if time.size and (time[0] < 0.0 or np.any(np.diff(time) <= 0.0)):
         raise InputError("tachogram: times must start at 0 s or later and increase; sort them and drop repeats")
@@ -191,7 +195,7 @@ def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
 
 
 def band_limited_random(nominal: float, rms: float, low: float, high: float, lines: int, seed: int) -> SpeedLaw:
-    """Return a law with a random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
+    """Return a speed law with a random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
 
     Frequencies and phases of the ``lines`` are drawn from ``seed``, see `lathe_rc.signals.noise.random_lines`.
     """

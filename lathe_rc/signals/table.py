@@ -34,7 +34,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _number(text: str, path: Path, line: int) -> float:
-    """Parse a finite number."""
+    """Parse a finite number from a CSV field."""
     try:
         number = float(text)
     except ValueError:

@@ -36,7 +36,7 @@ def evaluate(first: int, step: float, lines: Array, position: Array, velocity: A
 
 
 def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
-    """Return lines of given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], each (n,), as (3, n).
+    """Return vibration lines of given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], shape (3, n).
 
     Raises:
         InputError: arrays of different lengths.
@@ -46,6 +46,8 @@ def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
 
 def band_limited_random(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
     """Return lines of a random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s], see `random_lines`.
+
+    For an RMS of 0 there are no lines.
 
     Raises:
         InputError: an invalid band.
