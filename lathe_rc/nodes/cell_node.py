@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node of every member: it turns ROS's callbacks into events of the protocol, and does what the protocol asks for.
+"""ROS node of every cell member: passes ROS callbacks to the protocol as events and performs the requested actions.
 
-It has a `lathe_rc.protocol.MemberProtocol`, which decides, a `Role`, which computes or records, and a `Watch`, which
-sees whether others live.
+A node consists of a `lathe_rc.protocol.MemberProtocol`, which takes the decisions, a `Role`, which computes or records,
+and a `Watch`, which monitors the liveliness of other members.
 """
 
 import os
@@ -51,78 +51,78 @@ T = TypeVar("T")
 
 
 class Role(Protocol):
-    """Work of a kind of node in the cell; it is made when the node is configured, and lives until it is cleaned up."""
+    """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up."""
 
     def protocol(self, own: Announcement) -> MemberProtocol:
-        """The protocol of this kind of member."""
+        """Return the protocol object of this kind of member."""
 
     def member_names(self) -> list[str]:
-        """Fully qualified names of all members; a time master alone knows them."""
+        """Return the fully qualified names of all members; only a time master knows them."""
 
     def publications(self) -> list[tuple[str, str, bool]]:
-        """Fully qualified signal topic, message type, and whether its messages come at chosen samples."""
+        """Return topic, message type and sparse flag (messages at chosen samples) of each published signal."""
 
     def subscriptions(self) -> list[str]:
-        """Fully qualified signal topics that it reads."""
+        """Return the fully qualified names of the signal topics that the node reads."""
 
     def relative_topics(self) -> list[str]:
-        """Signal topics of its stage before remapping, if it has a stage."""
+        """Return the signal topics of the node's stage before remapping; empty without a stage."""
 
     def activate(self) -> None:
-        """Make publishers, subscriptions and services."""
+        """Create the publishers, subscriptions and services of the node."""
 
     def members_changed(self) -> None:
-        """A member has announced something new."""
+        """Take in a new announcement of a member."""
 
     def begin(self, *, joins: bool) -> None:
-        """Prepare for block 0: every topic has met its peers; ``joins``: the cell is running already."""
+        """Prepare the node for block 0 once every topic is matched; ``joins``: the cell is running already."""
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        """Do without lost members, see `actions.Lose`."""
+        """Continue without lost members (handles `actions.Lose`)."""
 
     def perform(self, action: actions.Action) -> None:
-        """Do what the protocol asks a time master for: to check the cell, to start, to release, to tell the time."""
+        """Perform a time master's action: check the cell, start, release blocks or publish the simulated time."""
 
     def work(self) -> None:
-        """Compute what the messages since the last call allow."""
+        """Compute as far as the messages received since the last call allow."""
 
     def tick(self, now: float) -> float:
-        """Do what is due by wall time; returns when it wants to be called again, monotonic [s]."""
+        """Do the work that is due by wall time; return the monotonic time of the next call [s]."""
 
     def failed(self) -> None:
-        """The node has given up."""
+        """React to the failure of the node."""
 
     def finish(self) -> None:
-        """Close files and write what is left."""
+        """Write the remaining data and close the files."""
 
     def clean_up(self) -> None:
-        """Let go of everything but publishers, subscriptions and services, which the node destroys."""
+        """Release all resources except publishers, subscriptions and services, which the node destroys."""
 
     def statistics(self) -> dict[str, object]:
-        """Figures for the diagnostics."""
+        """Return the figures of the role for the diagnostics."""
 
 
 class CellNode(LifecycleNode):
-    """A member of a cell, or a node alone.
+    """ROS 2 lifecycle node of a cell member, or of a node that runs without a cell.
 
     Args:
-        name: default name.
-        kind: of node, as `TABLES` has it.
-        role: makes its role once it is configured.
-        reporter: line to the harness.
-        exchange: between the nodes of this process.
+        name: default name of the node.
+        kind: kind of node, a key of `TABLES`.
+        role: creates the role when the node is configured.
+        reporter: sends reports to the harness.
+        exchange: hands signals over between the nodes of this process.
 
     Attributes:
-        table: parameters, once configured.
-        protocol: its part in the cell.
-        role: see the arguments; None unless configured.
+        table: parameters; set when the node is configured.
+        protocol: protocol object of this member.
+        role: role of the node; None unless configured.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
-        due: messages have come since it last worked.
-        handled: messages received so far.
-        refused_messages: those from outside the cell.
-        discarded: destroy the publishers, subscriptions and services that it had before it was cleaned up; for its
-            process to call.
-        next_tick: monotonic time [s] at which it wants `tick` to be called.
+        due: messages have arrived since the last call of `work`.
+        handled: number of messages received so far.
+        refused_messages: counter of rejected messages from outside the cell.
+        discarded: functions that destroy the publishers, subscriptions and services from before the clean-up; the
+            process calls them.
+        next_tick: monotonic time of the next call of `tick` [s].
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class CellNode(LifecycleNode):
         self._forget()
 
     def _forget(self) -> None:
-        """Be as before the first activation."""
+        """Reset the node to its state before the first activation."""
         self.role: Role | None = None
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
@@ -166,19 +166,19 @@ class CellNode(LifecycleNode):
     # ---- lifecycle ----------------------------------------------------------------------------------
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Validate parameters and allocate."""
+        """Validate the parameters and allocate the role."""
         return self._transition(state, "inactive", self._configure)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Announce the node and exchange data from now on; or go on after a deactivation."""
+        """Announce the node and start to exchange data, or resume after a deactivation."""
         return self._transition(state, "active", self._activate)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stand still: messages are put off, and so the cell stands still as well."""
+        """Pause the node, and with it the cell: incoming messages are deferred."""
         return self._transition(state, "inactive", self.protocol.deactivate)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Leave the cell, and be as before it was configured; not in the middle of a run, which needs its blocks."""
+        """Leave the cell and reset to unconfigured; rejected in mid-run, since the run needs the node's blocks."""
         if self.protocol.takes_part:
             self.get_logger().warning(
                 "cleanup refused in the middle of a run; activate to go on, or shutdown to give up"
@@ -187,11 +187,11 @@ class CellNode(LifecycleNode):
         return self._transition(state, "unconfigured", self._clean_up)
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Leave; in the middle of a run as one that has failed."""
+        """Leave the cell; in mid-run the node counts as failed."""
         return self._transition(state, "finalized", self._shut_down)
 
     def on_error(self, state: State) -> TransitionCallbackReturn:
-        """Safe state: nothing is published any more."""
+        """Enter the safe state: nothing is published any more."""
         self.protocol.deactivate()
         return TransitionCallbackReturn.SUCCESS
 
@@ -210,7 +210,7 @@ class CellNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _refusing(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """The lifecycle service, without the exception with which rclpy answers to a transition that cannot be."""
+        """Wrap a lifecycle service so that an invalid transition is rejected without rclpy's exception."""
 
         def call(request: Any, response: Any) -> Any:
             try:
@@ -245,7 +245,7 @@ class CellNode(LifecycleNode):
         self.protocol = self.role.protocol(own)
 
     def _effective(self, role: Role) -> NodeParameters:
-        """The table with the remapping of the command line written into ``remap``."""
+        """Return the parameters with the command line's remapping rules written into ``remap``."""
         rules = [f"{topic}:={self.topic(topic).removeprefix(self.namespace)}" for topic in role.relative_topics()]
         changed = sorted({rule for rule in rules if rule.split(":=")[0] != rule.split(":=")[1]})
         return self.table.model_copy(update={"remap": changed})
@@ -262,7 +262,7 @@ class CellNode(LifecycleNode):
         self.reporter("active", self.get_name(), pid=os.getpid())
 
     def _begin_to_exchange(self) -> None:
-        """Make the publishers and subscriptions of the protocol."""
+        """Create the publishers and subscriptions of the protocol."""
         add = self.create_publisher
         self._host = {
             "members": add(Member, "members", latched_qos(1)),
@@ -295,7 +295,7 @@ class CellNode(LifecycleNode):
         self.protocol.shut_down(time.monotonic())
 
     def interrupt(self, signal: str) -> None:
-        """Tell the others that this process ends by a signal."""
+        """Announce to the other members that this process ends by a signal."""
         self.protocol.interrupt(signal)
         self._perform_actions()
         if self._host and self.protocol.failure:
@@ -320,23 +320,23 @@ class CellNode(LifecycleNode):
         self.protocol.hear_cell_state(from_ros(message, CellState), time.monotonic())
 
     def completed(self, blocks: int, samples: int, *, last: bool) -> None:
-        """The role has completed so many blocks and samples in all."""
+        """Report the total number of blocks and samples that the role has completed."""
         self.protocol.computed(blocks, samples, time.monotonic(), last=last)
         if self.protocol.actions:
             self._perform_actions()
 
     def complete_part(self) -> None:
-        """The role has completed its last block."""
+        """Report that the role has completed its last block."""
         self.protocol.complete_part()
         self._perform_actions()
 
     def describe(self, **topics: tuple[object, ...]) -> None:
-        """Announce other lists of topics than before; see `MemberProtocol.describe`."""
+        """Announce changed lists of topics (see `MemberProtocol.describe`)."""
         self.protocol.describe(**topics)
         self._perform_actions()
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
-        """Give up, and say so to all; see `MemberProtocol.fail`."""
+        """Fail the node and announce the reason to all members (see `MemberProtocol.fail`)."""
         first = self.protocol.failure is None
         self.protocol.fail(error, cause=cause)
         self._perform_actions()
@@ -344,7 +344,7 @@ class CellNode(LifecycleNode):
             self.role.failed()
 
     def attempt(self, step: Callable[[], object]) -> None:
-        """Do something that may fail the node, and what the protocol asks for then."""
+        """Run a step whose error fails the node, then perform the protocol's pending actions."""
         try:
             step()
         except ForeignMessage as refused:
@@ -354,7 +354,7 @@ class CellNode(LifecycleNode):
         self._perform_actions()
 
     def _look(self) -> None:
-        """Let the protocol see the time, the others and the graph."""
+        """Pass the time, the state of the other members and the ROS graph to the protocol."""
         protocol = self.protocol
         self.watch.look()
         protocol.look(time.monotonic(), self.watch.silent, self.watch.ended())
@@ -365,7 +365,7 @@ class CellNode(LifecycleNode):
         self._perform_actions()
 
     def tick(self, now: float) -> None:
-        """Do what is due by the wall clock; nothing here touches a sample."""
+        """Do the periodic work that is due by wall time; it touches no sample."""
         self.next_tick = now + (_IDLE_TICK if self.protocol.ready else _TICK)
         if not self._host:
             return
@@ -378,19 +378,19 @@ class CellNode(LifecycleNode):
             self._publish_diagnostics()
 
     def work(self) -> None:
-        """Compute what the messages since the last call allow."""
+        """Compute as far as the messages received since the last call allow."""
         if self.role is not None and self.protocol.active and not self.protocol.failure:
             self.attempt(self.role.work)
 
     def finish(self) -> None:
-        """Close files and write what is left."""
+        """Write the remaining data and close the files."""
         if self.role is not None:
             self.role.finish()
 
     # ---- requests of the protocol -------------------------------------------------------------------
 
     def _perform_actions(self) -> None:
-        """Do what the protocol asks for; what it asks for meanwhile, after that."""
+        """Perform the protocol's pending actions, including actions added meanwhile."""
         if self._performs:
             return
         self._performs = True
@@ -466,15 +466,15 @@ class CellNode(LifecycleNode):
     # ---- topics -------------------------------------------------------------------------------------
 
     def topic(self, relative: str) -> str:
-        """Fully qualified name of a relative topic after all remapping."""
+        """Return the fully qualified name of a relative topic after all remapping."""
         return str(self.resolve_topic_name(remapped(self.table, relative)))
 
     def guarded(self, callback: Callable[[Any], object], *, always: bool = False) -> Callable[[Any], None]:
-        """A callback that fails the node, by name and in one line, instead of the process with a traceback.
+        """Wrap a callback so that its error fails the node with a one-line message instead of a traceback.
 
         Args:
-            callback: takes a message.
-            always: whether it also gets messages after the node has given up.
+            callback: function of one message.
+            always: call it also after the node has failed.
         """
 
         def call(message: Any) -> None:
@@ -494,10 +494,10 @@ class CellNode(LifecycleNode):
         return call
 
     def _in_turn(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
-        """A callback for signals, which are put off while the node is deactivated, and until it is ready.
+        """Wrap a signal callback so that messages are deferred while the node is deactivated or not yet ready.
 
-        So nothing is lost, and no block counts as missing that a node could not hear when it joined. Where nothing
-        holds the spindle back, signals are left out while it is deactivated, and counted as any that are missing.
+        So no message is lost, and blocks from before a node joined do not count as missing. In a free-running cell
+        the signals of a deactivated node are dropped instead, and counted like any missing blocks.
         """
         most = _MOST_PUT_OFF * signal_depth(self.table)
 
@@ -518,7 +518,7 @@ class CellNode(LifecycleNode):
         return call
 
     def _is_early(self) -> bool:
-        """Whether signals have to wait: until the node is ready, and knows where to begin if it may go on."""
+        """Return True while signals have to be deferred: the node is not ready, or its first sample is not known."""
         if self.protocol.master is not None:
             return not self.protocol.ready
         return bool(getattr(self.table, "restart_file", "")) and not self.protocol.alone
@@ -529,7 +529,7 @@ class CellNode(LifecycleNode):
             self.guarded(callback)(message)
 
     def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:
-        """A callback whose errors name all publishers of its topic, if there are several: any of them may be it."""
+        """Wrap a callback so that its errors name all publishers of the topic, since any of them may be the cause."""
 
         def call(data: bytes) -> None:
             try:
@@ -546,13 +546,13 @@ class CellNode(LifecycleNode):
     def listen(
         self, topic: str, msgtype: str, callback: Callable[[bytes], object], inside: Callable[[Any], object]
     ) -> None:
-        """Read a signal topic.
+        """Subscribe to a signal topic, over DDS or inside this process.
 
         Args:
             topic: fully qualified.
             msgtype: message type.
-            callback: gets the encoded message from DDS.
-            inside: gets the `lathe_rc.nodes.exchange.Delivery` of a node of this process instead.
+            callback: called with the encoded message from DDS.
+            inside: called instead with the `lathe_rc.nodes.exchange.Delivery` of a node of this process.
         """
         if self.exchange.has(topic):
             self.exchange.listen(topic, self.full_name, self.guarded(self._in_turn(inside)))
@@ -567,11 +567,11 @@ class CellNode(LifecycleNode):
         )
 
     def subscription_events(self, topic: str) -> SubscriptionEventCallbacks:
-        """Publishers that do not fit are named.
+        """Return the event callbacks of a subscription, which report publishers with incompatible QoS.
 
-        To hear of lost messages as well may stop a node for ever: rmw_fastrtps 8.4 takes its own lock and then
-        that of DDS where DDS takes them the other way round (its pull request 890); a flood from outside is enough.
-        Nothing is missed by that: every block and every message at a chosen sample is counted by its readers.
+        A callback for lost messages can deadlock the node: rmw_fastrtps 8.4 takes its own lock and then the lock of
+        DDS, while DDS takes them in the opposite order (its pull request 890); a flood of foreign messages suffices.
+        It is not needed either: readers count every block and every message at a chosen sample.
         """
 
         def incompatible(status: Any) -> None:
@@ -584,7 +584,7 @@ class CellNode(LifecycleNode):
         return SubscriptionEventCallbacks(incompatible_qos=incompatible)
 
     def announced(self, names: Sequence[str]) -> graph.Announced:
-        """The members' parameters and topics; see `lathe_rc.nodes.graph.announced`."""
+        """Return the parameters and topics announced by the members (see `lathe_rc.nodes.graph.announced`)."""
         return graph.announced(self.protocol.members, names, self.namespace, self._report_unknown)
 
     def _report_unknown(self, name: str, stage: str, why: str) -> None:
@@ -595,7 +595,7 @@ class CellNode(LifecycleNode):
     # ---- diagnostics --------------------------------------------------------------------------------
 
     def _refuse(self, message: ForeignMessage) -> None:
-        """Count a message from outside the cell; the protocol knows the relative names of its own topics."""
+        """Count a rejected message from outside the cell, under the protocol's relative topic name if it has one."""
         self.refused_messages.refuse(message.on(self.resolve_topic_name(message.topic)))
 
     def _report_refused(self, message: ForeignMessage) -> None:
@@ -623,6 +623,6 @@ class CellNode(LifecycleNode):
 
 
 def from_ros(message: Any, kind: type[T]) -> T:
-    """The protocol's own message with the fields of the ROS message of the same name."""
+    """Convert a ROS message to the protocol's message class of the same name."""
     values = {field.name: getattr(message, field.name) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of one process that compute as one program, many blocks at a time.
+"""Chain of stages in one process, computed together, many blocks at a time.
 
-By itself each stage computes what its inputs allow and hands it over: in a loop with a feedback of one block, one
-block. As a chain they compute as the offline engine does, as far as the window and the other processes allow, and each
-then publishes what it has computed. Between two steps of a chain every stage is as it would be by itself: its queues
-and tracks hold what it would find there. So when anything goes wrong the chain is given up, and each goes on alone.
+A stage alone computes as far as its inputs allow and hands the blocks over: in a loop with a feedback of one block, one
+block at a time. A chain computes like the offline engine, as far as the window and the other processes allow, and each
+stage then publishes its blocks. Between two steps of a chain every stage has the state that it would have alone, queues
+and delay buffers included. So after an error the chain is dissolved, and each stage goes on alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,10 @@ from lathe_rc.nodes.stage_role import StageRole
 
 
 class Chain:
-    """Some stages that are about to compute sample 0.
+    """Chain of stages that are about to compute sample 0.
 
     Args:
-        roles: in the order in which they compute.
+        roles: stages in the order of computation.
     """
 
     def __init__(self, roles: Sequence[StageRole]) -> None:
@@ -52,12 +52,12 @@ class Chain:
         roles[0].node.reporter("chain", names[0], nodes=names)
 
     def advance(self) -> None:
-        """Compute what the inputs from outside allow; the first of the stages says how far."""
+        """Compute as far as the inputs from outside the chain allow; the first stage sets the limit."""
         if not self._busy:
             self._roles[0].lead()
 
     def ready(self) -> tuple[int, bool] | None:
-        """Samples that all can compute, and whether the run ends with them; None while an input is missing."""
+        """Return the number of samples that all stages can compute and whether the run ends there; None: an input is missing."""
         samples, last = self._most, False
         for role in self._roles:
             ready = role.ready() if role.computes else None
@@ -69,7 +69,7 @@ class Chain:
         return samples, last
 
     def compute(self, samples: int, *, last: bool) -> None:
-        """Let all compute so many samples, with which the run may end, and publish them."""
+        """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
         first, failure, self._busy = self._roles[0].samples, None, True
         self._tapes.advance(first)
         for role, stage in zip(self._roles, self._stages, strict=True):
@@ -96,7 +96,7 @@ class Chain:
             self._roles[self._program.number].node.fail(failure)
 
     def leave(self) -> None:
-        """Let each stage go on alone, from where it stands."""
+        """Dissolve the chain: each stage goes on alone from its current sample."""
         self._over = True
         if not self._busy:
             for role in self._roles:
@@ -104,11 +104,11 @@ class Chain:
 
 
 def form(role: StageRole, cell: Cell | None = None) -> None:
-    """Make chains of a stage and others of its process and cell, none of which has computed yet.
+    """Form chains of a stage and other stages of its process and cell, none of which has computed yet.
 
     Args:
-        role: see above.
-        cell: that the members make, if it is known.
+        role: the stage.
+        cell: cell of all members, if known.
     """
     node, master, waiting = role.node, role.node.protocol.master, role.node.exchange.stages
     mates = {other.node.full_name: other for other in waiting if other.may_join and other.cell == role.cell}
@@ -126,9 +126,9 @@ def form(role: StageRole, cell: Cell | None = None) -> None:
 
 
 def _groups(cell: Cell, here: Mapping[str, object]) -> list[list[str]]:
-    """The stages that are here, cut so that what leaves a group comes back to it by feedback alone.
+    """Group the stages of this process such that a group's outputs return to it only through feedback.
 
-    Of members that nobody here knows it is not known which of their inputs are feedback: they come after every group.
+    The feedback inputs of members of unknown kind are not known: such members are placed after every group.
     """
     groups: list[list[str]] = [[]]
     beyond: set[str] = set()  # stages elsewhere that compute after some of the group at hand

@@ -9,7 +9,7 @@ from lathe_rc.nodes import arguments, process
 
 
 def main() -> NoReturn:
-    """Run the nodes, and exit."""
+    """Run the nodes in this process, and exit."""
     words = sys.argv[1:]
     if arguments.ask_for_help(words):
         print(f"usage: ros2 run lathe_rc container NAME[:STAGE] ... [{arguments.ROS} ...]")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of DDS for the nodes of a process; this module imports nothing of lathe_rc, for the set-up runs it, too."""
+"""DDS settings for the nodes of a process; imports nothing of lathe_rc, since the set-up runs this module as well."""
 
 import os
 from collections.abc import Mapping
@@ -12,13 +12,13 @@ _CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS_STATIC_PEERS")
 
 
 def settings(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables that keep DDS on this machine, over loopback UDP, unless an environment says otherwise.
+    """Return environment variables that keep DDS on this machine over loopback UDP; variables already set prevail.
 
     With the range LOCALHOST, rmw_fastrtps adds shared memory whatever the profile and ``FASTDDS_BUILTIN_TRANSPORTS``
     say. So the profile limits the range instead, to the loopback interface.
 
-    Fast DDS's shared memory is not used because a killed process may leave it locked: other members then wait, or no
-    longer hear each other. ``FASTDDS_BUILTIN_TRANSPORTS=DEFAULT`` switches it on.
+    Fast DDS's shared memory is not used because a killed process may leave it locked: other members then block, or no
+    longer receive each other's messages. ``FASTDDS_BUILTIN_TRANSPORTS=DEFAULT`` switches it on.
     """
     profiles, reach = environ.get(PROFILES, _LOOPBACK), environ.get(RANGE, "LOCALHOST")
     found = {RANGE: reach, PROFILES: profiles, "SKIP_DEFAULT_XML_FILE": "1"}  # one in the folder may be anybody's
@@ -32,5 +32,5 @@ def settings(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def settle() -> None:
-    """Give this process the settings, before its first node."""
+    """Apply the DDS settings to this process; call it before the first node is created."""
     os.environ.update(settings(os.environ))

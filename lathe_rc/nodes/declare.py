@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters from parameter tables."""
+"""Declaration of ROS parameters from parameter tables."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _TYPES = {
 
 
 def descriptor(row: Row) -> ParameterDescriptor:
-    """The description of a parameter for ROS tools; all are read-only: changes during a run are events."""
+    """Return the ROS descriptor of a parameter; all are read-only, since changes during a run are events."""
     made = ParameterDescriptor(
         name=row.name,
         type=_TYPES[row.type, row.is_list],
@@ -45,7 +45,7 @@ def descriptor(row: Row) -> ParameterDescriptor:
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """The overrides that the node was given; it must have declared them automatically."""
+    """Return the parameter overrides of a node, which must have declared them automatically."""
     given: dict[str, Any] = {}
     found: dict[str, Any] = node.get_parameters_by_prefix("")
     for name, parameter in found.items():
@@ -56,14 +56,14 @@ def overrides(node: Node) -> dict[str, Any]:
 
 
 def refuse_lost(node: Node, words: Sequence[str]) -> None:
-    """Refuse a ``-p`` for a node that something else has overruled, which ROS keeps quiet about.
+    """Reject a ``-p`` for a node that another override has replaced, which ROS ignores silently.
 
     Args:
-        node: as `overrides` wants it.
-        words: its command line.
+        node: node with automatically declared overrides (see `overrides`).
+        words: command line of the node.
 
     Raises:
-        InputError: the node has another value.
+        InputError: the node has a different value.
     """
     given, name = overrides(node), node.get_name()
     own = [rule for rule in arguments.rules(words) if rule.node in ("", name)]
@@ -84,7 +84,7 @@ def refuse_lost(node: Node, words: Sequence[str]) -> None:
 
 
 def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
-    """Validate what the node was given and declare every parameter of its table; once declared, they stay.
+    """Validate the overrides of a node and declare every parameter of its table, once.
 
     Raises:
         InputError: an unknown parameter, a wrong type or a value out of range.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the nodes of a process wait for messages, requests and events, and hand them to their callbacks."""
+"""Event loop of a process: waits for messages, requests and events of its nodes and calls their callbacks."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,12 +14,12 @@ _MOST = 64  # of one topic or service at a time: a flood keeps nobody from its n
 
 
 class Events:
-    """Waits for events of some nodes, and hands them over.
+    """Event executor of the nodes of a process.
 
     EventsExecutor must not lose a publisher, subscription or service while it spins: an event of one that has come,
     and that it has not handed over yet, it then drops without the interpreter's lock, which crashes the process
-    (rclpy's issue 1644). So what a node discards is kept until the executor has let go of everything at once; another
-    one takes its place.
+    (rclpy's issue 1644). So discarded entities of a node are kept until the whole executor is replaced by a new
+    one.
 
     Args:
         nodes: of this process.
@@ -36,7 +36,7 @@ class Events:
         return executor
 
     def spin(self, wait: float) -> None:
-        """Wait for the next event, up to so many seconds, and hand it over."""
+        """Wait for the next event, at most ``wait`` [s], and call its callback."""
         # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and sees signals.
         self._executor.spin_once(timeout_sec=wait)
         if any(node.discarded for node in self._nodes):
@@ -48,12 +48,12 @@ class Events:
 
 
 def drain_missed_messages(node: Node) -> None:
-    """Hand over the messages and requests that wait at a node unannounced; to be called from time to time.
+    """Process messages and requests of a node for which no event was raised; call this periodically.
 
     When EventsExecutor takes up a subscription or a service, rmw_fastrtps first counts the messages that have come and
-    then sets the callback that announces others (since its pull request 657). A message in between is never announced,
-    and from then on each announcement takes the message before: the newest one waits for the next. A cell whose last
-    message before the start is missed stands still for ever.
+    then sets the callback that announces others (since its pull request 657). A message in between raises no event,
+    and from then on each event takes the previous message: the newest one waits for the next event. A cell that misses
+    the last message before the start blocks forever.
     """
     for subscription in [*node.subscriptions]:
         with subscription.handle:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that starts the processes of cells: ``python -m lathe_rc.nodes.fork_server DESCRIPTOR``.
+"""Server that forks the processes of cells: ``python -m lathe_rc.nodes.fork_server DESCRIPTOR``.
 
-It imports once what nodes need, and forks itself for each process of a cell: that takes milliseconds, where a new
-interpreter takes a second to import the same. It takes part in no ROS domain itself. A process of which the request
-says so is replaced by a command: a separate interpreter.
+It imports the modules of the nodes once, and forks itself for each process of a cell: that takes milliseconds, where a
+new interpreter takes a second for the same imports. It takes part in no ROS domain itself. On request, the forked
+process is replaced by a command: a separate interpreter.
 
 `lathe_rc.process_launcher` asks for processes over a socket. The answers are pairs: the number of a process and None,
 with its pidfd, when it has started; the number and the exit code when it has ended.
 
 The libraries of ROS 2 run two threads from their import on, which wait for a tracing session of LTTng. They hold no
-lock meanwhile; forked processes do without them, and so without LTTng.
+lock meanwhile; forked processes run without these threads, and so without LTTng.
 """
 
 import contextlib
@@ -32,14 +32,14 @@ _FAREWELL = 10.0  # [s] for processes to end by themselves when nobody asks any 
 
 
 def _load(nodes: dict[str, Any]) -> None:
-    """Import what nodes need, and load what some of them will."""
+    """Import the modules of all nodes, and preload the kernels that some nodes use."""
     with contextlib.suppress(ImportError):  # a process that needs it says so
         importlib.import_module(_NODES).preload(nodes)
     gc.freeze()  # the collector leaves alone what forked processes share with this one
 
 
 def _become(request: dict[str, Any], report: int, log: int) -> int:
-    """Turn a process that has just been forked into one of a cell; its exit code."""
+    """Turn a freshly forked process into a process of a cell; return its exit code."""
     os.setsid()
     os.chdir(request["folder"])
     os.environ.clear()
@@ -59,7 +59,7 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
 
 
 def _reap_children(line: socket.socket, children: dict[int, int]) -> None:
-    """Wait for the children to end when the launcher has gone; kill those that do not."""
+    """Wait for the child processes after the launcher has gone; kill the remaining ones."""
     line.close()  # it is readable without end
     end = time.monotonic() + _FAREWELL
     while children and (readable := select.select([*children], [], [], max(end - time.monotonic(), 0.0))[0]):
@@ -70,10 +70,10 @@ def _reap_children(line: socket.socket, children: dict[int, int]) -> None:
 
 
 def serve(line: socket.socket) -> int:
-    """Fork as asked until the launcher has gone.
+    """Fork processes on request until the launcher has gone.
 
     Returns:
-        The exit code, also that of each process that was forked: they leave by the same way.
+        The exit code, in the server as well as in each forked process.
     """
     children: dict[int, int] = {}  # process number by pidfd, which is readable once the process has ended
     while True:
@@ -109,7 +109,7 @@ def serve(line: socket.socket) -> int:
 
 
 def main() -> None:
-    """Serve at the socket whose descriptor is the argument."""
+    """Serve requests at the socket whose descriptor is the command-line argument."""
     gc.disable()  # a process of a cell enables it: to collect while all is being imported takes a tenth longer
     with socket.socket(fileno=int(sys.argv[1])) as line:
         sys.exit(serve(line))

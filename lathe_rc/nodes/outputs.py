@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks and messages at chosen samples that a stage publishes: over DDS, and to readers in this process."""
+"""Output of a stage: blocks and messages at chosen samples, published over DDS and to readers in the same process."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ Memory = tuple[Signals, Samples | None]  #: arrays of one output, and the record
 
 
 class Outputs:
-    """Outputs of a stage.
+    """Publishers of a stage's blocks and of its messages at chosen samples.
 
     Args:
-        node: that publishes.
-        stage: that computes.
+        node: node that owns the publishers.
+        stage: stage that computes the blocks.
 
     Attributes:
         topics: fully qualified topic of each output.
@@ -50,35 +50,35 @@ class Outputs:
         self._outside_due = 0.0
 
     def activate(self) -> None:
-        """Make the publishers."""
+        """Create the publishers."""
         node = self._node
         for topic, msgtype, _ in self.publications:
             node.outlets[topic] = node.create_publisher(message_class(msgtype), topic, signal_qos(node.table))
         self._outside = set(node.outlets)
 
     def tick(self, now: float) -> None:
-        """Look for readers in other processes: to ask for every message would cost as much as a small stage."""
+        """Check for readers in other processes; a check per message would cost as much as a small stage."""
         if self._node.protocol.ready and now >= self._outside_due:  # the cell's own readers are there
             self._outside_due = now + _OUTSIDE_PERIOD
             outlets = self._node.outlets.items()
             self._outside = {topic for topic, outlet in outlets if outlet.get_subscription_count()}
 
     def memory(self, samples: int) -> list[Memory]:
-        """Arrays for the next samples of all outputs."""
+        """Return arrays for the next samples of all outputs."""
         return [pool.take(samples) for pool in self._pools]
 
     def _goes_out(self, topic: str) -> bool:
-        """Whether to publish: unless all readers of the topic are in this process."""
+        """Return True if a topic has to be published over DDS: not all of its readers are in this process."""
         return topic in self._outside or not self._node.exchange.read(topic)
 
     def publish(self, first: int, said: Sequence[Sparse], memory: Sequence[Memory], *, last: bool) -> int:
-        """Publish blocks in one piece, and the messages at chosen samples among them.
+        """Publish consecutive blocks together, with their messages at chosen samples.
 
         Args:
             first: index of their first sample.
-            said: messages at chosen samples, in order.
-            memory: arrays of each output, as `memory` gave them.
-            last: the run ends with them.
+            said: messages at chosen samples, in order of samples.
+            memory: arrays of each output, as returned by `memory`.
+            last: the run ends with these blocks.
 
         Returns:
             The number of blocks.

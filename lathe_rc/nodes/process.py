@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process with one node or several: start, loop, signals, exit code."""
+"""Process with one or several nodes: start, event loop, signals and exit code."""
 
 import contextlib
 import ctypes
@@ -68,12 +68,12 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
 
 
 def _words(error: RuntimeError) -> str:
-    """The message of rcl, without the file and line of its source."""
+    """Return the message of an rcl error without the file and line of its source."""
     return str(error).splitlines()[0].partition(", at /")[0]
 
 
 class _Stop:
-    """Set by SIGINT and SIGTERM."""
+    """Stop flag, set by SIGINT and SIGTERM."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -85,9 +85,9 @@ class _Stop:
 
 
 def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
-    """Configure and activate the nodes that start by themselves; what one refuses is in its ``failure``.
+    """Configure and activate the nodes that start automatically; a node's error is stored in its ``failure``.
 
-    All are configured before any is activated: then it is known what they hand over to each other.
+    All nodes are configured before any is activated, so that the topics inside the process are known.
     """
     ready = [node for node in nodes if node.autostart and node.trigger_configure() == TransitionCallbackReturn.SUCCESS]
     for node in ready:
@@ -97,17 +97,17 @@ def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
 
 
 def _due(nodes: Sequence[CellNode], now: float) -> float:
-    """When the next tick of a node is due; now if there is none."""
+    """Return the earliest monotonic time of a next tick [s]; now if all nodes are done."""
     return min((node.next_tick for node in nodes if not node.protocol.done), default=now)
 
 
 def _leaves(node: CellNode) -> bool:
-    """Whether a node has given up where nobody goes on."""
+    """Return True if a node has failed and no other member goes on."""
     return node.protocol.failure is not None and not node.protocol.others_go_on
 
 
 def _tick(nodes: Sequence[CellNode], now: float) -> None:
-    """Let nodes do what is due; one that has given up, and stays, has nothing more to write."""
+    """Call the ticks of the nodes that are due; a failed node without others to wait for gets none."""
     for node in nodes:
         if now >= node.next_tick and not (node.protocol.done or _leaves(node)):
             node.tick(now)
@@ -116,7 +116,7 @@ def _tick(nodes: Sequence[CellNode], now: float) -> None:
 
 
 def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
-    """Let nodes compute: what one hands over inside is work for its neighbours; yet services get their turn."""
+    """Let the nodes compute until no node has new input, at most until a time [s], so that services get their turn."""
     while (waiting := [node for node in nodes if node.due]) and not stop.signal:
         for node in waiting:
             node.due = False
@@ -157,7 +157,7 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
 
 
 def _tune(name: str) -> None:
-    """Let the operating system call this process by a name, and wake it as a cell needs it; without privileges."""
+    """Set the process name and the timer slack that a cell needs; works without privileges."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
     # Waits end when they should, not up to 50 µs later: the executor's empty looks are waits as well.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
@@ -167,17 +167,17 @@ def _tune(name: str) -> None:
 
 
 def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
-    """Run nodes in this process until they are done, fail or are told to stop.
+    """Run nodes in this process until they are done, fail or are stopped.
 
     Args:
         members: name and kind of each node.
-        args: command line of ROS, from ``--ros-args`` on.
+        args: ROS command line, starting at ``--ros-args``.
 
     Returns:
-        The exit code: 0, or that of the first node that has failed, or whose cell went to its safe state.
+        Exit code: 0, or the code of the first node that failed or whose cell went to its safe state.
 
     Raises:
-        InputError: a parameter file lies in a bag, and names code that is not allowed or files elsewhere.
+        InputError: a parameter file in a bag names code that is not allowed, or files outside the bag.
     """
     for file in arguments.parameter_files(args):
         if allowed_code.bag_around(file.parent) is not None:
@@ -224,11 +224,11 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
 
 
 def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
-    """Load what nodes load when they are configured, above all their compiled kernels, for forked processes to share.
+    """Preload the resources of nodes, mainly compiled kernels, so that forked processes share them.
 
     Args:
-        nodes: kind and parameters of each; those with classes of others load them themselves, which may have changed
-            since.
+        nodes: kind and parameters of each node; nodes with third-party classes load these themselves, since they may
+            have changed.
     """
     inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
     for package in _MESSAGES:
@@ -244,10 +244,10 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
 
 
 def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
-    """Names and kinds of the nodes NAME[:STAGE] before ``--ros-args``, and what follows.
+    """Split a command line into the NAME[:STAGE] nodes (names and kinds) and the arguments starting at ``--ros-args``.
 
     Raises:
-        InputError: there are none, or something else stands before ``--ros-args``.
+        InputError: no node is named, or other arguments precede ``--ros-args``.
     """
     named, rest = arguments.split(allowed_code.taken_from(words))
     for text in named or [""]:
@@ -258,5 +258,5 @@ def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
 
 
 def main(kind: str) -> NoReturn:
-    """Entry point of the executable of one kind of node."""
+    """Run the executable of one kind of node, and exit."""
     arguments.executable(kind, TABLES[kind], lambda words: run([(kind, kind)], words))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service with which the topics of a bag are sent again."""
+"""Quality of service (QoS) of replayed topics."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ DEPTH = 512  #: of the queues: so many may be under way before readers must have
 
 
 def _offers(recorded: Sequence[Qos]) -> set[tuple[bool, bool]]:
-    """Whether the publishers of a topic were best effort, and latched; a replay promises no deadline or lease."""
+    """Return best-effort and latched flags of a topic's publishers; a replay offers no deadline or lease."""
     return {
         (each.reliability == QosReliability.BEST_EFFORT, each.durability == QosDurability.TRANSIENT_LOCAL)
         for each in recorded
@@ -18,12 +18,12 @@ def _offers(recorded: Sequence[Qos]) -> set[tuple[bool, bool]]:
 
 
 def differ(recorded: Sequence[Qos]) -> bool:
-    """Whether the publishers of a topic offered what one publisher cannot."""
+    """Return True if the publishers of a topic offered different QoS, which one publisher cannot reproduce."""
     return len(_offers(recorded)) > 1
 
 
 def of(recorded: Sequence[Qos]) -> QoSProfile:
-    """As the topic was offered; reliable and volatile if nothing is known, or its publishers differ, as in rosbag2."""
+    """Return the offered QoS of a topic; reliable and volatile if unknown or not the same for all, as in rosbag2."""
     offers = _offers(recorded)
     best_effort, latched = offers.pop() if len(offers) == 1 else (False, False)
     return QoSProfile(
@@ -35,6 +35,6 @@ def of(recorded: Sequence[Qos]) -> QoSProfile:
 
 
 def kept(recorded: Sequence[Qos]) -> int:
-    """Messages that the publishers of a topic kept for late readers."""
+    """Return the number of messages that the publishers of a topic kept for late readers."""
     depths = (DEPTH if each.history == QosHistory.KEEP_ALL else max(each.depth, 1) for each in recorded)
     return min(sum(depths), DEPTH)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Executable: the ``replayer``, which sends again what a bag holds, whoever made it, with /clock."""
+"""Executable: the ``replayer``, which publishes the messages of any bag again, with /clock."""
 
 import json
 import tempfile
@@ -53,15 +53,15 @@ _LOOK = 0.05  # [s] of wall time between looks at services and signals
 
 
 class Replayer:
-    """Sends the messages of a bag in the order of their log times.
+    """Publisher of the messages of a bag, in the order of their log times.
 
     Args:
         node: carries the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and /clock.
-        parameters: what and how fast.
+        parameters: topics, speed and options of the replay.
         source: the bag.
 
     Raises:
-        InputError: a topic that the bag has not, or a message type that this machine has not.
+        InputError: the bag lacks a topic, or a message type is not installed on this machine.
     """
 
     def __init__(self, node: Node, parameters: ReplayerParameters, source: Source) -> None:
@@ -133,7 +133,7 @@ class Replayer:
     # ---- start --------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Make the publishers, and wait for readers; as a cell, until a recorder is ready."""
+        """Create the publishers and wait for readers; as a cell, wait until a recorder is ready."""
         if self._parameters.as_cell:
             self._join()
         else:
@@ -164,7 +164,7 @@ class Replayer:
         self._waiting[topic] = 0
 
     def _join(self) -> None:
-        """Announce the nodes that made the bag, each with its topics, and a recorder; begin when that is ready."""
+        """Announce the bag's nodes with their topics, and a recorder; begin when the recorder is ready."""
         ready: list[str] = []
 
         def heard(member: Any) -> None:
@@ -218,15 +218,15 @@ class Replayer:
     # ---- run ----------------------------------------------------------------------------------------
 
     def _look(self, wait: float = 0.0) -> None:
-        """Serve what has come."""
+        """Process pending messages and service requests."""
         self._executor.spin_once(timeout_sec=wait)
         self._looked = time.monotonic()
 
     def run(self) -> None:
-        """Send everything, again and again if asked to.
+        """Publish all messages of the bag, repeatedly if so configured.
 
         Raises:
-            LatheError: a reader does not take what is sent to it.
+            LatheError: a reader does not accept the messages.
         """
         self.open()
         while True:
@@ -239,7 +239,7 @@ class Replayer:
             self._let_go()
 
     def _let_go(self) -> None:
-        """Say that the cell has ended, once the recorder has all of it: then it leaves."""
+        """Announce the end of the cell, once the recorder has all messages, so that it leaves."""
         self._until(lambda: self._recorded >= self._blocks)
         self._send(_STATE, self._ended)
         self._acknowledged(_STATE)
@@ -250,7 +250,7 @@ class Replayer:
         yield from self._source.messages(self._topics, start_ns=self._start_ns, stop_ns=self._stop_ns)
 
     def _latched(self) -> Iterator[Message]:
-        """Latched messages from before the start, as many as their publishers kept: a late reader had them too."""
+        """Return the latched messages from before the start, up to the publishers' depth, as late readers got them."""
         kept: dict[str, deque[Message]] = {}
         for topic in sorted(self._topics):
             recorded = self._source.topics[topic].qos
@@ -288,7 +288,7 @@ class Replayer:
             self.sent += 1
 
     def _send(self, topic: str, message: Any) -> None:
-        """Publish later than everything before, by the wall clock that stamps messages: it tells readers the order."""
+        """Publish a message with a later wall-clock stamp than all before it, since readers sort by the stamp."""
         if time.time_ns() - self._settled_ns > _PROMPT:
             for other in self._publishers:
                 self._acknowledged(other)
@@ -308,7 +308,7 @@ class Replayer:
             self._acknowledged(topic)
 
     def _wait_until(self, due: float) -> float:
-        """Wait for a moment of wall time, and as long as it is paused; returns for how long it was paused [s]."""
+        """Wait until a monotonic time, longer while paused; return the time spent paused [s]."""
         held = 0.0
         while True:
             now = time.monotonic()
@@ -324,13 +324,13 @@ class Replayer:
                 return held
 
     def _hold(self) -> None:
-        """Let no more blocks be under way than the recorder can queue; what DDS acknowledges may not have been read."""
+        """Limit the blocks in flight to the recorder's queue; acknowledged by DDS does not mean read."""
         self._blocks += 1
         if self._window:
             self._until(lambda: self._blocks - self._recorded <= self._window)
 
     def _until(self, enough: Callable[[], bool]) -> None:
-        """Wait until the recorder has told enough."""
+        """Wait until the recorder has reported enough progress."""
         heard = time.monotonic()
         while not enough():
             before = self._recorded
@@ -341,25 +341,25 @@ class Replayer:
                 raise LatheError(f"the recorder has taken nothing for {_ACKNOWLEDGED:.0f} s")
 
     def _acknowledged(self, topic: str) -> None:
-        """Wait until all reliable readers have what was sent."""
+        """Wait until all reliable readers have acknowledged the messages."""
         if self._waiting[topic] and not self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED)):
             raise LatheError(f"{topic}: a reader has taken nothing for {_ACKNOWLEDGED:.0f} s")
         self._waiting[topic] = 0
 
 
 def _ns(seconds: float) -> int:
-    """A time in ns to the digits that were given: a binary number of 1.7e9 s is 238 ns coarse."""
+    """Convert a decimal time to ns exactly; a binary number of 1.7e9 s would be 238 ns coarse."""
     return int(Decimal(repr(seconds)) * 10**9)
 
 
 def _seconds(time_ns: int) -> str:
-    """Seconds, cut to whole µs, that `_ns` takes as they stand."""
+    """Format a time in s, truncated to whole µs, such that `_ns` parses it exactly."""
     seconds, rest = divmod(time_ns // 1000, 10**6)
     return f"{seconds}.{rest:06d}".rstrip("0").rstrip(".")
 
 
 def _span(seconds: float) -> str:
-    """A time in a unit that suits it."""
+    """Format a duration in a suitable unit."""
     units = (("years", 31_556_952.0), ("days", 86_400.0), ("h", 3600.0), ("min", 60.0))
     name, unit = next(((name, unit) for name, unit in units if seconds >= 2.0 * unit), ("s", 1.0))
     return f"{seconds / unit:.3g} {name}"
@@ -375,12 +375,12 @@ def _work(node: Node, parameters: ReplayerParameters) -> None:
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Replay until the end, a failure, or Ctrl-C; see `standalone_node.run`."""
+    """Replay a bag until the end, a failure, or Ctrl-C (see `standalone_node.run`)."""
     return standalone_node.run(KIND, ReplayerParameters, _work, values, args)
 
 
 def main() -> NoReturn:
-    """Run the node, and exit."""
+    """Run the replayer node, and exit."""
     arguments.executable(KIND, ReplayerParameters, partial(run, {}))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports of a process to the harness that started it: JSON lines over a socket, which also ties their lives together.
+"""Reports of a process to its harness as JSON lines over a socket, which also detects the end of the harness.
 
 The harness passes one end of a socket pair and its number in ``LATHE_REPORT_FD``. When the other end closes, the
 harness is gone, and so the process ends too.
@@ -16,14 +16,14 @@ THROUGHPUT = "LATHE_THROUGHPUT"  #: set where the cell is to run as fast as it c
 
 
 class Reporter:
-    """The process's line to its harness; silent when nobody listens."""
+    """Connection of a process to its harness; does nothing without a harness."""
 
     def __init__(self) -> None:
         number = os.environ.get(VARIABLE)
         self._socket = socket.socket(fileno=int(number)) if number else None
 
     def __call__(self, event: str, node: str, **values: object) -> None:
-        """Report an event, with the monotonic time that all processes of the machine share."""
+        """Report an event with the monotonic time, which all processes of the machine share."""
         if self._socket is None:
             return
         line = json.dumps({"event": event, "node": node, "monotonic_ns": time.monotonic_ns(), **values})
@@ -35,7 +35,7 @@ class Reporter:
 
     @property
     def orphaned(self) -> bool:
-        """True when the harness is gone."""
+        """Return True if the harness is gone."""
         if self._socket is None:
             return False
         if self._socket.fileno() < 0:

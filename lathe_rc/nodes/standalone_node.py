@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes that are members of no cell: start, parameters, signals, exit code."""
+"""Start, parameters, signals and exit code of nodes that are not members of a cell."""
 
 import contextlib
 import sys
@@ -28,18 +28,18 @@ def standalone_node(
     signals: SignalHandlerOptions | None = None,
     rosout: bool = True,
 ) -> Iterator[tuple[Node, T]]:
-    """A node and its parameters, as long as the context lasts.
+    """Provide a node and its parameters as a context manager.
 
     Args:
         kind: name of the node.
-        table: its parameters.
-        values: parameters; those of the command line of ROS come from ``args``.
-        args: command line of ROS, from ``--ros-args`` on.
-        signals: that ROS handles; default: all.
-        rosout: whether what it tells goes to /rosout as well.
+        table: parameter table of the node.
+        values: parameter values; values on the ROS command line are in ``args``.
+        args: ROS command line, starting at ``--ros-args``.
+        signals: signals that ROS handles; default: all.
+        rosout: publish log messages on /rosout as well.
 
     Raises:
-        InputError: a parameter that is refused.
+        InputError: a parameter is invalid.
     """
     dds.settle()
     rclpy.init(args=["lathe", *args], signal_handler_options=signals)
@@ -65,14 +65,14 @@ def run(
     values: Mapping[str, object],
     args: Sequence[str],
 ) -> int:
-    """Run a node until its work ends or fails, or Ctrl-C.
+    """Run a node until its work ends or fails, or until Ctrl-C.
 
     Args:
         kind: name of the node.
-        table: its parameters.
-        work: what it does.
-        values: parameters; those of the command line of ROS come from ``args``.
-        args: command line of ROS, from ``--ros-args`` on.
+        table: parameter table of the node.
+        work: function that does the work of the node.
+        values: parameter values; values on the ROS command line are in ``args``.
+        args: ROS command line, starting at ``--ros-args``.
 
     Returns:
         The exit code.
