@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of one topic that a node reads: checked, and in order."""
+"""Queue of the blocks of one topic that a node reads: checked, and in order."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -19,17 +19,17 @@ from lathe_rc.protocol import BlockOrder, ForeignMessage
 
 
 class BlockQueue(BlockOrder):
-    """Blocks of one topic, checked and in order.
+    """Queue of the blocks of one topic, checked and in order.
 
     Args:
         topic: fully qualified name.
         msgtype: message type.
-        parameters: of the node that reads.
-        fields: those that it reads.
+        parameters: parameters of the reading node.
+        fields: fields that the node reads.
 
     Attributes:
-        blocks: checked blocks that wait to be used.
-        inside: its blocks are handed over in this process.
+        blocks: checked blocks, not used yet.
+        inside: the blocks come from a node of this process.
     """
 
     def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
@@ -44,13 +44,13 @@ class BlockQueue(BlockOrder):
         self._newest: Block | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
-        """See `BlockOrder`; what has come before is forgotten."""
+        """Accept blocks of one source only (extends `BlockOrder`); queued blocks are dropped."""
         super().expect(source, first)
         self.blocks.clear()
         self._newest = None
 
     def add(self, data: bytes) -> Block | None:
-        """Check a block and queue it; None if another already stands for it, see `hold`, or if it is a repeat.
+        """Check and queue an encoded block; return None for a repeat, or if a held block (see `hold`) replaces it.
 
         Raises:
             ForeignMessage: another source or run, or no block at all.
@@ -68,7 +68,7 @@ class BlockQueue(BlockOrder):
         return self.accept(block)
 
     def take(self, run: Run) -> None:
-        """Queue blocks that were handed over in this process.
+        """Queue blocks that a node of this process has handed over.
 
         Raises:
             LatheError: see `add`.
@@ -82,11 +82,11 @@ class BlockQueue(BlockOrder):
 
     @property
     def message(self) -> bytes:
-        """The block that `add` has taken last, as our nodes encode it."""
+        """Return the last block taken by `add`, encoded as lathe_rc's own nodes do."""
         return self._decoder.message
 
     def accept(self, block: Block) -> Block | None:
-        """Check a block and queue it; see `add`."""
+        """Check a decoded block and queue it (see `add`)."""
         self.admit(block.run_id, block.source)
         if block.step_ns != self._step_ns:
             raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
@@ -111,7 +111,7 @@ class BlockQueue(BlockOrder):
         return self._append(block)
 
     def until(self, end: int) -> Iterator[Block]:
-        """Take out what waits of the samples before ``end``."""
+        """Remove and yield the queued samples before ``end``."""
         while self.blocks and self.blocks[0].first_index < end:
             block = self.blocks.popleft()
             if (samples := end - block.first_index) < block.samples:
@@ -120,28 +120,28 @@ class BlockQueue(BlockOrder):
             yield block
 
     def pop(self, samples: int) -> Signals:
-        """Take out the next samples of blocks of this process; without a copy if they are one piece."""
+        """Remove and return the next samples of blocks of this process; no copy if they are one block."""
         if self.blocks[0].samples == samples:
             return self.blocks.popleft().signals
         pieces = [block.signals for block in self.until(self.blocks[0].first_index + samples)]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """The state that another process needs to go on: next sample, blocks received, waiting and newest."""
+        """Return the state that another process needs to resume: next sample, blocks received, queued blocks, newest block."""
         return self.end, self.received, list(self.blocks), self._newest
 
     def go_on(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
-        """Go on from the `state` of another process."""
+        """Resume from the `state` of another process."""
         end, received, waiting, self._newest = state
         self.resume(source, end, received, ended=self._newest is not None and self._newest.last)
         self.blocks = deque(waiting)
 
     def hold_newest(self, end: int, newest: Block | None = None) -> None:
-        """Let the newest sample stand for those of a source that is lost, see `hold`.
+        """Hold the newest sample of a lost source up to the end of the run (see `hold`).
 
         Args:
-            end: of the run [sample].
-            newest: the newest block with all its fields; None: with those that are read.
+            end: end of the run [sample].
+            newest: the newest block with all its fields; None: only the fields that are read.
         """
         first = self.end
         self.hold(end)
@@ -151,16 +151,16 @@ class BlockQueue(BlockOrder):
             self.received += 1
 
     def _last(self) -> Block:
-        """The newest block; before the first one zeros."""
+        """Return the newest block; a block of zeros before the first."""
         return self._newest or self._zero()
 
     def _zero(self) -> Block:
-        """A block that stands for those before the first."""
+        """Return a one-sample block of zeros, used before the first block arrives."""
         zeros = {name: np.zeros(1, dtype) for name, dtype in messages.sample_fields(self.type).items()}
         return Block(self._run_id, self.source, 0, self._step_ns, False, 0, 0, 0, zeros)  # noqa: FBT003
 
     def _held(self, newest: Block, first: int, end: int) -> Iterator[Block]:
-        """Blocks with the last sample of another."""
+        """Yield blocks that repeat the last sample of the newest block from ``first`` to ``end``."""
         for start in range(first, end, self._size):
             samples = min(self._size, end - start)
             yield replace(
@@ -174,7 +174,7 @@ class BlockQueue(BlockOrder):
             )
 
     def _append(self, block: Block, count: int = 1) -> Block:
-        """Queue a block, or so many in one piece."""
+        """Queue one piece that holds ``count`` blocks."""
         self.append(block.first_index + block.samples, count, last=block.last)
         self._newest = block
         self.blocks.append(block)

@@ -57,7 +57,7 @@ class Chain:
             self._roles[0].lead()
 
     def ready(self) -> tuple[int, bool] | None:
-        """Return the number of samples that all stages can compute and whether the run ends there; None: an input is missing."""
+        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
         samples, last = self._most, False
         for role in self._roles:
             ready = role.ready() if role.computes else None

@@ -12,7 +12,7 @@ _CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS_STATIC_PEERS")
 
 
 def settings(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return environment variables that keep DDS on this machine over loopback UDP; variables already set prevail.
+    """Return the environment variables that restrict DDS to this machine over loopback UDP, unless overridden.
 
     With the range LOCALHOST, rmw_fastrtps adds shared memory whatever the profile and ``FASTDDS_BUILTIN_TRANSPORTS``
     say. So the profile limits the range instead, to the loopback interface.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real encoder as time master: readings from a topic or a line release blocks as soon as they reach so far."""
+"""Time master with a real encoder: readings from a topic or a serial line release the blocks that they complete."""
 
 import time
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ _POLL = 0.5e-3  # [s] between looks at a line
 
 
 def _place(joints: Any, name: str) -> int | None:
-    """Place of a joint, without a name the first, in the positions of a joint state; None: it has none.
+    """Return the index of a joint in a joint state's positions, of the first joint without a name; None if it has none.
 
     Several nodes may publish on one topic, as the grippers of a robot do, and a driver may publish velocities alone.
     """
@@ -32,12 +32,12 @@ def _place(joints: Any, name: str) -> int | None:
 
 
 class EncoderRole(SpindleRole):
-    """See the module; with a file it is a spindle like any other.
+    """Role of the time master with a real encoder; with a file as source it works like the simulated spindle.
 
-    When the encoder is lost the others come to their safe state, while the spindle seems to go on at its last speed.
+    When the encoder is lost the members go to their safe state, and the angle is extrapolated at the last speed.
 
-    Block k is due when the last reading that it needs would have been here, had it taken as long on its way as the
-    quickest one so far.
+    Block k is due when the last reading that it needs would have arrived with the shortest transmission delay observed
+    so far.
     """
 
     stage: EncoderDevice
@@ -53,14 +53,14 @@ class EncoderRole(SpindleRole):
         self._other = ""  # the last of them
 
     def finish(self) -> None:
-        """See `Role`."""
+        """Close the encoder's line (implements `Role`)."""
         super().finish()
         if self._line is not None:
             self._line.close()
             self._line = None
 
     def statistics(self) -> dict[str, object]:
-        """See `Role`."""
+        """Return the figures of spindle and encoder for the diagnostics (implements `Role`)."""
         counted = self.stage.counted
         figures: dict[str, object] = {"newest reading [s]": round(counted.time, 6), "late readings": counted.late}
         if self._unusable:
@@ -71,17 +71,17 @@ class EncoderRole(SpindleRole):
 
     @contextmanager
     def _losing_it(self) -> Iterator[None]:
-        """Turn errors inside into the loss of the encoder."""
+        """Convert errors in the context into the loss of the encoder."""
         try:
             yield
         except LatheError as error:
             self._lose_encoder(str(error))
 
     def _lose_encoder(self, why: str) -> None:
-        """Lead the others to their safe state.
+        """Declare the encoder lost and lead the members to their safe state.
 
         Raises:
-            LatheError: they cannot wait for it.
+            LatheError: a safe state is not possible: no window, no members, or no sample released yet.
         """
         if not self.table.window or not self.leads.completed or not self.samples:
             raise LatheError(why)
@@ -91,7 +91,7 @@ class EncoderRole(SpindleRole):
             self.leads.declare_safe(why, time.monotonic())
 
     def _listen_to_joints(self) -> None:
-        """As soon as a node publishes them: only then is it known what quality of service can be asked for."""
+        """Subscribe to the joint states as soon as a node publishes them: only then are their offered QoS known."""
         node, topic = self.node, self.node.topic(self._device.topic)
         if not self._listens and (publishers := node.get_publishers_info_by_topic(topic)):
             self._listens = True
@@ -111,7 +111,7 @@ class EncoderRole(SpindleRole):
             self._hear(iter([(time_ns, joints.position[place] * self._scale)]))
 
     def _hear(self, readings: Iterator[Reading]) -> None:
-        """Take readings; those before the run are over."""
+        """Take encoder readings; readings from before the start of the run are ignored."""
         for time_ns, count in readings:
             if not self.leads.running or self.leads.over or self._lost:
                 continue
@@ -120,7 +120,7 @@ class EncoderRole(SpindleRole):
             self.pace.schedule = min(self.pace.schedule, self._came - self.stage.counted.time)
 
     def start_run(self) -> None:
-        """See `SpindleRole`."""
+        """Begin the run; with a live encoder the schedule follows the readings (extends `SpindleRole`)."""
         super().start_run()
         if self.stage.live:
             self.pace.schedule, self._came = np.inf, time.monotonic()
@@ -128,12 +128,12 @@ class EncoderRole(SpindleRole):
     # ---- run ----------------------------------------------------------------------------------------
 
     def blocks_at_once(self) -> int:
-        """See `SpindleRole`; all that is there, for an encoder that has fallen behind has to catch up."""
+        """Return the largest number of blocks to release; a late live encoder catches up (extends `SpindleRole`)."""
         catches_up = self.stage.live and not self._lost
         return min(self.leads.credit, self.together) if catches_up else super().blocks_at_once()
 
     def possible(self) -> int:
-        """See `SpindleRole`: no more than the readings reach to."""
+        """Return the number of samples to release, limited by the encoder readings (extends `SpindleRole`)."""
         samples = super().possible()
         if not self.stage.live:
             return samples
@@ -144,7 +144,7 @@ class EncoderRole(SpindleRole):
         return min(samples, there)
 
     def fall_behind(self, late: float) -> None:
-        """See `SpindleRole`; a real spindle does not wait."""
+        """Check the cell's lag behind a live encoder, which cannot wait; beyond ``max_lag`` it counts as lost."""
         if not self.stage.live:
             super().fall_behind(late)
         elif late > self._device.max_lag and not self._lost:
@@ -155,12 +155,12 @@ class EncoderRole(SpindleRole):
             )
 
     def work(self) -> None:
-        """See `SpindleRole`: the readings that have come may let blocks go."""
+        """Compute, and release the blocks that new readings allow (extends `SpindleRole`)."""
         super().work()
         self.release()
 
     def tick(self, now: float) -> float:
-        """See `Role`."""
+        """Poll the encoder and do the spindle's periodic work (implements `Role`)."""
         leads = self.leads
         if leads.active and self.stage.live and not leads.done and not leads.failure:
             self.node.attempt(self._look)
@@ -168,7 +168,7 @@ class EncoderRole(SpindleRole):
         return due if self._line is None else min(due, now + _POLL)
 
     def _look(self) -> None:
-        """Take what has come on a line; has a topic its publisher; has nothing come for too long?"""
+        """Read the encoder's line or subscribe to its topic, and check for readings that are overdue."""
         if self._lost:
             return
         with self._losing_it():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executables of ``ros2 run lathe_rc NAME``: one for each kind of node of a cell, and those that are nodes alone.
+"""Executables of ``ros2 run lathe_rc NAME``: one for each kind of cell node and for each standalone node.
 
 ``python -m lathe_rc.nodes.executables NAME ...`` is the same without an installation.
 """
@@ -17,10 +17,10 @@ from lathe_rc.nodes.arguments import exit_with
 
 
 def __getattr__(name: str) -> Callable[[], None]:
-    """The entry point of an executable.
+    """Return the entry point of an executable.
 
     Raises:
-        AttributeError: there is no such executable.
+        AttributeError: no executable has this name.
     """
     if name not in TABLES.own and importlib.util.find_spec(f"lathe_rc.nodes.{name}") is None:
         raise AttributeError(f"no node {name!r}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks that a stage reads: a queue of what has come of each topic, and a buffer of what it may still look back at."""
+"""Inputs of a stage: a queue of received blocks per topic, and a buffer for the samples that delayed inputs read."""
 
 from collections.abc import Collection, Sequence
 
@@ -12,18 +12,18 @@ from lathe_rc.nodes.block_queue import BlockQueue
 
 
 class Inputs:
-    """Inputs of a stage.
+    """Inputs of a stage, with their queues and buffers.
 
     Args:
-        ports: fully qualified topic of each input, and the input.
+        ports: fully qualified topic and port of each input.
         parameters: of the node.
-        together: blocks that are computed in one go, at most.
+        together: largest number of blocks computed in one step.
 
     Attributes:
         ports: see the arguments.
-        queues: by topic.
-        forward: queues of the inputs whose block k is needed for block k of the outputs; the others are feedback.
-        reach: sample up to which the stage may go where no input holds it back; None: any.
+        queues: block queue of each topic.
+        forward: queues of the inputs whose block k is needed for block k of the outputs; all other inputs are feedback.
+        reach: sample up to which the stage may compute if no input limits it; None: no limit.
     """
 
     def __init__(self, ports: Sequence[tuple[str, Input]], parameters: NodeParameters, together: int) -> None:
@@ -40,7 +40,7 @@ class Inputs:
         self.wire()
 
     def wire(self, without: Collection[str] = ()) -> None:
-        """Put queues and buffers in the order in which they are read; nothing waits for the topics ``without``."""
+        """Arrange queues and buffers in reading order; the topics ``without`` do not delay the computation."""
         self._inputs = [(self.queues[topic], self.buffers[topic], port.delay) for topic, port in self.ports]
         self._delayed = [port for port in self._inputs if port[2] and port[0].topic not in without]
         waits = [(topic, port.delay) for topic, port in self.ports if topic not in without]
@@ -48,14 +48,14 @@ class Inputs:
         self.forward = [self.queues[topic] for topic in dict.fromkeys(t for t, delay in waits if not delay)]
 
     def share(self) -> None:
-        """Read without a copy what is computed in this process, where nothing of its past is wanted."""
+        """Enable reading without a copy from topics of this process whose past samples are not needed."""
         self._shared = [queue for topic, queue in self.queues.items() if queue.inside and not self.buffers[topic].delay]
 
     def first(self) -> int | None:
-        """Sample with which the first blocks begin; None until every forward input has one.
+        """Return the sample at which the inputs begin; None until every forward input has a block.
 
         Raises:
-            LatheError: they do not begin with the same sample.
+            LatheError: the inputs do not begin with the same sample.
         """
         if not all(queue.blocks for queue in self.forward):
             return None
@@ -64,18 +64,18 @@ class Inputs:
         return places[0]
 
     def begin(self, first: int) -> None:
-        """The first sample to be computed is this."""
+        """Reset the buffers to begin at sample ``first``."""
         for buffer in self.buffers.values():
             buffer.restart(first)
 
     def ready(self, first: int, blocks: int, at_once: int, *, in_cell: bool) -> tuple[int, bool] | None:
-        """Samples that can be computed in one go, and whether the run ends with them; None while an input is missing.
+        """Return the number of computable samples and whether the run ends there; None while an input is missing.
 
         Args:
             first: next sample.
-            blocks: computed so far.
-            at_once: blocks to compute, at most.
-            in_cell: a time master leads.
+            blocks: number of blocks computed so far.
+            at_once: largest number of blocks to compute.
+            in_cell: a time master leads the run.
         """
         end, ended = first + at_once * self._size, False
         for queue in self.forward:
@@ -99,10 +99,10 @@ class Inputs:
         return (samples, last) if samples > 0 else None
 
     def _ends_with(self, end: int) -> bool:
-        """Whether the run ends before sample ``end``.
+        """Return True if the run ends before sample ``end``.
 
         Raises:
-            LatheError: it ends with another sample for another input.
+            LatheError: the inputs do not end with the same sample.
         """
         ends = [queue.end for queue in self.forward]
         if max(ends) > min(queue.end for queue in self.forward if queue.ended):
@@ -115,7 +115,7 @@ class Inputs:
             raise LatheError(f"inputs do not {what} with the same sample: {where}")
 
     def read(self, first: int, samples: int) -> list[Signals]:
-        """The next samples of all inputs, which are there."""
+        """Return the next samples of all inputs; they must have arrived."""
         taken = {queue.topic: queue.pop(samples) for queue in self._shared}
         return [
             taken[queue.topic] if queue.topic in taken else self._view(place, first, samples)
@@ -123,7 +123,7 @@ class Inputs:
         ]
 
     def take(self, place: int, first: int, samples: int) -> Signals:
-        """The next samples of one input, with all that has to come before them."""
+        """Return the next samples of one input, after loading all earlier ones into its buffer."""
         queue, buffer, delay = self._inputs[place]
         _load(queue, buffer, first + samples - delay)
         return buffer.view(first - delay, samples)
@@ -137,12 +137,12 @@ class Inputs:
     # ---- in a chain ---------------------------------------------------------------------------------
 
     def join_chain(self, inside: Collection[str]) -> None:
-        """Leave the topics ``inside`` of a chain to it."""
+        """Join a chain, which supplies the topics ``inside``."""
         self.wire(inside)
         self._shared = []
 
     def pass_over(self, inside: Collection[str], first: int) -> None:
-        """Put the blocks that came ``inside`` of a chain where they would be had the stage computed alone."""
+        """Move or drop queued blocks of the chain's topics ``inside``, as if the stage had computed alone up to ``first``."""
         for topic in self.buffers.keys() & inside:
             queue, buffer = self.queues[topic], self.buffers[topic]
             if buffer.delay:
@@ -152,7 +152,7 @@ class Inputs:
                     pass
 
     def part(self, inside: Collection[str], first: int) -> None:
-        """Read everything alone from now on."""
+        """Leave a chain and read all inputs from the stage's own queues, starting at ``first``."""
         for topic in self.buffers.keys() & inside:
             if not self.buffers[topic].delay:
                 self.buffers[topic].restart(first)
@@ -160,7 +160,7 @@ class Inputs:
 
 
 def _load(queue: BlockQueue, buffer: DelayBuffer, until: int) -> None:
-    """Move queued blocks into the topic's buffer until it reaches sample ``until``, as far as they have come."""
+    """Move queued blocks into the topic's buffer up to sample ``until``, as far as blocks have arrived."""
     while buffer.end < until and queue.blocks:
         block = queue.blocks.popleft()
         try:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether other nodes are alive: what DDS hears of them, and whether their processes have ended.
+"""Liveliness of other nodes: DDS liveliness, and the state of their processes on this machine.
 
 DDS asserts a node's liveliness from a thread of its own, whatever the node computes. It cannot tell a process that has
 died from one that is stopped; where the process is on this machine, the operating system can.
 
-Fast DDS may go on taking a writer for alive that says nothing any more: if a sign of life comes at the moment at which
-its lease has run out, the timer of the lease is not started again, and only a further sign would start it. So a process
-on this machine that is stopped is silent, whatever DDS says.
+Fast DDS may report a silent writer as alive: if an assertion arrives at the moment at which the lease expires, the
+lease timer is not restarted, and only a further assertion would restart it. So a stopped process on this machine
+counts as silent, whatever DDS reports.
 """
 
 import os
@@ -29,13 +29,13 @@ from lathe_rc.protocol import SILENCE, Announcement
 
 @cache
 def this_host() -> str:
-    """An identity that processes share if they see each other's numbers: the boot of a machine, and the name space."""
+    """Return an identity shared by processes that see each other's process numbers: boot id and PID name space."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return f"{boot} {Path('/proc/self/ns/pid').stat().st_ino}"
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether a process of this machine has been stopped by a signal."""
+    """Return True if a process of this machine has been stopped by a signal."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     except OSError:
@@ -44,21 +44,21 @@ def _is_stopped(pid: int) -> bool:
 
 
 def liveliness() -> QoSProfile:
-    """Of the topic `lathe_rc.messages.ALIVE`."""
+    """Return the QoS of the topic `lathe_rc.messages.ALIVE`."""
     return QoSProfile(
         depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=SILENCE)
     )
 
 
 class Watch:
-    """Watches members of the cell in other processes.
+    """Monitor of the liveliness of cell members in other processes.
 
     Args:
-        node: that watches.
-        told: called when a member has become silent, or is heard again.
+        node: node that monitors the members.
+        told: called when a member becomes silent or alive again.
 
     Attributes:
-        silent: since when a member is not heard any more, or stopped [s], monotonic, by fully qualified name.
+        silent: monotonic time since which a member is silent or stopped [s], by fully qualified name.
     """
 
     def __init__(self, node: LifecycleNode, told: Callable[[], None]) -> None:
@@ -69,7 +69,7 @@ class Watch:
         self.silent: dict[str, float] = {}
 
     def follow(self, member: Announcement) -> None:
-        """Watch a member from now on; if it announces itself from another process, that one."""
+        """Monitor a member; after an announcement from another process, monitor that process."""
         if (member.pid == os.getpid() and member.host == self._host) or self._pids.get(member.name) == member.pid:
             return
         if member.name not in self._pids:
@@ -92,7 +92,7 @@ class Watch:
                 self._node.get_logger().warning(f"{member.name}: its process {member.pid} is not watched ({error})")
 
     def close(self) -> None:
-        """Watch nobody any more; the node destroys its subscriptions itself."""
+        """Stop the monitoring; the node destroys its subscriptions itself."""
         while self._processes:
             os.close(self._processes.popitem()[1])
 
@@ -107,12 +107,12 @@ class Watch:
             self._told()
 
     def look(self) -> None:
-        """See who is silent."""
+        """Update the set of silent members."""
         silent = self._unheard | {name for name in self._processes if _is_stopped(self._pids[name])}
         self.silent = {name: self.silent.get(name, time.monotonic()) for name in silent}
 
     def ended(self) -> set[str]:
-        """Members whose process, on this machine, has ended."""
+        """Return the members whose process on this machine has ended."""
         if not self._processes:
             return set()
         poll = select.poll()

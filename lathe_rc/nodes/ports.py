@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Classes of messages, and quality of service of the topics of a cell."""
+"""ROS message classes, and quality of service (QoS) of a cell's topics."""
 
 import importlib
 import importlib.util
@@ -14,12 +14,12 @@ from lathe_rc.cell.parameters import NodeParameters
 
 
 def message_class(msgtype: str) -> Any:
-    """The rclpy class of a message type. A bag or a topic names it: no package is imported but those of interfaces.
+    """Return the rclpy class of a message type; of foreign names, only interface packages are imported.
 
     Raises:
-        ImportError: there is no such package of interfaces here.
-        AttributeError: it has no such message.
-        ValueError: that is no name of a type.
+        ImportError: no such interface package is installed.
+        AttributeError: the package has no such message.
+        ValueError: not the name of a message type.
     """
     package, kind, name = msgtype.split("/")
     if package != messages.PACKAGE and not _holds_interfaces(package):
@@ -28,9 +28,9 @@ def message_class(msgtype: str) -> Any:
 
 
 def _holds_interfaces(package: str) -> bool:
-    """Tell whether a package was made of message definitions: only those have this type support beside them.
+    """Return True if a package contains interfaces: only these packages have the type support library.
 
-    ROS's own index of resources is not asked: in an environment of wheels nothing says where it is.
+    ROS's resource index is not used: an environment of wheels does not tell where it is.
     """
     spec = importlib.util.find_spec(package) if package.isidentifier() else None
     folders = (spec.submodule_search_locations or ()) if spec else ()
@@ -38,9 +38,10 @@ def _holds_interfaces(package: str) -> bool:
 
 
 def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
-    """Reliable, and deep enough for all blocks in flight, which a late match then still receives.
+    """Return the QoS of signal topics: reliable, and deep enough that a late match receives all blocks in flight.
 
-    A reader of a cell with a window keeps all until it takes them: a flood from outside would push out what belongs.
+    A reader in a cell with a window keeps all messages until it takes them: otherwise a flood of foreign messages could
+    displace the cell's own.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_ALL if topic and parameters.window else HistoryPolicy.KEEP_LAST,
@@ -53,9 +54,9 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
 
 
 def latched_qos(depth: int = 0) -> QoSProfile:
-    """Reliable; the newest message of each publisher reaches those who come late.
+    """Return the QoS of latched topics: reliable; late readers receive the newest message of each publisher.
 
-    Without a depth, for readers: all are kept until they are taken, a flood from outside pushes none out.
+    Without a depth, for readers: all messages are kept until they are taken, so a flood of foreign ones displaces none.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that do not belong to the cell: refused, counted and named, while the cell goes on."""
+"""Counter of rejected messages from outside the cell; the cell goes on."""
 
 from collections.abc import Callable
 
@@ -9,14 +9,14 @@ _MOST = 32  # senders that are counted by name
 
 
 class RefusedMessages:
-    """Counts what a node has refused.
+    """Counter of the messages that a node has rejected.
 
     Args:
-        told: called with the first message of each sender, up to a number of senders.
+        told: called with the first message of each sender, up to a limited number of senders.
 
     Attributes:
-        senders: messages by sender; those of too many senders together.
-        topics: on which any have come.
+        senders: number of messages by sender; senders beyond the limit are counted together as ``others``.
+        topics: topics with rejected messages.
     """
 
     def __init__(self, told: Callable[[ForeignMessage], None]) -> None:
@@ -25,7 +25,7 @@ class RefusedMessages:
         self.topics: set[str] = set()
 
     def refuse(self, message: ForeignMessage) -> None:
-        """Count a message."""
+        """Count a rejected message."""
         self.topics.add(message.topic)
         new = message.sender not in self.senders
         sender = "others" if new and len(self.senders) >= _MOST else message.sender
@@ -34,5 +34,5 @@ class RefusedMessages:
             self._told(message)
 
     def __str__(self) -> str:
-        """How many of whom."""
+        """Return the number of rejected messages of each sender."""
         return ", ".join(f"{count} from {sender}" for sender, count in self.senders.items()) or "none"

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Executable: the ``rerun_bridge``, which shows the cell in Rerun while it runs and takes no part in it.
+"""Executable: the ``rerun_bridge``, which shows a running cell in Rerun without taking part in it.
 
-It is no member, so nobody waits for it: it gives no credit, and what it reads it asks for as best effort and
-volatile. A reliable reader would be served again what it has missed, and at the end of a run the publishers would
-wait 2 s for one that is stuck. It takes what has come 50 times a second: to be woken for every message would take
-more from the cell than all the showing.
+The bridge is not a member, so no node waits for it: it gives no credit, and its subscriptions are best effort and
+volatile. For a reliable reader, publishers would repeat missed messages, and at the end of a run they would wait 2 s
+for a stuck one. It polls its subscriptions 50 times a second: a wake-up for every message would cost the cell more
+than the whole display.
 """
 
 import os
@@ -46,12 +46,12 @@ _BUSY = 0.5  # [s] between looks at the graph while a run is heard
 
 
 class RerunBridge:
-    """Hears the signal topics of a cell in the main thread, and shows them in another.
+    """Bridge that reads a cell's signal topics in the main thread and shows them in another thread.
 
     Args:
-        node: in the namespace of the cell.
+        node: node in the namespace of the cell.
         parameters: what to show, and where.
-        output: that it goes to.
+        output: destination of the view.
     """
 
     def __init__(self, node: Node, parameters: RerunBridgeParameters, output: Output) -> None:
@@ -64,17 +64,17 @@ class RerunBridge:
         self._stop = False
 
     def stop(self, *_: object) -> None:
-        """End after what has been heard is shown; a signal handler."""
+        """Stop after all received messages are shown; a signal handler."""
         self._stop = True
 
     def run(self) -> list[ShownRun]:
-        """Show one run after the other until it is told to stop.
+        """Show one run after the other until stopped.
 
         Returns:
-            The runs that were shown.
+            The runs shown.
 
         Raises:
-            LatheError: a broken message, or the view cannot be written.
+            LatheError: a malformed message, or the view cannot be written.
         """
         shower = threading.Thread(target=self._show)
         shower.start()
@@ -97,7 +97,7 @@ class RerunBridge:
         return self._live.shown
 
     def _look(self) -> bool:
-        """Subscribe to what has come, and notice when everybody has gone; tells whether something is heard."""
+        """Subscribe to new topics and detect the end of all publishers; return True if messages have arrived."""
         namespace = self._node.get_namespace().rstrip("/") + "/"
         present = {
             topic: kind
@@ -121,7 +121,7 @@ class RerunBridge:
         self._node.get_logger().info(f"listens to {topic}")
 
     def _hear(self) -> None:
-        """Take what has come, some of each topic in turn: pieces wait for topics that are behind, but not for long."""
+        """Take the received messages in turns, a few per topic, since chunks wait only briefly for late topics."""
         count = -1
         while count < (count := self._heard):
             for topic, (subscription, msgtype) in self._subscriptions.items():
@@ -131,7 +131,7 @@ class RerunBridge:
                 self._backlog.put(*heard)
 
     def _show(self) -> None:
-        """Show what has been heard; the body of the other thread."""
+        """Show the received messages; main function of the second thread."""
         os.nice(_NICE)  # and of those that Rerun starts from this one
         try:
             for message in self._backlog:
@@ -145,21 +145,21 @@ class RerunBridge:
 
 
 def _nothing(_: bytes) -> None:
-    """No executor calls back."""
+    """Unused callback of the subscriptions: messages are taken without an executor."""
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
-    """Show what runs until Ctrl-C, the end of the viewer, or of the first run if so asked.
+    """Show running cells until Ctrl-C or the end of the viewer; if so configured, only the first run.
 
     Args:
-        values: parameters; those of the command line of ROS come from ``args``.
-        args: command line of ROS, from ``--ros-args`` on.
+        values: parameter values; values on the ROS command line are in ``args``.
+        args: ROS command line, starting at ``--ros-args``.
 
     Returns:
-        The runs that were shown.
+        The runs shown.
 
     Raises:
-        LatheError: a parameter, Rerun, or a broken message.
+        LatheError: an invalid parameter, an error of Rerun, or a malformed message.
     """
     require()
     signals = SignalHandlerOptions.NO
@@ -173,7 +173,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
 
 
 def main() -> NoReturn:
-    """Run the node, and exit."""
+    """Run the bridge, and exit."""
 
     def bridge(words: Sequence[str]) -> int:
         run({}, words)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stage as the role of a node: it is fed in order, computes alone or in a chain, and publishes."""
+"""Role of a node with a stage: reads blocks in order, computes alone or in a chain, and publishes."""
 
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -25,34 +25,34 @@ _TOGETHER = 2  # parts of the window: so much is computed in one go, and members
 
 
 class Chain(Protocol):
-    """Stages that compute together, see `lathe_rc.nodes.chain.Chain`."""
+    """Interface of stages that are computed together (implemented by `lathe_rc.nodes.chain.Chain`)."""
 
     def advance(self) -> None:
-        """Compute what the inputs from outside allow; the first of the stages says how far."""
+        """Compute as far as the inputs from outside the chain allow; the first stage sets the limit."""
 
     def ready(self) -> tuple[int, bool] | None:
-        """Samples that all can compute, and whether the run ends with them; None while an input is missing."""
+        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
 
     def compute(self, samples: int, *, last: bool) -> None:
-        """Let all compute so many samples, with which the run may end, and publish them."""
+        """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
 
     def leave(self) -> None:
-        """Let each stage go on alone, from where it stands."""
+        """Dissolve the chain: each stage goes on alone from its current sample."""
 
 
 class StageRole:
-    """See the module.
+    """Role of a cell node that computes a stage.
 
     Args:
-        node: that it is the role of.
+        node: node that has this role.
 
     Attributes:
         node: see the arguments.
-        stage: that it computes.
-        blocks, samples: computed so far.
-        together: blocks that are computed in one go, at most.
+        stage: stage that the role computes.
+        blocks, samples: number computed so far.
+        together: largest number of blocks computed in one step.
         started: the first sample is known.
-        chain: that it computes in; None: alone.
+        chain: chain of the stage; None if it computes alone.
     """
 
     stage: Stage
@@ -74,28 +74,28 @@ class StageRole:
     # ---- membership ---------------------------------------------------------------------------------
 
     def protocol(self, own: Announcement) -> MemberProtocol:
-        """See `Role`."""
+        """Return the node's protocol object (implements `Role`)."""
         return MemberProtocol(own, self.node.table.window, masters=MASTERS)
 
     def member_names(self) -> list[str]:
-        """See `Role`."""
+        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
         return []
 
     def publications(self) -> list[tuple[str, str, bool]]:
-        """See `Role`."""
+        """Return topic, message type and sparse flag of each output (implements `Role`)."""
         return self.outputs.publications
 
     def subscriptions(self) -> list[str]:
-        """See `Role`."""
+        """Return the topics of the stage's inputs (implements `Role`)."""
         return list(self.inputs.queues)
 
     def relative_topics(self) -> list[str]:
-        """See `Role`."""
+        """Return the stage's signal topics before remapping (implements `Role`)."""
         inputs, outputs = ([port.topic for port in self.stage.inputs], [port.topic for port in self.stage.outputs])
         return [*inputs, *outputs, *self.stage.sparse_topics]
 
     def activate(self) -> None:
-        """See `Role`; there is a service that schedules events."""
+        """Create publishers, subscriptions and the service that schedules events (implements `Role`)."""
         self.outputs.activate()
         for topic, queue in self.inputs.queues.items():
             queue.inside = self.node.exchange.has(topic)
@@ -105,7 +105,7 @@ class StageRole:
         self.node.create_service(Schedule, "~/schedule", self._on_schedule)
 
     def members_changed(self) -> None:
-        """Learn whose blocks to accept, before the first of them."""
+        """Set the expected source of each input from the members' announcements, before its first block."""
         protocol = self.node.protocol
         peers = protocol.master.members if protocol.master else tuple(protocol.members)
         for name in peers:
@@ -116,7 +116,7 @@ class StageRole:
                     self._expect(queue, name)
 
     def _expect(self, queue: BlockQueue, source: str) -> None:
-        """Accept a member's blocks: in a cell from the first on; alone, with a run, from the first to come."""
+        """Set a queue's source: in a cell from block 0; without a cell, with a run id, from the first block received."""
         if self.node.protocol.master is None:
             if self.node.table.run_id and not queue.source:
                 queue.expect(source, None)
@@ -127,10 +127,10 @@ class StageRole:
         queue.repeats = self.node.protocol.restarts(source)
 
     def begin(self, *, joins: bool) -> None:
-        """See `Role`.
+        """Prepare for block 0, or resume from a kept state in a running cell (implements `Role`).
 
         Raises:
-            LatheError: the cell is running, and there is nothing to go on from.
+            LatheError: the cell is running, and the node has no kept state to resume from.
         """
         if self.restart is not None:
             self.restart.begin(joins=joins)
@@ -140,10 +140,10 @@ class StageRole:
             )
 
     def perform(self, action: Action) -> None:
-        """See `Role`."""
+        """Ignore the actions of a time master (implements `Role`)."""
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        """See `Role`; the newest samples of lost members are held."""
+        """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
         if self.chain is not None:
             self.chain.leave()
         for queue in self.inputs.queues.values():
@@ -157,11 +157,11 @@ class StageRole:
         self.node.due = True
 
     def become_safe(self, first: int) -> None:
-        """Be safe from a sample on."""
+        """Switch the stage to its safe state, starting at sample ``first``."""
         self.stage.lose(first)
 
     def _follow_the_master(self, first: int) -> None:
-        """Go no further than the spindle: a node that reads from lost members alone would run ahead to the end."""
+        """Limit the stage to the spindle's progress; with inputs from lost members only, it would compute up to the end."""
         node, master = self.node, self.node.protocol.master
         assert master is not None, "it has declared the safe state"
         self.inputs.reach = first
@@ -178,32 +178,32 @@ class StageRole:
         node.listen(topic, messages.ENCODER, partial(come, pace.add), partial(come, pace.take))
 
     def failed(self) -> None:
-        """See `Role`; the stages that it computes with go on alone."""
+        """Dissolve the chain after a failure; its other stages go on alone (implements `Role`)."""
         if self.chain is not None:
             self.chain.leave()
 
     def finish(self) -> None:
-        """See `Role`."""
+        """Do nothing: a stage has no files to close (implements `Role`)."""
 
     def clean_up(self) -> None:
-        """See `Role`."""
+        """Leave the chain and the exchange of the process (implements `Role`)."""
         self.failed()
         if self in self.node.exchange.stages:
             self.node.exchange.stages.remove(self)
 
     def tick(self, now: float) -> float:
-        """See `Role`."""
+        """Check for readers in other processes; no further call is due (implements `Role`)."""
         self.outputs.tick(now)
         return float("inf")
 
     def statistics(self) -> dict[str, object]:
-        """See `Role`."""
+        """Return blocks, samples, lost blocks and missing inputs for the diagnostics (implements `Role`)."""
         waiting = {f"waiting for {topic}": not queue.blocks for topic, queue in self.inputs.queues.items()}
         return {"blocks": self.blocks, "samples": self.samples, "lost blocks": self.lost, **waiting}
 
     @property
     def lost(self) -> int:
-        """Blocks that never came, in a free-running cell."""
+        """Return the number of blocks lost in a free-running cell."""
         return sum(queue.lost for queue in self.inputs.queues.values())
 
     # ---- events -------------------------------------------------------------------------------------
@@ -227,12 +227,12 @@ class StageRole:
 
     @property
     def computes(self) -> bool:
-        """Whether it takes part in a cell that runs."""
+        """Return True if the node takes part in a running cell."""
         protocol = self.node.protocol
         return protocol.active and protocol.ready and not (protocol.failure or protocol.over)
 
     def work(self) -> None:
-        """See `Role`: compute every block whose inputs are there."""
+        """Compute every block whose inputs have arrived (implements `Role`)."""
         if self.node.protocol.master is not None and not self.node.protocol.ready:
             return  # blocks may wait there for a latecomer
         if not self.started and any(queue.blocks for queue in self.inputs.forward):
@@ -245,7 +245,7 @@ class StageRole:
             self.compute(samples, last=last)
 
     def ready(self) -> tuple[int, bool] | None:
-        """Samples to compute in one go, and whether the run ends with them; None while an input is missing."""
+        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
         if not self.started:
             # Alone, a node may join a stream that is under way; in a cell it begins at 0.
             first = self.inputs.first() if self.inputs.forward else None
@@ -256,16 +256,16 @@ class StageRole:
         return self.inputs.ready(self.samples, self.blocks, self.at_once(), in_cell=in_cell)
 
     def at_once(self) -> int:
-        """Blocks to compute in one go, at most: up to the one after which the state is to be kept."""
+        """Return the largest number of blocks for one step: the step ends where the state has to be kept."""
         return self.together if self.restart is None else max(min(self.together, self.restart.keep_at - self.blocks), 1)
 
     def start(self, first: int) -> None:
-        """The first sample to be computed is this."""
+        """Begin the computation at sample ``first``."""
         self.started, self.samples = True, first
         self.inputs.begin(first)
 
     def compute(self, samples: int, *, last: bool) -> None:
-        """Compute some blocks in one go, and publish each; the last one of the run may be shorter."""
+        """Compute and publish some blocks in one step; the last block of the run may be shorter."""
         memory = self.outputs.memory(samples)
         inputs = self.inputs.read(self.samples, samples)
         said = self.stage.advance(self.samples, inputs, [signals for signals, _ in memory], last=last)
@@ -281,7 +281,7 @@ class StageRole:
             self.restart.keep()
 
     def _complete(self) -> None:
-        """The last block has been computed."""
+        """Finish after the last block: report events that were not reached, and lost blocks."""
         if waiting := self.stage.waiting:
             self.node.get_logger().warning(f"not reached: {'; '.join(waiting)}")
             self.node.reporter("not_reached", self.node.get_name(), events=waiting)
@@ -293,28 +293,28 @@ class StageRole:
 
     @property
     def may_join(self) -> bool:
-        """Whether it can compute in a chain from now on."""
+        """Return True if the stage can still join a chain."""
         return not self.started and self.restart is None and bool(self.node.table.window) and self.computes
 
     @property
     def cell(self) -> str:
-        """Name of its time master; empty as long as it has none."""
+        """Return the name of the time master; empty as long as none is known."""
         master = self.node.protocol.master
         return master.name if master is not None else ""
 
     def join(self, chain: Chain, inside: Collection[str]) -> None:
-        """Compute in a chain from sample 0 on, whose stages publish the topics ``inside``."""
+        """Join a chain at sample 0; the stages of the chain publish the topics ``inside``."""
         self.chain = chain
         self.inputs.join_chain(inside)
         self.start(0)
 
     def lead(self) -> None:
-        """As the first of a chain, let it compute what the inputs allow."""
+        """As the first stage of a chain, let the chain compute as far as its inputs allow."""
         while self.chain is not None and (ready := self.chain.ready()):
             self.chain.compute(ready[0], last=ready[1])
 
     def publish_copies(self, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool) -> None:
-        """Publish what the chain has computed: copies, for readers keep what they are given."""
+        """Publish copies of the arrays that the chain has computed, since readers keep the published arrays."""
         samples = next(iter(outputs[0].values())).size
         memory = self.outputs.memory(samples)
         for (copies, _), signals in zip(memory, outputs, strict=True):
@@ -325,6 +325,6 @@ class StageRole:
         self._publish(sparse, memory, samples, last=last)
 
     def part(self, inside: Collection[str]) -> None:
-        """Compute alone from now on."""
+        """Leave the chain and compute alone."""
         self.chain, self.node.due = None, True
         self.inputs.part(inside, self.samples)
