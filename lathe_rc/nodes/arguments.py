@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of a node's executable: what ROS does not answer or refuse; this module imports no ROS."""
+"""Command line of a node's executable: help, and the errors that ROS does not report; imports no ROS."""
 
 import json
 import signal
@@ -21,13 +21,13 @@ _LONGEST_END = 20  # [s] that destructors may take
 
 
 class Rule(NamedTuple):
-    """A parameter on the command line.
+    """Parameter rule (``-p``) on the command line.
 
     Attributes:
-        text: ``NODE:PARAM:=VALUE``, as it was given.
-        node: whom it is for; empty: everybody.
-        parameter: its name.
-        value: as YAML.
+        text: rule as given, ``NODE:PARAM:=VALUE``.
+        node: name of the target node; empty: all nodes.
+        parameter: name of the parameter.
+        value: value in YAML.
     """
 
     text: str
@@ -37,30 +37,30 @@ class Rule(NamedTuple):
 
 
 def ask_for_help(words: Sequence[str]) -> bool:
-    """Whether a command line does."""
+    """Return True if a command line asks for help."""
     return "--help" in words or "-h" in words
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The arguments before ``--ros-args``, and the rest."""
+    """Split a command line into the arguments before ``--ros-args`` and the rest."""
     end = list(words).index(ROS) if ROS in words else len(words)
     return list(words[:end]), list(words[end:])
 
 
 def help_or_refusal(program: str, name: str, table: type[Table], words: Sequence[str]) -> bool:
-    """Show a node's help if it is asked for.
+    """Show a node's help if requested; otherwise check its command line.
 
     Args:
-        program: how the node is started.
-        name: of the node.
-        table: its parameters.
-        words: the command line.
+        program: command that starts the node.
+        name: name of the node.
+        table: parameter table of the node.
+        words: command line.
 
     Returns:
-        Whether it was shown.
+        True if the help was shown.
 
     Raises:
-        InputError: something that ROS would pass over.
+        InputError: an argument that ROS would ignore.
     """
     if ask_for_help(words):
         _show(program, name, table)
@@ -91,12 +91,12 @@ def _show(program: str, name: str, table: type[Table]) -> None:
 
 
 def executable(name: str, table: type[Table], run: Callable[[list[str]], int]) -> NoReturn:
-    """Be the executable of a node: answer or refuse its command line, or run it, and exit.
+    """Run the executable of a node: show its help, report errors of its command line or run the node, and exit.
 
     Args:
-        name: of the node and its executable.
-        table: its parameters.
-        run: what it does with a command line of ROS; returns the exit code.
+        name: name of the node and its executable.
+        table: parameter table of the node.
+        run: function that runs the node with a ROS command line and returns the exit code.
     """
 
     def work() -> int:
@@ -107,7 +107,7 @@ def executable(name: str, table: type[Table], run: Callable[[list[str]], int]) -
 
 
 def exit_with(work: Callable[[], int]) -> NoReturn:
-    """Exit with the code of some work, or with that of its error after one line."""
+    """Exit with the exit code of a function; print a `LatheError` in one line and exit with its code."""
     try:
         code = work()
     except LatheError as error:
@@ -118,13 +118,13 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
 
 
 def bound_the_end() -> None:
-    """Let SIGALRM end this process if it does not leave: in one of some hundred ends Fast DDS waits for itself."""
+    """Kill this process by SIGALRM if its exit hangs: about one in some hundred exits of Fast DDS deadlocks."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(_LONGEST_END)
 
 
 def rules(words: Sequence[str]) -> Iterator[Rule]:
-    """Each ``-p`` of a command line that ROS has accepted."""
+    """Yield each ``-p`` rule of a valid ROS command line."""
     is_ros = False
     for word, following in pairwise([*words, ""]):
         if word in (ROS, "--"):
@@ -136,15 +136,15 @@ def rules(words: Sequence[str]) -> Iterator[Rule]:
 
 
 def parameter_files(words: Sequence[str]) -> list[Path]:
-    """The parameter files of a command line of ROS."""
+    """Return the parameter files of a ROS command line."""
     return [Path(following) for word, following in pairwise([*words, ""]) if word == "--params-file"]
 
 
 def texts(words: Sequence[str]) -> set[str]:
-    """All texts that are values of parameters on a command line of ROS and in its files.
+    """Return all string values of parameters on a ROS command line and in its parameter files.
 
     Raises:
-        InputError: a file cannot be read.
+        InputError: a parameter file cannot be read.
     """
     values = [ros_yaml.parse_value(rule.value, f"-p {rule.text}") for rule in rules(words)]
     values += [

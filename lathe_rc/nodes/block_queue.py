@@ -127,7 +127,7 @@ class BlockQueue(BlockOrder):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """Return the state that another process needs to resume: next sample, blocks received, queued blocks, newest block."""
+        """Return the state for a restart: next sample, number of blocks received, queued blocks and newest block."""
         return self.end, self.received, list(self.blocks), self._newest
 
     def go_on(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:

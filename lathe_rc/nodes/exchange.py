@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals between the nodes of one process: handed over in memory, not through DDS.
+"""Exchange of signals between the nodes of one process: in memory, without DDS.
 
-Which topics stay inside is settled once, when the nodes of a process have been configured and before any of them is
-activated. Nodes that are configured later, and those in other processes, use DDS. What is handed over is the same:
-the arrays that the publisher computed, which nobody writes to afterwards, or the bytes of a message at a chosen sample.
-Blocks that were computed in one go come in one piece.
+The topics inside the process are fixed once, after the nodes of the process have been configured and before any is
+activated. Nodes configured later, and nodes in other processes, use DDS. The exchange passes on the publisher's arrays
+themselves, which are not modified afterwards, or the bytes of a message at a chosen sample. Blocks computed in one step
+are passed on as one `Run`.
 """
 
 from collections import defaultdict
@@ -16,18 +16,18 @@ from lathe_rc.cell.wiring import Cell
 
 
 class Run(NamedTuple):
-    """Consecutive blocks in one piece.
+    """Consecutive blocks, joined into one.
 
     Attributes:
-        block: all of their samples, and the companions of the last; if it is the last, so is the last of them.
-        companions: what each of them says of its companions, see BlockInfo.msg.
+        block: the samples of all blocks, with the companions and the ``last`` flag of the last one.
+        companions: companions of each block, see BlockInfo.msg.
     """
 
     block: Block
     companions: Sequence[int]
 
     def blocks(self, size: int) -> Iterator[Block]:
-        """Each of them, as views; ``size`` is their length, the last of the run may be shorter [sample]."""
+        """Yield each block as a view; ``size`` is the block size [sample], the last block of the run may be shorter."""
         if len(self.companions) == 1:
             yield self.block
             return
@@ -41,16 +41,16 @@ Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
 
 
 def _alone(role: Any, cell: Cell | None) -> None:
-    """Let each stage compute by itself."""
+    """Default of `Exchange.form`: no chains, each stage computes alone."""
 
 
 class Exchange:
-    """Blocks that nodes hand over inside of a process.
+    """Exchange of blocks between the nodes of one process.
 
     Attributes:
-        master: takes the Progress of a node, if the time master is in this process.
+        master: callback for the Progress of a node, if the time master is in this process.
         stages: roles with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
-        form: lets a stage and those of its cell that wait here compute together, if it is given what they make.
+        form: function that forms chains of a stage and the waiting stages of its cell; takes the role and the cell.
     """
 
     def __init__(self, form: Callable[[Any, Cell | None], None] = _alone) -> None:
@@ -61,26 +61,26 @@ class Exchange:
         self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
 
     def join(self, published: Iterable[str]) -> None:
-        """Take in the fully qualified topics that a configured node publishes."""
+        """Register the topics that a configured node publishes, by fully qualified name."""
         self._inside.update(published)
 
     def has(self, topic: str) -> bool:
-        """Whether a node of this process publishes a topic."""
+        """Return True if a node of this process publishes a topic."""
         return topic in self._inside
 
     def listen(self, topic: str, member: str, callback: Callable[[Any], None]) -> None:
-        """Let a node read a topic that `has`; its callback gets every `Delivery`."""
+        """Subscribe a node to a topic of this process (see `has`); its callback receives every `Delivery`."""
         self._readers[topic][member] = callback
 
     def read(self, topic: str) -> bool:
-        """Whether anybody in this process reads a topic."""
+        """Return True if a node of this process reads a topic."""
         return topic in self._readers
 
     def readers(self, topic: str) -> set[str]:
-        """Fully qualified names of the nodes that read a topic here, and not through DDS."""
+        """Return the fully qualified names of the nodes that read a topic here instead of through DDS."""
         return set(self._readers.get(topic, ()))
 
     def hand_over(self, topic: str, delivery: Delivery) -> None:
-        """Give a message to the readers in this process."""
+        """Pass a message on to the readers in this process."""
         for callback in self._readers.get(topic, {}).values():
             callback(delivery)

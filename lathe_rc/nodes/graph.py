@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Facts from ROS's graph and from announcements: which topics have met, and which parameters members really have."""
+"""ROS graph and announcements: matched topics, and the actual parameters of the members."""
 
 import json
 import tempfile
@@ -26,7 +26,7 @@ Announced = tuple[dict[str, NodeParameters], dict[str, Unknown]]
 
 
 def publishers(node: Node, topic: str) -> list[str]:
-    """Nodes that publish a topic."""
+    """Return the nodes that publish a topic."""
     return sorted(_name(end) for end in node.get_publishers_info_by_topic(topic))
 
 
@@ -37,16 +37,16 @@ def unmatched(
     protocol: MemberProtocol,
     exchange: Exchange,
 ) -> Iterator[str]:
-    """Topics that have not met all of their members, each with the missing ones.
+    """Return the topics with missing peers, each with the members that have not matched yet.
 
-    The graph knows names, but runs ahead of what DDS has matched; DDS counts matches, but without names.
+    The ROS graph has names, but may list endpoints before DDS has matched them; DDS counts matches, but without names.
 
     Args:
-        node: that has them.
-        inlets: subscription of each topic, by fully qualified name.
-        outlets: publisher of each topic, likewise.
-        protocol: knows the members.
-        exchange: has the readers in this process.
+        node: node that has the topics.
+        inlets: subscriptions by fully qualified topic.
+        outlets: publishers by fully qualified topic.
+        protocol: protocol object with the known members.
+        exchange: exchange with the readers in this process.
     """
     for topic, inlet in inlets.items():
         expected = protocol.expected_writers(topic)
@@ -74,19 +74,19 @@ def announced(
     namespace: str,
     report_unknown: Callable[[str, str, str], None],
 ) -> Announced:
-    """The members' announcements, by their name in a namespace: for a `lathe_rc.cell.wiring.Cell`.
+    """Return the members' announcements by relative name, as input for a `lathe_rc.cell.wiring.Cell`.
 
     Args:
-        members: all that have been heard.
-        names: those of the cell.
-        namespace: with its slash at the end.
-        report_unknown: gets the name and the stage of a member that is not known here, and why.
+        members: all announcements received.
+        names: names of the cell's members.
+        namespace: namespace with a trailing slash.
+        report_unknown: called with the name and the stage of a member of unknown kind, and the reason.
 
     Returns:
-        The parameters of the members that are known here, and the topics of the others.
+        The parameters of members of known kinds, and the topics of all other members.
 
     Raises:
-        InputError: a member that is known has a parameter that cannot be.
+        InputError: a member of a known kind has an invalid parameter.
     """
     tables, unknown = dict[str, NodeParameters](), dict[str, Unknown]()
     for name in names:
@@ -106,7 +106,7 @@ def _topics_of(member: Announcement, namespace: str) -> Unknown:
 
 
 def _table(member: Announcement, report_unknown: Callable[[str, str, str], None]) -> NodeParameters | None:
-    """The parameters that a member has announced; None, and reported, if its stage is unknown here."""
+    """Return the announced parameters of a member; None, after a report, if its stage is unknown here."""
     try:
         kind = TABLES.get(member.stage)
         why = "there is no such stage here"
@@ -125,7 +125,7 @@ def _table(member: Announcement, report_unknown: Callable[[str, str, str], None]
 
 
 def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
-    """Why the parameters that a member announces are not taken: they name code or files that it may not name."""
+    """Return the reason to reject announced parameters: they name code or files that a member may not name."""
     for row in kind.rows().values():
         value = values[row.name]
         if row.named is not None:
@@ -139,7 +139,7 @@ def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
 
 
 def _may_announce(path: str) -> bool:
-    """Whether a member may name a file: as the user does, one that comes with lathe_rc, or one of a bag's replay."""
+    """Return True if a member may name a file: a file of the user, of lathe_rc, or of a replayed bag."""
     if allowed_code.is_named(path):
         return True
     place, temporary = resources.find(Path(path)).resolve(), Path(tempfile.gettempdir()).resolve()

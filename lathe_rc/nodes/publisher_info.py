@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Offers of the publishers of any topic: message types as they are installed here, and quality of service."""
+"""Publishers of arbitrary topics: installed message types and offered quality of service (QoS)."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,10 +16,10 @@ from lathe_rc.errors import InputError
 
 
 def installed(msgtype: str) -> Typestore:
-    """A message type and those that it is made of, as their packages define them here.
+    """Return a message type and its nested types, as defined by the installed packages.
 
     Raises:
-        InputError: one of them is not installed.
+        InputError: a type is not installed.
     """
     found: dict[str, Any] = {}
     wanted = {msgtype}
@@ -38,7 +38,7 @@ def installed(msgtype: str) -> Typestore:
 
 
 def _used(kind: Any) -> Iterable[str]:
-    """The message types in a field's description."""
+    """Yield the message types in a field description."""
     if kind[0] == Nodetype.NAME:
         yield kind[1]
     elif kind[0] != Nodetype.BASE:
@@ -46,7 +46,7 @@ def _used(kind: Any) -> Iterable[str]:
 
 
 def offered(publisher: TopicEndpointInfo) -> Qos:
-    """The offer of a publisher, in the form of bags. DDS does not carry history and depth."""
+    """Return the offered QoS of a publisher in the form used by bags; DDS transmits no history and depth."""
     qos = publisher.qos_profile
     deadline, lifespan, lease = (
         QosTime(*divmod(duration.nanoseconds, 10**9))
@@ -66,7 +66,7 @@ def offered(publisher: TopicEndpointInfo) -> Qos:
 
 
 def asked(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """The most that all publishers offer; a full queue makes reliable ones wait."""
+    """Return the strictest QoS that all publishers offer; with a full queue, reliable publishers wait."""
     reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return QoSProfile(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder as the role of a node: every signal topic of the cell in one bag, sorted, complete, always closed."""
+"""Recorder role of a node: records every signal topic of the cell in one bag, sorted, complete and always closed."""
 
 import json
 import shutil
@@ -41,19 +41,19 @@ _HOST_TOPICS = {
 
 
 class _Encoders(dict[tuple[str, str, str, int], Encoder]):
-    """By message type, run, source and step [ns]."""
+    """Block encoders by message type, run, source and step [ns]."""
 
     def __missing__(self, key: tuple[str, str, str, int]) -> Encoder:
-        """Make it."""
+        """Create the encoder of a key."""
         encoder = self[key] = Encoder(*key)
         return encoder
 
 
 class RecorderRole:
-    """See the module. It subscribes to the topics that the members announce; alone, to those of any announcement.
+    """Role of the recorder; subscribes to the topics of all members, or without a cell to all announced topics.
 
     Args:
-        node: that it is the role of.
+        node: node that has this role.
     """
 
     def __init__(self, node: CellNode) -> None:
@@ -82,22 +82,22 @@ class RecorderRole:
         self._flush_due = 0.0
 
     def protocol(self, own: Announcement) -> MemberProtocol:
-        """See `Role`; it is wired once it has subscribed to the topics of the members."""
+        """Return the node's protocol object; it is wired after the subscriptions are created (implements `Role`)."""
         return MemberProtocol(own, self.table.window, masters=MASTERS, wired=False)
 
     def member_names(self) -> list[str]:
-        """See `Role`."""
+        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
         return []
 
     def relative_topics(self) -> list[str]:
-        """See `Role`."""
+        """Return the relative signal topics: none, since a recorder has no stage (implements `Role`)."""
         return []
 
     def begin(self, *, joins: bool) -> None:
-        """See `Role`.
+        """Prepare for block 0 (implements `Role`).
 
         Raises:
-            LatheError: the cell is running, and its first blocks are gone.
+            LatheError: the cell is running already, and its first blocks are lost.
         """
         if joins:
             raise LatheError(
@@ -105,16 +105,16 @@ class RecorderRole:
             )
 
     def perform(self, action: Action) -> None:
-        """See `Role`."""
+        """Ignore the actions of a time master (implements `Role`)."""
 
     def work(self) -> None:
-        """See `Role`: messages are written as they come."""
+        """Do nothing: messages are written when they arrive (implements `Role`)."""
 
     def failed(self) -> None:
-        """See `Role`."""
+        """Do nothing after a failure (implements `Role`)."""
 
     def activate(self) -> None:
-        """Subscribe to the host topics; the signals follow when the members have announced them."""
+        """Subscribe to the host topics; the signal topics follow when the members have announced them."""
         self.node.create_service(Trigger, "~/snapshot", self._on_snapshot)
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.node.topic(topic)
@@ -123,7 +123,7 @@ class RecorderRole:
             self.node.create_subscription(kind, full, callback, qos, raw=True)
 
     def clean_up(self) -> None:
-        """See `Role`; a bag without a block, of a cell that did not begin, is nothing to keep."""
+        """Reset the role; the bag of a cell that did not begin holds no block and is removed (implements `Role`)."""
         self.finish()
         if not self._blocks and self._path.is_dir():
             shutil.rmtree(self._path)
@@ -154,15 +154,15 @@ class RecorderRole:
             self._open.write(topic, self._log_ns, data)
 
     def publications(self) -> list[tuple[str, str, bool]]:
-        """It publishes no signals."""
+        """Return the published signals: none."""
         return []
 
     def subscriptions(self) -> list[str]:
-        """All signal topics of the members."""
+        """Return all signal topics of the members."""
         return [*self._queues, *self._sparse]
 
     def statistics(self) -> dict[str, object]:
-        """See `Role`."""
+        """Return the recorder's figures for the diagnostics (implements `Role`)."""
         told: dict[str, object] = {"blocks": self._blocks, "lost blocks": self._lost, "bag": str(self._path)}
         if self._snapshots is not None:
             told |= {"snapshots": self._snapshots.bags, "memory for snapshots [B]": self._snapshots.held}
@@ -175,7 +175,7 @@ class RecorderRole:
     # ---- topics -------------------------------------------------------------------------------------
 
     def members_changed(self) -> None:
-        """Subscribe once all members are known; beside a spindle that runs alone, to whatever is announced."""
+        """Subscribe once all members are known; with a spindle that runs alone, to every announced topic."""
         members = self.node.protocol.members
         for name, pid in self._processes.items():
             if self._merger is not None and members[name].pid != pid:
@@ -210,7 +210,7 @@ class RecorderRole:
         self.node.describe(subscribes=tuple(self.subscriptions()))
 
     def _peers(self) -> list[str]:
-        """The members; beside a spindle that runs alone, all nodes that have announced themselves."""
+        """Return the members; with a spindle that runs alone, all announced nodes."""
         protocol = self.node.protocol
         return list(protocol.members if protocol.master is None else protocol.master.members)
 
@@ -220,7 +220,7 @@ class RecorderRole:
         self.node.get_logger().info(f"snapshots: up to {needed} B of memory, bags in {snapshots.folder}")
 
     def _explain(self) -> None:
-        """Let the bag say what was run, with the parameters that the members really have."""
+        """Store the scenario in the bag, with the parameters that the members announce."""
         tables, _ = self.node.announced(self._peers())
         if tables:
             host = [self.node.topic(topic) for topic in _HOST_TOPICS]
@@ -242,7 +242,7 @@ class RecorderRole:
         self.node.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_run, queue))
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        """See `Role`; what they published is held, and the bag says from which sample on."""
+        """Hold the newest samples of lost members; the bag records from which sample (implements `Role`)."""
         assert self._merger is not None, "only a cell with a window has a safe state"
         held: dict[str, int] = {}
         for topic, queue in self._queues.items():
@@ -263,7 +263,7 @@ class RecorderRole:
     # ---- snapshots ----------------------------------------------------------------------------------
 
     def _tell_snapshot(self, snapshot: Snapshot) -> None:
-        """Say that one has been begun or closed."""
+        """Report that a snapshot was begun or closed."""
         sample, cause = snapshot.triggers[0]
         span = f"samples {snapshot.first} to {snapshot.first + snapshot.samples - 1}"
         if not snapshot.samples:
@@ -302,14 +302,14 @@ class RecorderRole:
     # ---- data ---------------------------------------------------------------------------------------
 
     def tick(self, now: float) -> float:
-        """See `Role`; what a crash may lose is bounded in time as well."""
+        """Flush the bag periodically, so that a crash loses a bounded time (implements `Role`)."""
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
             self.node.attempt(self._writer.flush)
         return self._flush_due
 
     def _on_message_at(self, topic: str, msgtype: str, data: bytes) -> None:
-        """A message at a chosen sample, of a node in another process."""
+        """Check and record a message at a chosen sample from a node in another process."""
         try:
             message = messages.decode(msgtype, data)
         except ValueError as error:
@@ -330,7 +330,7 @@ class RecorderRole:
         self._on_sparse(topic, data)
 
     def _expect_joints(self, topic: str, sample: int, begin: int) -> None:
-        """They name no sender, but there is one for each period, and no more."""
+        """Reject unexpected joint states: they name no sender, but one is due per period."""
         period, waiting = self._joints[topic]
         waiting -= {other for other in waiting if other < begin}
         if sample % period or sample in waiting:
@@ -349,7 +349,7 @@ class RecorderRole:
             self._drain()
 
     def _on_message(self, queue: BlockQueue, data: bytes) -> None:
-        """A block of a node in another process."""
+        """Record a block from a node in another process."""
         if self.node.protocol.over:
             return
         block = queue.add(data)
@@ -363,7 +363,7 @@ class RecorderRole:
             self._drain()
 
     def _on_run(self, queue: BlockQueue, run: Run) -> None:
-        """Blocks of a node in this process; the messages at chosen samples among them have come before."""
+        """Record blocks from a node in this process; their messages at chosen samples have arrived before."""
         if self.node.protocol.over:
             return
         queue.take(run)
@@ -385,7 +385,7 @@ class RecorderRole:
             self._write_unsorted(queue, block, data)
 
     def _write_unsorted(self, queue: BlockQueue, block: Block, data: bytes) -> None:
-        """Free-running, blocks may be missing, so nothing can be waited for: write in the order of arrival."""
+        """Write a block of a free-running cell in order of arrival: blocks may be missing, so sorting cannot wait."""
         self._write(block.log_ns, queue.topic, data)
         if block.last:
             self._ended.add(queue.topic)
@@ -395,14 +395,14 @@ class RecorderRole:
             self._complete()
 
     def _complete(self) -> None:
-        """The last block of every topic is written."""
+        """Finish after the last block of every topic is written."""
         self.node.reporter("complete", self.node.get_name(), blocks=self._blocks)
         self.finish()
         self.node.completed(self._blocks, self._samples, last=True)
         self.node.complete_part()
 
     def _drain(self) -> None:
-        """Write every block that is complete."""
+        """Write every block that is complete on all topics."""
         assert self._merger is not None
         self._merger.release()
         self._log_ns, self._blocks, self._samples = self._merger.log_ns, self._merger.rows, self._merger.samples
@@ -416,7 +416,7 @@ class RecorderRole:
         self._log_ns = max(self._log_ns, log_ns)
 
     def finish(self) -> None:
-        """Write what is left and close the bag."""
+        """Write the remaining data and close the bag."""
         if self._writer is None:
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Restart of a node in mid-run: it keeps its state in a file, and another process goes on from there.
+"""Restart of a node in mid-run: the node stores its state in a file, and a new process resumes from it.
 
-The newest blocks of a process may be lost with it: DDS sends nothing again for the dead. No reader is more than a
-window behind, so the state in the file is at least a window old, and the new process sends the blocks since then once
-more. Nor is it older than two windows: suppliers, which may be a window ahead, keep three and some more.
+The newest blocks of a process may be lost when it dies, since DDS then repeats no message. No reader is more than one
+window behind, so the state in the file is at least one window old, and the new process sends the blocks since then
+again. The state is at most two windows old: publishers, which may be one window ahead, keep a little more than three.
 """
 
 from collections import deque
@@ -20,7 +20,7 @@ from lathe_rc.nodes.outputs import Outputs
 
 
 class Resumable(Protocol):
-    """A stage's role as far as its state is kept, see `lathe_rc.nodes.stage_role.StageRole`."""
+    """Interface of a stage's role whose state can be stored (see `lathe_rc.nodes.stage_role.StageRole`)."""
 
     node: CellNode
     stage: Stage
@@ -35,14 +35,14 @@ class Restart:
     """State of a stage in a file.
 
     Args:
-        role: that has the stage.
-        file: where to keep the state.
+        role: role of the stage.
+        file: path of the state file.
 
     Attributes:
-        keep_at: blocks after which the state is kept next.
+        keep_at: number of blocks after which the state is stored next.
 
     Raises:
-        InputError: in a cell without a window.
+        InputError: the cell has no window.
     """
 
     def __init__(self, role: Resumable, file: str) -> None:
@@ -57,13 +57,13 @@ class Restart:
         self._states: deque[tuple[int, bytes, list[tuple[str, int]]]] = deque()
 
     def begin(self, *, joins: bool) -> None:
-        """Begin, or go on from the state of another process."""
+        """Begin at block 0, or resume from the state of another process."""
         if joins:
             self._resume()
         self.keep()
 
     def keep(self) -> None:
-        """Keep the state, and write the one of a window ago."""
+        """Keep the current state in memory, and write the state of one window ago to the file."""
         blocks = self._role.blocks
         self.keep_at = blocks + self._window
         self._states.append((blocks, state_file.dump(self._kept()), []))
@@ -72,7 +72,7 @@ class Restart:
         self._write()
 
     def keep_event(self, action: str, index: int) -> None:
-        """Let another process know of an event that this one was asked for."""
+        """Append a scheduled event to the state file, for a process that resumes."""
         for _, _, events in self._states:
             events.append((action, index))
         if self._states:
@@ -83,7 +83,7 @@ class Restart:
         state_file.save(Path(self._file), state, state_file.dump({"events": events}))
 
     def _kept(self) -> dict[str, object]:
-        """All that the next block depends on, and of which start of the cell it is."""
+        """Return the state that the next block depends on, with the session of the cell."""
         role, master = self._role, self._node.protocol.master
         assert master is not None, "it has announced all members"
         return {
@@ -98,7 +98,7 @@ class Restart:
         }
 
     def _resume(self) -> None:
-        """Go on from the state of another process."""
+        """Resume from the state of another process."""
         role, fresh, protocol = self._role, self._kept(), self._node.protocol
         state = state_file.load(Path(self._file), self._node.table, fresh, Block)
         if state["of"] != fresh["of"]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spindle as time master: it checks the cell, releases blocks by window and pace, and tells the simulated time."""
+"""Time master role of the spindle: checks the cell, releases blocks by window and pace, publishes simulated time."""
 
 import time
 from collections import deque
@@ -27,10 +27,10 @@ _JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is judged 
 
 
 class SpindleRole(StageRole):
-    """See the module; its stage is the spindle and its encoder.
+    """Role of the time master; its stage is the spindle and its encoder.
 
     Attributes:
-        pace: of the run.
+        pace: schedule of the run.
     """
 
     stage: TimeMaster
@@ -52,11 +52,11 @@ class SpindleRole(StageRole):
 
     @property
     def leads(self) -> TimeMasterProtocol:
-        """The node's protocol."""
+        """Return the node's protocol object as a time master's."""
         return cast("TimeMasterProtocol", self.node.protocol)
 
     def protocol(self, own: Announcement) -> TimeMasterProtocol:
-        """See `Role`."""
+        """Create and return the time master's protocol object (implements `Role`)."""
         table = self.table
         reactions = Reactions(
             stall_reaction=table.stall_reaction,
@@ -70,14 +70,14 @@ class SpindleRole(StageRole):
         return protocol
 
     def member_names(self) -> list[str]:
-        """See `Role`: all members, the spindle included; none when it runs alone."""
+        """Return the names of all members, spindle included; empty if it runs alone (implements `Role`)."""
         if not self.table.members:
             return []
         others = (name if name.startswith("/") else self.node.namespace + name for name in self.table.members)
         return [self.node.full_name, *others]
 
     def activate(self) -> None:
-        """See `Role`."""
+        """Create the publishers, subscriptions and services of the time master (implements `Role`)."""
         super().activate()
         node = self.node
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
@@ -88,7 +88,7 @@ class SpindleRole(StageRole):
         self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
 
     def statistics(self) -> dict[str, object]:
-        """See `Role`."""
+        """Return the time master's figures for the diagnostics (implements `Role`)."""
         leads = self.leads
         return {
             **super().statistics(),
@@ -102,7 +102,7 @@ class SpindleRole(StageRole):
     # ---- requests of the protocol -------------------------------------------------------------------
 
     def perform(self, action: actions.Action) -> None:
-        """See `Role`."""
+        """Perform an action of the time master's protocol (implements `Role`)."""
         match action:
             case actions.CheckCell():
                 self._check_cell()
@@ -120,7 +120,7 @@ class SpindleRole(StageRole):
                     self.node.reporter("pace", self.node.get_name(), **figures)
 
     def _check_cell(self) -> None:
-        """Make the same check as before an offline run, with the parameters that the members really have."""
+        """Check the cell as before an offline run, with the actual parameters of the members, and start the run."""
         if names := self.leads.own.members:
             cell = Cell(*self.node.announced(names))
             cell.check()
@@ -132,23 +132,23 @@ class SpindleRole(StageRole):
         self.leads.start(time.monotonic())
 
     def start_run(self) -> None:
-        """Block 0 may go."""
+        """Start the run: begin the schedule and form chains."""
         self.pace.schedule = time.monotonic()
         self.node.exchange.form(self, self._cell)
         if self.chain is None and self.inputs.ports:
             self.start(0)
 
     def become_safe(self, first: int) -> None:
-        """See `StageRole`: lead the others, as before; the newest samples of lost members are held."""
+        """Keep the spindle turning in the safe state; the newest samples of lost members are held (see `StageRole`)."""
 
     # ---- blocks -------------------------------------------------------------------------------------
 
     def blocks_at_once(self) -> int:
-        """Blocks to release at once, at most."""
+        """Return the largest number of blocks to release in one step."""
         return 1 if self.table.speed_factor else min(self.leads.credit, self.together)
 
     def possible(self) -> int:
-        """Samples to release at once; 0 while it, or others in its chain, wait for an input."""
+        """Return the number of samples to release in one step; 0 while the spindle or its chain waits for an input."""
         samples = self.table.block_size * self.blocks_at_once()
         if self.chain is None and not self.inputs.ports:
             return samples
@@ -179,7 +179,7 @@ class SpindleRole(StageRole):
         self.node.next_tick = time.monotonic()
 
     def _is_due(self, blocks: int) -> bool:
-        """Whether the next blocks may go; counts how late they are."""
+        """Return True if the next blocks are due; count their lateness."""
         now, due = time.monotonic(), self.pace.due(self.blocks)
         if now < due:
             self.node.next_tick = min(self.node.next_tick, due)
@@ -192,7 +192,7 @@ class SpindleRole(StageRole):
         return self.leads.may_release
 
     def _tell_lag(self, lag: float) -> None:
-        """Say early that the members cannot hold the pace, and a grouping that costs less: fewer processes."""
+        """Warn early that the members cannot hold the pace, and suggest a cheaper grouping with fewer processes."""
         members = self.leads.members.values()
         processes = {member.process for member in members}
         recorders = [member.name for member in members if not member.publishes]
@@ -207,15 +207,15 @@ class SpindleRole(StageRole):
         self.node.reporter("behind", self.node.get_name(), message=text)
 
     def fall_behind(self, late: float) -> None:
-        """Put the schedule off: the members are too slow for the pace."""
+        """Postpone the schedule by ``late`` [s]: the members are too slow for the pace."""
         self.pace.slip(late)
 
     def lead(self) -> None:
-        """See `StageRole`: as far as credit and pace allow."""
+        """Release blocks as far as credit and pace allow (extends `StageRole`)."""
         self.node.attempt(self.release)
 
     def work(self) -> None:
-        """Take the progress of members in this process: not at once, the block that they report may be under way."""
+        """Process the progress of members in this process, deferred because the reported block may be in progress."""
         for _ in range(len(self._reported)):  # their reports on the blocks that this releases have their turn later
             report = self._reported.popleft()
             self.node.due = self.node.due or bool(self._reported)  # an error leaves the rest for the next turn
@@ -224,7 +224,7 @@ class SpindleRole(StageRole):
             self.release()  # blocks of the cut may let others go
 
     def tick(self, now: float) -> float:
-        """See `Role`."""
+        """Release blocks that are due; return the time of the next call (implements `Role`)."""
         super().tick(now)
         if self.leads.running:
             self.node.attempt(self.release)

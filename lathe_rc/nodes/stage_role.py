@@ -116,7 +116,7 @@ class StageRole:
                     self._expect(queue, name)
 
     def _expect(self, queue: BlockQueue, source: str) -> None:
-        """Set a queue's source: in a cell from block 0; without a cell, with a run id, from the first block received."""
+        """Set a queue's source: in a cell from block 0 on; without a cell, from the first block that arrives."""
         if self.node.protocol.master is None:
             if self.node.table.run_id and not queue.source:
                 queue.expect(source, None)
@@ -161,7 +161,7 @@ class StageRole:
         self.stage.lose(first)
 
     def _follow_the_master(self, first: int) -> None:
-        """Limit the stage to the spindle's progress; with inputs from lost members only, it would compute up to the end."""
+        """Limit the stage to the spindle's progress; with all inputs lost, it would compute up to the end of the run."""
         node, master = self.node, self.node.protocol.master
         assert master is not None, "it has declared the safe state"
         self.inputs.reach = first

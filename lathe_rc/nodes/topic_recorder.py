@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Executable: the ``topic_recorder``, which records any topics in the order in which they were published."""
+"""Executable: the ``topic_recorder``, which records arbitrary topics in the order of publication."""
 
 import signal
 import threading
@@ -34,14 +34,14 @@ _AT_ONCE = 10_000  # messages of a topic that are taken before the others have t
 
 
 class TopicRecorder:
-    """Records topics into a bag.
+    """Recorder of arbitrary topics into a bag.
 
     Args:
-        node: that subscribes.
-        parameters: what to record, and where.
+        node: node that subscribes.
+        parameters: topics to record, and the path of the bag.
 
     Raises:
-        InputError: no bag, or a place where none can be begun.
+        InputError: no path of a bag, or the bag cannot be created there.
     """
 
     def __init__(self, node: Node, parameters: TopicRecorderParameters) -> None:
@@ -74,7 +74,7 @@ class TopicRecorder:
     # ---- topics -------------------------------------------------------------------------------------
 
     def _graph(self) -> Mapping[str, Sequence[str]]:
-        """Message types by topic, of those that have publishers."""
+        """Return the message types by topic, for topics that have publishers."""
         return {
             topic: types
             for topic, types in self._node.get_topic_names_and_types()
@@ -89,7 +89,7 @@ class TopicRecorder:
         return self._parameters.all or not (topic in _OWN or any(part[:1] == "_" for part in topic.split("/")))
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared; with simulated time, to /clock before anything else."""
+        """Subscribe to new topics; with simulated time, subscribe to /clock first."""
         graph = self._graph()
         if self._looks <= _LOOKS:
             self._present |= graph.keys()
@@ -162,7 +162,7 @@ class TopicRecorder:
             self._order.add(topic, source_ns, sequence, data + bytes(-len(data) % 4))
 
     def _take_all(self) -> bool:
-        """Take what has arrived; returns whether that is all."""
+        """Take the messages that have arrived; return True if none are left."""
         emptied = True
         for topic, inlet in self._inlets.items():
             with inlet.handle:
@@ -181,7 +181,7 @@ class TopicRecorder:
             self.written += 1
 
     def _step(self) -> int:
-        """Wait a moment for messages, take and write them; returns how many came."""
+        """Wait briefly for messages, take and write them; return their number."""
         before = self._taken
         # The executor wakes up for one message; the rest of a burst is taken without it, ten times as fast.
         self._executor.spin_once(timeout_sec=_LOOK)
@@ -202,12 +202,12 @@ class TopicRecorder:
     # ---- run ----------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Record until it is stopped, or all publishers are gone; then close the bag.
+        """Record until stopped or until all publishers have gone; then close the bag.
 
         Raises:
-            InputError: a topic that is named cannot be recorded.
-            LatheError: the disk does not take it, or /clock is of no use.
-            LossyRunError: messages are missing, or not where they belong.
+            InputError: a named topic cannot be recorded.
+            LatheError: the bag cannot be written, or /clock is not usable.
+            LossyRunError: messages are missing or out of order.
         """
         looked = 0.0
         try:
@@ -226,7 +226,7 @@ class TopicRecorder:
         self._tell()
 
     def _left(self) -> bool:
-        """Whether somebody was there, and nobody is."""
+        """Return True if there were publishers and all of them have gone."""
         return bool(self._taken) and not any(inlet.get_publisher_count() for inlet in self._inlets.values())
 
     def _tell(self) -> None:
@@ -255,12 +255,12 @@ def _work(node: Node, parameters: TopicRecorderParameters) -> None:
 
 
 def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Record until it is stopped; see `standalone_node.run`."""
+    """Record until stopped (see `standalone_node.run`)."""
     return standalone_node.run(KIND, TopicRecorderParameters, _work, values, args)
 
 
 def main() -> NoReturn:
-    """Run the node, and exit."""
+    """Run the topic recorder, and exit."""
     arguments.executable(KIND, TopicRecorderParameters, partial(run, {}))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of a cell, without I/O: joining, progress and credit, silence and death, the safe state and the end.
+"""Protocol of a cell, without I/O: joining, progress and credit, silence and death of members, safe state and end.
 
-A node hands events to its `MemberProtocol`, each with the time, and does what the protocol then asks for (`actions`).
+A node passes events with their time to its `MemberProtocol`, and performs the requests of the protocol (`actions`).
 Nothing here publishes, waits, reads a clock or starts a thread: so thousands of cells can be simulated in a second.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests of the protocol to its node: each is done once, in the order in which they stand."""
+"""Requests of the protocol to its node: each is performed once, in the order of the list."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -26,37 +26,37 @@ class Tell(NamedTuple):
 
 
 class TellTime(NamedTuple):
-    """Publish the simulated time: the slowest member has completed so many samples."""
+    """Publish the simulated time, given by the samples that the slowest member has completed."""
 
     samples: int
 
 
 class Follow(NamedTuple):
-    """Watch a member: the liveliness of its topic ``alive``, and its process."""
+    """Monitor a member: the liveliness of its topic ``alive``, and its process."""
 
     member: Announcement
 
 
 class MembersChanged(NamedTuple):
-    """Take in a new announcement: of whom to accept blocks, to which topics to subscribe."""
+    """Update the node after a new announcement: sources of blocks, and topics to subscribe to."""
 
 
 class Begin(NamedTuple):
-    """Prepare for block 0, or to ``join`` a run that is under way; answer with `MemberProtocol.begun`."""
+    """Prepare for block 0, or to ``join`` a running cell; answered with `MemberProtocol.begun`."""
 
     joins: bool
 
 
 class CheckCell(NamedTuple):
-    """Check the cell that the announcements describe; answer with `TimeMasterProtocol.start`."""
+    """Check the cell described by the announcements; answered with `TimeMasterProtocol.start`."""
 
 
 class Start(NamedTuple):
-    """Block 0 may go: form chains, and begin the schedule."""
+    """Start the run at block 0: form chains, and begin the schedule."""
 
 
 class TellPace(NamedTuple):
-    """Report how late the blocks of the run were."""
+    """Report the lateness of the blocks of the run."""
 
 
 class Release(NamedTuple):
@@ -64,9 +64,9 @@ class Release(NamedTuple):
 
 
 class Lose(NamedTuple):
-    """Do without lost members: the run ends with sample ``end``; be safe from sample ``first`` on.
+    """Continue without lost members: safe state from sample ``first`` on, end of the run at sample ``end``.
 
-    ``again``: others were lost before, and the node is safe already.
+    ``again``: members were lost before, and the node is in its safe state already.
     """
 
     lost: frozenset[str]
@@ -90,7 +90,7 @@ class Report(NamedTuple):
 
 
 class Leave(NamedTuple):
-    """Wait up to ``patience`` [s] until other nodes have the last messages, and leave; answer with `left`."""
+    """Leave, after at most ``patience`` [s] for the acknowledgement of the last messages; answered with `left`."""
 
     patience: float
 

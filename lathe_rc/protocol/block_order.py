@@ -1,29 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Order of the blocks of one topic: each once, none missing, from one source."""
+"""Order of the blocks of one topic: each block once, no gaps, from one source."""
 
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol.messages import ForeignMessage
 
 
 class BlockOrder:
-    """Which block may come next.
+    """Sequence check of the blocks of one topic.
 
     Args:
         topic: fully qualified name.
-        run_id: of the cell; empty: any.
-        longest_gap: samples that may be missing in a free-running cell; None: none may, the cell has a window.
+        run_id: run id of the cell; empty: any.
+        longest_gap: largest number of missing samples in a free-running cell; None: no gaps, the cell has a window.
 
     Attributes:
         topic: see the arguments.
-        source: the only node whose blocks are accepted; empty: until a source is expected, none if there is a run, and
-            the first to come if there is none.
-        open: it is not known yet with which sample the blocks begin.
+        source: the only node whose blocks are accepted; while empty, no blocks are accepted with a run id, and blocks of
+            any node without one: the first node becomes the source.
+        open: the first sample of the blocks is not known yet.
         end: index after the newest sample, with which the next block has to begin unless it is `open`.
-        received: blocks so far, those that were lost included.
-        lost: blocks that never came; always 0 unless the cell is free-running.
-        ended: the last block has come.
-        repeats: blocks may come twice: their source may be another process that goes on in its place.
-        held_from: sample from which on the newest sample is held, since the source is lost; None: it is not.
+        received: number of blocks so far, lost blocks included.
+        lost: number of lost blocks; always 0 unless the cell is free-running.
+        ended: the last block has arrived.
+        repeats: blocks may be repeated, since the source can be restarted in another process.
+        held_from: sample from which the newest sample of a lost source is held; None: the source is not lost.
     """
 
     def __init__(self, topic: str, run_id: str, longest_gap: int | None = None) -> None:
@@ -35,16 +35,16 @@ class BlockOrder:
         self.held_from: int | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
-        """Accept blocks of this node alone, from a sample on; None: the first to come."""
+        """Accept blocks of one node only, starting at sample ``first``; None: starting at the first block that arrives."""
         self.source, self.open = source, first is None
         self.received = self.lost = 0
         self.end, self.ended = first or 0, False
 
     def admit(self, run_id: str, source: str) -> None:
-        """Refuse a stranger.
+        """Reject a block from outside the cell.
 
         Raises:
-            ForeignMessage: another run or source.
+            ForeignMessage: the block has another run id or source.
         """
         if self._run_id and run_id != self._run_id:
             raise ForeignMessage(self.topic, source, run_id, f"expected run {self._run_id!r}")
@@ -52,10 +52,10 @@ class BlockOrder:
             raise ForeignMessage(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
 
     def missing(self, source: str, first: int, samples: int) -> int | None:
-        """Samples that are missing before a block; None: it is a repeat, or another one already stands for it.
+        """Return the number of samples missing before a block; None for a repeat, or if a held block replaces it.
 
         Raises:
-            LatheError: a gap or a repeat that may not be.
+            LatheError: a gap or repeat that is not allowed.
         """
         if self.held_from is not None:
             return None
@@ -72,17 +72,17 @@ class BlockOrder:
         return missing
 
     def append(self, end: int, blocks: int = 1, *, last: bool) -> None:
-        """The next blocks, which end before a sample, are there."""
+        """Record the arrival of the next blocks, which end before sample ``end``."""
         self.end, self.ended = end, last
         self.received += blocks
 
     def hold(self, end: int) -> None:
-        """The source is lost: its newest sample stands for all that follow up to sample ``end``, where the run ends."""
+        """Hold the newest sample of a lost source up to sample ``end``, where the run ends."""
         self.held_from = self.end
         self.end = max(end, self.held_from)
         self.open, self.ended = False, True
 
     def resume(self, source: str, end: int, received: int, *, ended: bool) -> None:
-        """Go on from the state of another process; blocks from before it are repeats."""
+        """Resume from the state of another process; earlier blocks count as repeats."""
         self.source, self.end, self.received, self.ended = source, end, received, ended
         self.open, self.repeats = False, True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One member of a cell: how it joins, begins, reports progress, notices the others' fate, fails and ends."""
+"""Protocol of one cell member: joining, start, progress, monitoring of other members, failure and end."""
 
 import json
 import math
@@ -27,31 +27,31 @@ _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until it is reported; the las
 
 
 class MemberProtocol:
-    """State of a member. Events are methods, with the monotonic time ``now`` [s]; requests wait in `actions`.
+    """State machine of a cell member: events are methods with monotonic time ``now`` [s], `actions` holds requests.
 
     Args:
-        own: first announcement of this member, with all of its topics that are known already.
-        window: blocks that may be in flight; 0: nothing holds the time master back.
-        masters: kinds of node that may be time masters.
-        wired: all publishers and subscriptions are there once it is active; else from `describe` on.
+        own: first announcement of this member, with the topics known so far.
+        window: largest number of blocks in flight; 0: the cell is free-running.
+        masters: kinds of nodes that may be time masters.
+        wired: True if all publishers and subscriptions exist once the member is active; False: only after `describe`.
 
     Attributes:
         actions: requests to the node, oldest first; the node empties it after each event.
         own: the newest announcement of this member.
         members: the newest announcement of each member, by fully qualified name.
-        master: that of the time master; None as long as none has been heard.
-        phase: of the cell, as the time master says; None as long as it has said nothing.
-        active: between activation and deactivation.
-        ready: every topic is matched, and the node has begun.
-        safe: it knows that members are lost.
-        over: its part of the run is complete.
-        done: it may leave.
-        failure: why it gave up.
-        without: members that are lost.
-        unmatched: topics that have not met their peers, as the node has seen last, for messages.
-        patience: for messages to be acknowledged [s].
-        silent: since when a member is not heard any more, or stopped [s], by name.
-        ended: members whose process, on this machine, has ended.
+        master: the newest announcement of the time master; None before the first.
+        phase: phase of the cell published by the time master; None before the first message.
+        active: the node is active (between activation and deactivation).
+        ready: every topic is matched, and the node is prepared for its first block.
+        safe: this member knows that members are lost.
+        over: this member's part of the run is complete.
+        done: this member may leave.
+        failure: reason of this member's failure.
+        without: lost members.
+        unmatched: topics with missing peers at the last look at the graph, for messages.
+        patience: longest wait for acknowledgements [s].
+        silent: time since which a member is silent or stopped [s], by name.
+        ended: members whose process on this machine has ended.
     """
 
     def __init__(
@@ -90,12 +90,12 @@ class MemberProtocol:
 
     @property
     def takes_part(self) -> bool:
-        """Whether the others of a cell that runs need this member."""
+        """Return True if the other members of a running cell need this member."""
         runs = self.phase in (Phase.RUNNING, Phase.SAFE)
         return runs and self.master is not None and not (self.over or self.failure)
 
     def activate(self, now: float) -> None:
-        """The node exchanges messages from now on, or again."""
+        """Activate the member, or resume after a deactivation: messages are exchanged from now on."""
         self.active = True
         if not self._started:
             self._started = True
@@ -104,17 +104,17 @@ class MemberProtocol:
         self.announce()
 
     def deactivate(self) -> None:
-        """The node stands still, and so does the cell."""
+        """Deactivate the member: node and cell pause."""
         self.active = False
 
     def clean_up(self) -> None:
-        """The node leaves the cell, which shall not begin without it: it says that it joins anew."""
+        """Leave the cell, which must not begin without this member: its next announcement is a new join."""
         self.active = self.ready = False
         if self._started:
             self.announce()
 
     def shut_down(self, now: float) -> None:
-        """The node is finalized; in the middle of a run as one that has failed."""
+        """Finalize the node; in mid-run the member counts as failed."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))
         else:
@@ -122,7 +122,7 @@ class MemberProtocol:
         self.active = False
 
     def interrupt(self, signal: str) -> None:
-        """The node's process is told to end by a signal."""
+        """Handle a signal that ends the node's process."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
         elif self._started and not (self.over or self.failure or self.done):
@@ -133,7 +133,7 @@ class MemberProtocol:
     # ---- announcements ------------------------------------------------------------------------------
 
     def describe(self, **topics: tuple[object, ...]) -> None:
-        """Take new lists of topics into the announcement: fields of `Announcement`."""
+        """Update fields of the announcement, such as the lists of topics (see `Announcement`)."""
         self.own, self._wired = replace(self.own, **topics), True  # type: ignore[arg-type]
         self.announce()
 
@@ -160,10 +160,10 @@ class MemberProtocol:
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
     def hear_member(self, member: Announcement, now: float) -> None:
-        """A member has announced itself.
+        """Process a member's announcement.
 
         Raises:
-            ForeignMessage: it is no member of this cell.
+            ForeignMessage: the sender is no member of this cell.
         """
         if member.name == self.own.name and member.process == self.own.process:
             return  # this one
@@ -184,7 +184,7 @@ class MemberProtocol:
         self.members_changed(now)
 
     def _hear_master(self, master: Announcement, now: float) -> None:
-        """A time master has announced itself: the one of this cell, or its newest process."""
+        """Process a time master's announcement: this cell's time master, or a new process of it."""
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
@@ -193,7 +193,7 @@ class MemberProtocol:
             self.hear_cell_state(state, now)
 
     def _forget_master(self) -> None:
-        """Wait for another time master, before the run."""
+        """Forget the time master and wait for another; only before the run."""
         self.master = self.phase = None
         self.ready = self._beginning = False
         self.announce()
@@ -203,7 +203,7 @@ class MemberProtocol:
         return name in peers and name != self.own.name and name not in self.without
 
     def _check(self, member: Announcement) -> None:
-        """Refuse a stranger."""
+        """Reject an announcement from outside the cell."""
         why, known = "", self.members.get(member.name)
         if self.own.run_id and member.run_id != self.own.run_id:
             why = f"expected run {self.own.run_id!r}"
@@ -226,23 +226,23 @@ class MemberProtocol:
             raise ForeignMessage("members", member.name, member.run_id, why)
 
     def _may_lead(self, other: Announcement) -> bool:
-        """Whether a time master may take the place of the one so far: before the run, if it alone names this member."""
+        """Return True if a time master may replace the current one: before the run, if only it names this member."""
         if self.master is None or other.name == self.master.name:
             return True
         names_this = self.own.name in other.members and self.own.name not in self.master.members
         return names_this and self.phase in (None, Phase.WAITING)
 
     def _lives(self, member: Announcement) -> bool:
-        """Whether a process of this machine is known to live; of other machines nothing is known."""
+        """Return True if a process of this machine is known to be alive; False for processes of other machines."""
         if member is self.own:
             return False  # `_meet_namesake` decides
         return bool(member.pid) and member.host == self.own.host and member.name not in self.ended
 
     def _meet_namesake(self, other: Announcement) -> None:
-        """Another process has this member's name: the newcomer gives up, without a word that others take for ours.
+        """Resolve a name conflict with another process: the newcomer fails without an announcement under that name.
 
         Raises:
-            ForeignMessage: the other one is the newcomer.
+            ForeignMessage: the other process is the newcomer.
         """
         established = (MemberState.READY, MemberState.SAFE)
         if self.failure or self.done:
@@ -257,40 +257,40 @@ class MemberProtocol:
         self.done = True
 
     def members_changed(self, now: float) -> None:
-        """A member has announced something new."""
+        """Request an update of the node after a new announcement."""
 
     def member_failed(self, member: Announcement, now: float) -> None:
-        """A member has given up; once the cell may be running, the time master says what is to be done."""
+        """Handle the failure of a member; once the cell may be running, the time master decides on the reaction."""
         if not self.ready:
             self.abandon(member)
 
     def abandon(self, member: Announcement) -> None:
-        """Give up because a member has."""
+        """Fail because another member has failed."""
         self.fail(LatheError(f"{member.name} {why_failed(member)}"), cause="abandoned")
 
     def parameter(self, name: str, key: str) -> object:
-        """A parameter that a member has announced; None if it has no such."""
+        """Return a parameter that a member has announced; None if it has no such parameter."""
         return _parsed(self.members[name].parameters).get(key)
 
     def restarts(self, name: str) -> bool:
-        """Whether another process may take the place of a member."""
+        """Return True if a member can be restarted in another process."""
         return bool(self.parameter(name, "restart_file"))
 
     # ---- until block 0 ------------------------------------------------------------------------------
 
     @property
     def complete(self) -> bool:
-        """Whether the time master and all members that it names have announced themselves."""
+        """Return True if the time master and all members that it names have announced themselves."""
         return self.master is not None and all(name in self.members for name in self.master.members)
 
     @property
     def alone(self) -> bool:
-        """Whether a time master is there that names no members."""
+        """Return True if a time master is known that names no members."""
         return any(member.stage in self._masters and not member.members for member in self.members.values())
 
     @property
     def wants_match(self) -> bool:
-        """Whether the node shall look at ROS's graph and call `matched`: nothing else is missing until it is ready."""
+        """Return True if only topic matching is missing before the start, so that the node has to call `matched`."""
         if not self.active or self.ready or self._beginning or self.failure or not self.complete:
             return False
         if self.phase is None:  # the cell may be running already
@@ -299,11 +299,11 @@ class MemberProtocol:
         return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
 
     def expected_writers(self, topic: str) -> set[str]:
-        """Members that publish a topic."""
+        """Return the members that publish a topic."""
         return {peer.name for peer in self._peers() if topic in peer.publishes}
 
     def expected_readers(self, topic: str) -> set[str]:
-        """Members that subscribe to a topic."""
+        """Return the members that subscribe to a topic."""
         return {peer.name for peer in self._peers() if topic in peer.subscribes}
 
     def _peers(self) -> Iterator[Announcement]:
@@ -311,10 +311,10 @@ class MemberProtocol:
         return (self.members[name] for name in names if name != self.own.name and name in self.members)
 
     def matched(self, unmatched: Sequence[str]) -> None:
-        """The node has looked at the graph.
+        """Process the node's look at the ROS graph.
 
         Args:
-            unmatched: topics that have not met all of their members yet, each with the missing ones.
+            unmatched: topics with missing peers, each with the names of the missing members.
         """
         self.unmatched = unmatched
         if not unmatched and self.wants_match:
@@ -322,14 +322,14 @@ class MemberProtocol:
             self.actions.append(do.Begin(joins=self.phase != Phase.WAITING))
 
     def begun(self, now: float) -> None:
-        """The node is prepared for block 0."""
+        """Record that the node is prepared for its first block."""
         self.ready, self._beginning = True, False
         self.announce()
         self._report("ready")
         self.members_changed(now)
 
     def missing(self) -> list[str]:
-        """Members and topics that this one waits for until it can begin; empty if it has begun, or waits for none."""
+        """Return the members and topics that this member still needs in order to begin; empty if none."""
         if self.done or self.failure or (self.ready and self.phase not in (None, Phase.WAITING)):
             return []
         if not self.active:
@@ -348,7 +348,7 @@ class MemberProtocol:
         return [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
 
     def _near(self, name: str) -> str:
-        """A hint at a node of nearly the name of a member, which the time master does not name."""
+        """Return a hint at a node with a similar name that the time master does not name."""
         assert self.master is not None, "it names the member"
         close = get_close_matches(name, self.members.keys() - set(self.master.members), 1)
         return f" ({close[0]} is there)" if close else ""
@@ -356,7 +356,7 @@ class MemberProtocol:
     # ---- progress -----------------------------------------------------------------------------------
 
     def computed(self, blocks: int, samples: int, now: float, *, last: bool) -> None:
-        """The node has completed so many blocks and samples in all; the time master hears it now and then."""
+        """Record the number of blocks and samples completed; progress is reported to the time master at intervals."""
         self._moved = now
         # At the same blocks in every member: the time master waits for the slowest.
         if last or blocks // self.progress_step > self._reported_blocks // self.progress_step:
@@ -364,16 +364,16 @@ class MemberProtocol:
             self.actions.append(do.Tell(Progress(self.own.run_id, self.own.name, blocks, samples, self._session)))
 
     def resumed(self, blocks: int) -> None:
-        """The node goes on in the place of another process, after so many blocks."""
+        """Record that the node resumes in place of another process, after a number of blocks."""
         self._reported_blocks = blocks
 
     # ---- the state of the cell ----------------------------------------------------------------------
 
     def hear_cell_state(self, state: CellState, now: float) -> None:
-        """The time master has said how the run goes.
+        """Process the cell state published by the time master.
 
         Raises:
-            ForeignMessage: it is that of another run.
+            ForeignMessage: the cell state belongs to another run.
         """
         if state.run_id != self.own.run_id:
             if self.own.run_id:
@@ -395,7 +395,7 @@ class MemberProtocol:
             self.go_safe(state)
 
     def go_safe(self, state: CellState) -> None:
-        """Members are lost."""
+        """Enter the safe state, since members are lost."""
         if self.own.name in state.lost or not self.ready:
             self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
             return
@@ -409,12 +409,12 @@ class MemberProtocol:
     # ---- time ---------------------------------------------------------------------------------------
 
     def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
-        """Do what is due; the node calls this at least ten times a second, and when a member falls silent.
+        """Do the periodic work; called at least ten times a second, and when a member becomes silent.
 
         Args:
             now: monotonic time [s].
-            silent: since when each member that is not heard, or stopped, has been so [s].
-            ended: members whose process, on this machine, has ended.
+            silent: time since which each silent or stopped member has been so [s].
+            ended: members whose process on this machine has ended.
         """
         self.silent, self.ended = silent, ended
         if now >= self._leave_due:
@@ -433,7 +433,7 @@ class MemberProtocol:
                 self._report("waits", missing=missing)
 
     def look_after_others(self, now: float) -> None:
-        """Name a time master that is silent, and leave if it is gone: without it no sample follows."""
+        """Report a silent time master, and fail if it is gone, since no further block can follow."""
         if self.master is None:
             return
         name = self.master.name
@@ -454,7 +454,7 @@ class MemberProtocol:
             self.fail(LatheError(given_up(name)), cause="masterless")
 
     def _wait_for_another_master(self, master: Announcement) -> None:
-        """The time master has ended before the run, as far as this member knows; others may know better."""
+        """Wait for another time master after one has ended before the run; other members may have more information."""
         failed = [each for each in self._peers() if each.state == MemberState.FAILED]
         self._former_peers = master.members
         if failed:
@@ -464,7 +464,7 @@ class MemberProtocol:
             self._forget_master()
 
     def _name_a_silent_master(self, name: str, now: float) -> None:
-        """Say once that it stalls: it cannot say so itself."""
+        """Report once that the time master stalls the cell, since it cannot report this itself."""
         silent = self.phase == Phase.RUNNING and name in self.silent
         if silent and not self._master_stalls:
             if now - self._moved < SILENCE:  # blocks that were on their way are still being computed
@@ -473,7 +473,7 @@ class MemberProtocol:
         self._master_stalls = silent
 
     def _tell_stall(self, name: str, blocks: int) -> None:
-        """Say that a member is silent since it has completed so many blocks."""
+        """Report that a member is silent, with the number of blocks that it has completed."""
         # In this order: to log for the first time takes some 70 ms.
         self._report("stall", member=name, blocks=blocks)
         self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
@@ -481,7 +481,7 @@ class MemberProtocol:
     # ---- failure and end ----------------------------------------------------------------------------
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
-        """Give up, and say so to all; ``cause`` is ``abandoned`` if another node is to blame."""
+        """Fail and announce the reason; ``cause`` is ``abandoned`` if another node is the cause."""
         if self.failure:
             return
         self.failure = error
@@ -497,36 +497,36 @@ class MemberProtocol:
 
     @property
     def exit_code(self) -> int:
-        """Of the node's process: 0 if it has done its part of a run that came to its end."""
+        """Return the exit code of the node's process: 0 if it completed its part of a completed run."""
         return self.failure.exit_code if self.failure else int(self.safe) * LatheError.exit_code
 
     def _leave_with_the_cell(self) -> None:
-        """Leave, having given up, if the others go on no more."""
+        """Leave after a failure, once no other member goes on."""
         self.done = self.done or self.phase in (Phase.ENDED, Phase.FAILED)
 
     @property
     def others_go_on(self) -> bool:
-        """Whether this one has given up where the others may have to go on to the cell's safe state."""
+        """Return True if this member has failed while the others may still be on their way to the safe state."""
         return bool(self.failure) and self.ready and self.master is not None and self.master.name != self.own.name
 
     def complete_part(self) -> None:
-        """The node's part is over. In a cell it stays until all have ended; else until others have its last messages.
+        """Complete this member's part; it stays until the cell has ended, or without a cell until messages are acknowledged.
 
-        DDS sends a lost message again only as long as its process lives. A node that has given up stays as well, while
-        the others go on: its announcement says why, also to members that look later.
+        DDS repeats a lost message only as long as the sending process lives. A failed node stays as well while the others
+        go on: its announcement holds the reason, also for members that read it later.
         """
         self.over = True
         if self.master is None or self.master.name == self.own.name:
             self.leave(self.patience)
 
     def leave(self, patience: float = 0.0) -> None:
-        """Ask the node to leave, once; with its messages unacknowledged if the others need none of them."""
+        """Request once that the node leaves, after at most ``patience`` [s] for the acknowledgement of its messages."""
         if not self._leaving:
             self._leaving = True
             self.actions.append(do.Leave(patience))
 
     def left(self) -> None:
-        """The node has waited for its last messages."""
+        """Record that the node has finished waiting for its last messages."""
         self.done = True
 
     def _log(self, level: str, text: str) -> None:
@@ -538,16 +538,16 @@ class MemberProtocol:
 
 @lru_cache(maxsize=_MOST_MEMBERS)
 def _parsed(parameters: str) -> Any:
-    """Announced parameters: each member repeats the same ones, and the time master asks for them again and again."""
+    """Parse announced parameters; cached, since each member repeats them and the time master reads them often."""
     return json.loads(parameters)
 
 
 def why_failed(member: Announcement) -> str:
-    """The member's message about its failure, without its name at the beginning."""
+    """Return a member's failure message without its name at the beginning."""
     own_name = member.name.rpartition("/")[2]
     return f"failed: {member.message.removeprefix(f'{own_name}: ')}"
 
 
 def given_up(master: str) -> str:
-    """The announcement of members that go on without a silent time master."""
+    """Return the failure message of members that stop waiting for a silent time master."""
     return f"{master}, the time master, has been silent for {GIVEN_UP:g} s: no sample follows"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three messages of the protocol, with the fields of the ROS messages of the same names.
+"""Messages of the protocol, with the fields of the ROS messages of the same names.
 
-A ``session`` tells two starts of one scenario apart, whose run ids are equal: the time master draws it, members take it
-over from its announcement, and 0, of a third-party node, stands for any.
+A ``session`` distinguishes two starts of one scenario, whose run ids are equal: the time master draws it, members copy
+it from its announcement, and 0, used by third-party nodes, matches any session.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _LONGEST = 256  # characters of a name that is quoted
 
 
 class MemberState(IntEnum):
-    """How far a member has come; the constants of Member.msg."""
+    """State of a member; the constants of Member.msg."""
 
     JOINING = 0
     WIRED = 1
@@ -35,7 +35,7 @@ class Phase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """Member.msg: a member says its name, its topics and how far it has come."""
+    """Announcement of a member: name, topics and state (Member.msg)."""
 
     run_id: str
     name: str
@@ -54,13 +54,13 @@ class Announcement:
 
     @property
     def process(self) -> tuple[str, int]:
-        """Host and process number: two announcements with the same are of the same process."""
+        """Return host and process number, which identify the process of the announcement."""
         return self.host, self.pid
 
 
 @dataclass(frozen=True, slots=True)
 class CellState:
-    """CellState.msg: the time master says how the run goes."""
+    """State of the run, published by the time master (CellState.msg)."""
 
     run_id: str
     state: int
@@ -73,7 +73,7 @@ class CellState:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress.msg: a member says how many blocks and samples it has completed."""
+    """Number of blocks and samples that a member has completed (Progress.msg)."""
 
     run_id: str
     name: str
@@ -83,13 +83,13 @@ class Progress:
 
 
 class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong
-    """A message from outside the cell; it is refused and counted, and the cell goes on.
+    """Error for a message from outside the cell; the message is rejected and counted, and the cell goes on.
 
     Args:
-        topic: fully qualified.
-        source: sender that the message names; empty if it names none.
-        run_id: run that it names.
-        why: what was expected.
+        topic: fully qualified name.
+        source: sender named by the message; empty if none is named.
+        run_id: run id in the message.
+        why: expected content.
     """
 
     def __init__(self, topic: str, source: str, run_id: str, why: str) -> None:
@@ -99,5 +99,5 @@ class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wro
         self._rest = source, run_id, why
 
     def on(self, topic: str) -> "ForeignMessage":
-        """The same with the fully qualified name of its topic."""
+        """Return a copy of the error with another topic name."""
         return ForeignMessage(topic, *self._rest)

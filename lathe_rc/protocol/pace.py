@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pace of a run against wall time: when each block is due, and how late it was released."""
+"""Pace of a run against wall time: the due time of each block, and its lateness."""
 
 from lathe_rc.cell.latency_histogram import PERCENT, Durations, Percentiles
 
@@ -8,15 +8,15 @@ class Pace:
     """Schedule of the blocks of a run.
 
     Args:
-        block: wall time that a block takes [s]; 0: as fast as the members follow.
-        window: blocks that may be in flight.
-        judged: blocks after which `lag` judges the pace.
+        block: wall time per block [s]; 0: as fast as the members follow.
+        window: largest number of blocks in flight.
+        judged: number of blocks after which `lag` is evaluated.
 
     Attributes:
         block: see the arguments.
-        schedule: monotonic time at which sample 0 would have been, were there no slips [s].
-        slipped: time that the schedule gave up because members were slow [s].
-        lateness: of all blocks, by size.
+        schedule: monotonic time of sample 0 in the current schedule, slips included [s].
+        slipped: total delay of the schedule due to slow members [s].
+        lateness: histogram of the lateness of all blocks.
     """
 
     def __init__(self, block: float, window: int, judged: int = 0) -> None:
@@ -27,11 +27,11 @@ class Pace:
         self._percentiles, self._late = Percentiles(), 0
 
     def due(self, blocks: int) -> float:
-        """Monotonic time at which the next block may be released, after so many [s]."""
+        """Return the monotonic time at which the next block is due, given the number of blocks before it [s]."""
         return self.schedule + (blocks + 1) * self.block
 
     def count(self, late: float, blocks: int) -> None:
-        """Count some blocks that are released together, the first of them ``late`` [s]."""
+        """Count blocks that are released together, the first of them ``late`` [s]."""
         for number in range(blocks):
             behind = max(late - number * self.block, 0.0)
             self.lateness.add(behind)
@@ -39,19 +39,19 @@ class Pace:
             self._late += behind > self.block
 
     def lag(self) -> float:
-        """Part of the wanted pace that the first blocks have lost to slips; 0 before and after they are judged."""
+        """Return the fraction of the pace that the first blocks lost to slips; 0 except at the evaluation."""
         if self._percentiles.count < self._judged or not self._judged:
             return 0.0
         elapsed, self._judged = self._judged * self.block, 0
         return self.slipped / (elapsed + self.slipped)
 
     def slip(self, late: float) -> None:
-        """Put the schedule off [s]: the next blocks would make up for less, and no long burst shall catch up."""
+        """Postpone the schedule after a late block, so that the cell does not catch up in a long burst."""
         self.schedule += late
         self.slipped += late
 
     def figures(self) -> dict[str, object]:
-        """Figures of the run for the harness; empty if no block was due at a time."""
+        """Return the figures of the run for the harness; empty for a run without a pace."""
         if not self._percentiles.count:
             return {}
         return {

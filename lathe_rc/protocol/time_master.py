@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time master: it starts the run, releases blocks by window, ends it, and leads the others to a safe state."""
+"""Protocol of the time master: starts the run, releases blocks by window, ends it, and leads members to a safe state."""
 
 from collections import deque
 from collections.abc import Collection, Mapping
@@ -17,7 +17,7 @@ _GONE = 0.2  # [s] for messages to be acknowledged, if a dead member never will
 
 @dataclass(frozen=True)
 class Reactions:
-    """Parameters of a time master; see `lathe_rc.cell.stages.time_master.TimeMasterParameters`."""
+    """Reactions of a time master to silence and death (see `lathe_rc.cell.stages.time_master.TimeMasterParameters`)."""
 
     stall_reaction: str
     stall_time: float
@@ -27,20 +27,20 @@ class Reactions:
 
 
 class TimeMasterProtocol(MemberProtocol):
-    """A `MemberProtocol` that counts the progress of all members; those that its announcement names.
+    """Protocol of a time master: a `MemberProtocol` that also tracks the progress of the members that it names.
 
     Args:
         own, window, masters: see `MemberProtocol`.
-        reactions: to silence and death.
+        reactions: reactions to silence and death of members.
 
     Attributes:
-        blocks, samples: released so far.
-        end: of the run [sample]; None: endless, or not known yet.
-        blocks_in_run: the same in blocks.
-        running: from block 0 to the end.
-        unsafe: members that do not know yet of the safe state: until they do no block is released.
-        completed: blocks that each member has completed.
-        latency: from the release of a block until every member has completed it, by size.
+        blocks, samples: number released so far.
+        end: end of the run [sample]; None: endless, or not known yet.
+        blocks_in_run: length of the run in blocks; None: endless, or not known yet.
+        running: True from block 0 to the end of the run.
+        unsafe: members that have not confirmed the safe state; no block is released until all have.
+        completed: number of blocks that each member has completed.
+        latency: histogram of the time from the release of a block to its completion by every member.
     """
 
     def __init__(self, own: Announcement, window: int, reactions: Reactions, *, masters: Collection[str] = ()) -> None:
@@ -64,32 +64,32 @@ class TimeMasterProtocol(MemberProtocol):
 
     @property
     def least(self) -> int:
-        """Blocks that every member has completed."""
+        """Return the number of blocks that every member has completed."""
         return min(self.completed.values(), default=self.blocks)
 
     @property
     def slowest(self) -> str:
-        """The first of the members that are least far, as far as that is known.
+        """Return the first of the members with the least reported progress.
 
-        They report blocks when they pass a multiple of some, and one that computes two at once reports one more: a
-        member that waits for another may have reported less.
+        Members report their progress at multiples of some blocks, and a member that computes two at once reports one
+        more: a waiting member may have reported less than the member that it waits for.
         """
         return min(self.completed, key=lambda name: self.completed[name] // self.progress_step, default="")
 
     @property
     def credit(self) -> int:
-        """Blocks that the window allows."""
+        """Return the number of blocks that the window allows."""
         if not self.completed or not self.window:
             return 1
         return self.window - (self.blocks - self.least)
 
     @property
     def may_release(self) -> bool:
-        """Whether blocks go out at all."""
+        """Return True if blocks can be released at all."""
         return self.running and self.active and not (self.failure or self.done or self.unsafe)
 
     def know_end(self, samples: int | None) -> None:
-        """The stage knows the length of the run [sample]; a safe state may have set another end."""
+        """Set the end of the run [sample] from the stage; a safe state may already have set an earlier end."""
         if self.end is None and samples is not None:
             self._set_end(samples)
 
@@ -100,14 +100,14 @@ class TimeMasterProtocol(MemberProtocol):
     # ---- start --------------------------------------------------------------------------------------
 
     def activate(self, now: float) -> None:
-        """See `MemberProtocol`."""
+        """Activate the time master, and publish the waiting phase (extends `MemberProtocol`)."""
         first = not self._started
         super().activate(now)
         if first:
             self._say(Phase.WAITING, 0)
 
     def members_changed(self, now: float) -> None:
-        """Ask for the check of the cell when every member is ready; count those that know of the safe state."""
+        """Request the check of the cell when every member is ready; update the members that have confirmed the safe state."""
         if self.unsafe:
             self.unsafe -= {name for name in self.unsafe if self.members[name].state == MemberState.SAFE}
             self.actions.append(do.Release())
@@ -118,12 +118,12 @@ class TimeMasterProtocol(MemberProtocol):
             self.actions.append(do.CheckCell())
 
     def _is_ready(self, member: Announcement) -> bool:
-        """Whether a member is ready for this start of the cell, and not for another one with the same run id."""
+        """Return True if a member is ready for this session, not for another start with the same run id."""
         here = member.session in (0, self.own.session) and member.name not in self.ended
         return here and member.state == MemberState.READY
 
     def start(self, now: float) -> None:
-        """The cell has passed its check: the run begins."""
+        """Begin the run, after the cell has passed its check."""
         self.running, self._checking = True, False
         self._log("info", f"run {self.own.run_id or '(no id)'} begins with {len(self.completed)} members")
         self._say(Phase.RUNNING, 0)
@@ -138,10 +138,10 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
 
     def hear_cell_state(self, state: CellState, now: float) -> None:
-        """The time master itself says how the run goes; another one is a stranger.
+        """Reject cell states that are not the time master's own.
 
         Raises:
-            ForeignMessage: it is not what this one has said.
+            ForeignMessage: the cell state was published by another time master.
         """
         if (state.run_id, state.session) != (self.own.run_id, self.own.session):
             raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
@@ -149,20 +149,20 @@ class TimeMasterProtocol(MemberProtocol):
     # ---- progress -----------------------------------------------------------------------------------
 
     def release(self, blocks: int, now: float) -> None:
-        """The node releases so many blocks now."""
+        """Record that the node releases a number of blocks."""
         if self.completed:
             self._released.extend([now] * blocks)
 
     def computed(self, blocks: int, samples: int, now: float, *, last: bool) -> None:
-        """See `MemberProtocol`."""
+        """Record the time master's own progress (extends `MemberProtocol`)."""
         self.blocks, self.samples = blocks, samples
         super().computed(blocks, samples, now, last=last)
 
     def hear_progress(self, progress: Progress, now: float) -> None:
-        """A member has completed blocks.
+        """Process the progress of a member.
 
         Raises:
-            ForeignMessage: of another run.
+            ForeignMessage: the progress belongs to another run.
         """
         if progress.run_id != self.own.run_id:
             raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
@@ -188,7 +188,7 @@ class TimeMasterProtocol(MemberProtocol):
         self._after(before, now)
 
     def _after(self, before: int, now: float) -> None:
-        """Every member may have completed some more blocks."""
+        """Update latency, simulated time and credit after progress beyond ``before`` blocks; end the run when complete."""
         least = self.least
         if least > before:
             for _ in range(least - before):
@@ -206,12 +206,12 @@ class TimeMasterProtocol(MemberProtocol):
     # ---- end ----------------------------------------------------------------------------------------
 
     def complete_part(self) -> None:
-        """The last block is out; the run ends when all members have completed it."""
+        """Record that the last block is released; the run ends when all members have completed it."""
         if not self.completed:
             self.finish_run()
 
     def finish_run(self) -> None:
-        """All members have completed the last block."""
+        """End the run after all members have completed the last block."""
         self.actions.append(do.TellPace())
         self._say(Phase.ENDED, self.samples, self._why)
         self._log("info", f"run ended: {self.blocks} blocks, {self.samples} samples")
@@ -221,7 +221,7 @@ class TimeMasterProtocol(MemberProtocol):
         self.leave(self.patience)
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
-        """As the time master, fail the cell with it."""
+        """Fail, and fail the cell with the time master."""
         first = not self.failure
         if first and self._started:
             self._say(Phase.FAILED, self.samples, str(error))
@@ -230,14 +230,14 @@ class TimeMasterProtocol(MemberProtocol):
     # ---- silence and death --------------------------------------------------------------------------
 
     def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
-        """See `MemberProtocol`; alone, the run begins at once."""
+        """Do the periodic work; a time master without members begins the run at once (extends `MemberProtocol`)."""
         if self.active and not (self.running or self._checking or self.over or self.own.members or self.failure):
             self._checking = True
             self.actions.append(do.CheckCell())
         super().look(now, silent, ended)
 
     def look_after_others(self, now: float) -> None:
-        """Name the members that are dead or silent, and do what is to be done about them."""
+        """Report dead and silent members, and react as configured."""
         if not self.running or self.over or self.failure:
             return
         self._forgive(now - self._looked)
@@ -275,9 +275,10 @@ class TimeMasterProtocol(MemberProtocol):
             self._lose(dict.fromkeys(lost or self._stalled, "fell silent"), now)
 
     def _forgive(self, passed: float) -> None:
-        """While this node stood still itself, for so long [s], it could hear none: that is not the others' silence.
+        """Extend all silence deadlines by the time ``passed`` [s] during which this node itself was stopped.
 
-        Members that have given it up meanwhile repeat it: it waits for that before it does without any.
+        Members that have failed meanwhile repeat their announcement: the time master waits for it before it gives up any
+        member.
         """
         if passed > SILENCE:
             passed += GIVEN_UP if passed > GIVEN_UP else 0.0
@@ -291,7 +292,7 @@ class TimeMasterProtocol(MemberProtocol):
             self._tell_stall(name, self.completed[name])
 
     def member_failed(self, member: Announcement, now: float) -> None:
-        """See `MemberProtocol`: the others go on to their safe state, if they can wait until all know."""
+        """Handle the failure of a member: the others go on to the safe state if the cell has a window, else the cell fails."""
         if member.message == given_up(self.own.name):
             why = f"{self.own.name} stood still at sample {self.samples}: the others have given it up"
             self.fail(LatheError(why))
@@ -305,10 +306,10 @@ class TimeMasterProtocol(MemberProtocol):
             self.fail(LatheError(f"{name} {why}"), cause="abandoned")
 
     def _lose(self, members: Mapping[str, str], now: float) -> None:
-        """Bring the cell to its safe state without some members, from the next sample on: once all others know.
+        """Remove lost members and bring the cell to its safe state from the next sample on, once all others know.
 
         Args:
-            members: the fate of each.
+            members: reason of the loss, by member.
             now: monotonic time [s].
         """
         who = ", ".join(f"{name} {fate}" for name, fate in sorted(members.items()))
@@ -330,7 +331,7 @@ class TimeMasterProtocol(MemberProtocol):
         self._after(least, now)
 
     def declare_safe(self, why: str, now: float) -> None:
-        """Bring the cell to its safe state from the next sample on, once all members know."""
+        """Declare the safe state from the next sample on; blocks are released again once all members know."""
         self._why = f"{self._why}; {why}" if self._why else f"{why}: safe state from sample {self.samples} on"
         again, self._declared = self._declared, True
         if not again:
