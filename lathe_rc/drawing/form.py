@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figure of a run: profile, form error over angle, form error against revolution."""
+"""Figure of a run: profile, form error over angle, and form error by revolution."""
 
 import io
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ _IN_NOTEBOOK = 72.0  # [dots per inch]
 
 @dataclass(frozen=True)
 class TurnedForm:
-    """The form that a run has turned.
+    """Form that a run has turned.
 
     Attributes:
-        angle: of the spindle [rad], shape (samples,).
+        angle: spindle angle [rad], shape (samples,).
         reference: desired radius deviation [m], shape (samples,).
         error: form error [m], shape (samples,).
         errors: form error by revolution; at least one.
-        before: revolutions before the first of them.
+        before: number of revolutions before the first one in ``errors``.
     """
 
     angle: np.ndarray
@@ -35,32 +35,32 @@ class TurnedForm:
     before: int
 
     def revolution(self, number: int) -> tuple[np.ndarray, slice]:
-        """Angle in a revolution [°], and its samples."""
+        """Return the angle in a revolution [°], and the samples of the revolution."""
         starts = self.errors.starts[number : number + 2] if number >= 0 else self.errors.starts[-2:]
         span = slice(int(starts[0]), int(starts[1]))
         return np.rad2deg(np.mod(self.angle[span], 2 * np.pi)), span
 
 
 class RunFigure(Figure):
-    """A figure that a notebook shows, though nobody has imported pyplot there."""
+    """Figure that a notebook displays without an import of pyplot."""
 
     def _repr_png_(self) -> bytes:
-        """As a notebook shows it: small."""
+        """Return a small PNG image for a notebook."""
         image = io.BytesIO()
         self.savefig(image, format="png", dpi=_IN_NOTEBOOK, metadata={"Software": None})
         return image.getvalue()
 
 
 def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> RunFigure:
-    """Desired form, form error over angle in the first and the last revolution, and form error by revolution.
+    """Draw the desired form, the form error over angle in the first and last revolution, and the form error by revolution.
 
     Args:
-        run: what it has turned.
-        title: of the figure.
+        run: form that the run has turned.
+        title: title of the figure.
         beside: name and form of another run of the same part, whose errors are drawn as well.
 
     Returns:
-        A figure that pyplot does not know: its ``savefig`` writes it, notebooks show it.
+        A figure outside pyplot: ``savefig`` writes it, and notebooks display it.
     """
     errors = run.errors
     figure = RunFigure(figsize=(13, 4.4), layout="constrained")
@@ -127,14 +127,14 @@ def _beside(over_angle: Axes, curve: Axes, name: str, peer: TurnedForm) -> None:
 
 
 def learning(errors: FormErrors, before: int = 0) -> RunFigure:
-    """The form error by revolution alone, small; ``before``: revolutions before the first of them."""
+    """Draw a small plot of the form error by revolution; ``before``: number of revolutions before the first one."""
     figure = RunFigure(figsize=(5.0, 2.4), layout="constrained")
     _by_revolution(figure.subplots(), errors, before)
     return figure
 
 
 def _scale(errors: FormErrors) -> str:
-    """Of an axis of errors: a round part may be met at once, and a logarithm has no place for that."""
+    """Choose the scale of an error axis: linear if an error is zero, which a logarithm cannot show."""
     return "log" if errors.rms.all() else "linear"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and pictures as HTML: what a notebook shows when a result is the last line of a cell."""
+"""Tables and images as HTML, for results in a notebook."""
 
 import base64
 from collections.abc import Iterable, Sequence
@@ -9,7 +9,7 @@ from lathe_rc.analysis.form_errors import FormErrors
 
 
 def errors_picture(errors: FormErrors, before: int) -> str:
-    """The form error by revolution as a picture, if there is a revolution; ``before``: revolutions before the first."""
+    """Return an image of the form error by revolution, if any; ``before``: number of revolutions before the first."""
     if not errors.rms.size:
         return ""
     from lathe_rc.drawing import form
@@ -19,7 +19,7 @@ def errors_picture(errors: FormErrors, before: int) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; the first cell of a row names it."""
+    """Return an HTML table; the first cell of each row is its header."""
     style = 'style="text-align: left"'
     lines = ["".join(f"<th {style}>{escape(text)}</th>" for text in head)] if head else []
     for name, *cells in rows:

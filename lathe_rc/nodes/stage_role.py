@@ -161,7 +161,7 @@ class StageRole:
         self.stage.lose(first)
 
     def _follow_the_master(self, first: int) -> None:
-        """Limit the stage to the spindle's progress; with all inputs lost, it would compute up to the end of the run."""
+        """Limit the stage to the spindle's progress; with all inputs lost, it would compute up to the end at once."""
         node, master = self.node, self.node.protocol.master
         assert master is not None, "it has declared the safe state"
         self.inputs.reach = first

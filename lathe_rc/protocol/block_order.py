@@ -15,8 +15,8 @@ class BlockOrder:
 
     Attributes:
         topic: see the arguments.
-        source: the only node whose blocks are accepted; while empty, no blocks are accepted with a run id, and blocks of
-            any node without one: the first node becomes the source.
+        source: the only node whose blocks are accepted; while empty, no block is accepted if there is a run id;
+            otherwise the first sender becomes the source.
         open: the first sample of the blocks is not known yet.
         end: index after the newest sample, with which the next block has to begin unless it is `open`.
         received: number of blocks so far, lost blocks included.
@@ -35,7 +35,7 @@ class BlockOrder:
         self.held_from: int | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
-        """Accept blocks of one node only, starting at sample ``first``; None: starting at the first block that arrives."""
+        """Accept blocks of one node only, starting at sample ``first``; None: at the first block that arrives."""
         self.source, self.open = source, first is None
         self.received = self.lost = 0
         self.end, self.ended = first or 0, False

@@ -510,7 +510,7 @@ class MemberProtocol:
         return bool(self.failure) and self.ready and self.master is not None and self.master.name != self.own.name
 
     def complete_part(self) -> None:
-        """Complete this member's part; it stays until the cell has ended, or without a cell until messages are acknowledged.
+        """Complete this member's part; it stays until the cell has ended, or until its messages are acknowledged.
 
         DDS repeats a lost message only as long as the sending process lives. A failed node stays as well while the others
         go on: its announcement holds the reason, also for members that read it later.

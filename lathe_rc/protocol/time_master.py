@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Protocol of the time master: starts the run, releases blocks by window, ends it, and leads members to a safe state."""
+"""Protocol of the time master: starts the run, releases blocks by window, ends it and leads the way to a safe state."""
 
 from collections import deque
 from collections.abc import Collection, Mapping
@@ -107,7 +107,7 @@ class TimeMasterProtocol(MemberProtocol):
             self._say(Phase.WAITING, 0)
 
     def members_changed(self, now: float) -> None:
-        """Request the check of the cell when every member is ready; update the members that have confirmed the safe state."""
+        """Request the check of the cell when every member is ready; update which members confirmed the safe state."""
         if self.unsafe:
             self.unsafe -= {name for name in self.unsafe if self.members[name].state == MemberState.SAFE}
             self.actions.append(do.Release())
@@ -188,7 +188,7 @@ class TimeMasterProtocol(MemberProtocol):
         self._after(before, now)
 
     def _after(self, before: int, now: float) -> None:
-        """Update latency, simulated time and credit after progress beyond ``before`` blocks; end the run when complete."""
+        """Update latency, simulated time and credit after progress beyond ``before`` blocks, or end the run."""
         least = self.least
         if least > before:
             for _ in range(least - before):

@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of results."""
+"""Views of results: reports, charts and Rerun recordings."""
 
 __all__ = ["rerun_blueprint", "rerun_pieces", "rerun_scene"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTML pages with figures: Vega-Lite specifications, drawn by the page itself or here as pictures.
+"""HTML pages with figures: Vega-Lite specifications, rendered by the page itself or here as images.
 
-The page carries Vega's library and the script that draws. It runs these two scripts alone, known by their hashes, and
-nothing that a bag or a sweep says in it.
+The page contains Vega's library and the drawing script. Only these two scripts, identified by their hashes, can run; a
+string from a bag or a sweep cannot.
 """
 
 import base64
@@ -52,13 +52,13 @@ LOOK: Spec = {
 
 @cache
 def library() -> str:
-    """Vega, Vega-Lite and vega-embed, as one script."""
+    """Return Vega, Vega-Lite and vega-embed as one script."""
     return str(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;"))
 
 
 @cache
 def _light() -> Spec:
-    """`LOOK` in the colours of a light page."""
+    """Return the Vega configuration `LOOK` with the colours of a light page."""
     light = (_HERE / "page.css").read_text(encoding="utf-8").partition("@media")[0]
     colours = {name: value.split() for name, value in re.findall(r"(--[\w-]+): ([^;]+);", light)}
     text = re.sub(
@@ -68,9 +68,9 @@ def _light() -> Spec:
 
 
 def page_template(path: Path, **filters: Callable[[str], str]) -> Template:
-    """The template in a file; others beside it can be included, and what pages have in common from here.
+    """Return the template in a file; it can include files beside it and the parts that all pages share.
 
-    What a bag or a sweep says in it ends no element.
+    Strings from a bag or a sweep are escaped, so that they cannot close an element.
     """
     environment = Environment(
         loader=FileSystemLoader([path.parent, _HERE]),
@@ -85,12 +85,12 @@ def page_template(path: Path, **filters: Callable[[str], str]) -> Template:
 
 @dataclass(eq=False)
 class Charts:
-    """The figures of a page.
+    """Figures of a page.
 
     Attributes:
-        specs: specifications by figure and choice; a figure without a choice has one of the name "".
-        chosen: which is shown first.
-        data: data sets that they share.
+        specs: specifications by figure and choice; a figure without choices has one named "".
+        chosen: choice shown first, by figure.
+        data: data sets shared by the figures.
     """
 
     specs: dict[str, dict[str, Spec]] = field(default_factory=dict)
@@ -98,11 +98,11 @@ class Charts:
     data: dict[str, Rows] = field(default_factory=dict)
 
     def add(self, name: str, specs: Mapping[str, Spec], first: str = "") -> None:
-        """Add a figure, which goes into the element of this id."""
+        """Add a figure for the page element with the id ``name``."""
         self.specs[name], self.chosen[name] = dict(specs), first
 
     def place(self, specs: Sequence[Spec]) -> list[str]:
-        """Add the parts of one more figure without a choice; returns the ids of their elements."""
+        """Add the parts of a figure without choices; return the ids of their elements."""
         count = len({name.split("-")[1] for name in self.specs})
         places = [f"figure-{count}-{part}" for part in range(len(specs))]
         for place, spec in zip(places, specs, strict=True):
@@ -110,18 +110,18 @@ class Charts:
         return places
 
     def _static(self, name: str) -> Spec:
-        """The specification of a figure as it is shown first, on white paper."""
+        """Return the specification of a figure's first choice in light colours."""
         spec = {**self.specs[name][self.chosen[name]], "config": _light()}
         return spec if is_vega(spec) else {**spec, "datasets": self.data}
 
     def png(self, name: str, scale: float) -> bytes:
-        """A figure as a file of its own."""
+        """Return a figure as a PNG file."""
         spec = self._static(name)
         convert = vl_convert.vega_to_png if is_vega(spec) else vl_convert.vegalite_to_png
         return bytes(convert(spec, scale=scale))
 
     def picture(self, name: str, beside: int) -> str:
-        """One of so many parts of a figure as a data URI: SVG, or JPEG where it has too many marks for that."""
+        """Return one of ``beside`` parts of a figure as a data URI: SVG, or JPEG if it has too many marks."""
         spec = self._static(name)
         own = spec.get("usermeta", {})
         if "square" in own:  # as charts.js draws it
@@ -142,17 +142,17 @@ class Charts:
 
     @property
     def document(self) -> Spec:
-        """All that the script of the page needs."""
+        """Return all data that the page's script needs."""
         return {"specs": self.specs, "data": self.data, "chosen": self.chosen, "look": LOOK}
 
     @property
     def scripts(self) -> list[str]:
-        """Those that draw the figures; none without figures."""
+        """Return the scripts that draw the figures; none without figures."""
         return [library(), (_HERE / "charts.js").read_text(encoding="utf-8")] if self.specs else []
 
     @property
     def policy(self) -> str:
-        """The page's Content-Security-Policy: it loads nothing, and runs these scripts alone."""
+        """Return the page's Content-Security-Policy: it loads no resources and runs only the page's own scripts."""
         hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in self.scripts]
         allowed = " ".join(f"'sha256-{each}'" for each in hashes) or "'none'"
         return f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}"
@@ -162,23 +162,23 @@ class Charts:
 
 
 def is_vega(spec: Spec) -> bool:
-    """Whether it is a specification of Vega itself, without a grammar of graphics."""
+    """Return True for a specification of Vega, False for Vega-Lite."""
     return "/vega/" in spec["$schema"]
 
 
 def chart(height: int, **parts: Any) -> Spec:
-    """A specification as wide as the page; ``height`` in px."""
+    """Return a specification as wide as the page; ``height`` in px."""
     schema, fit = "https://vega.github.io/schema/vega-lite/v6.json", {"type": "fit-x", "contains": "padding"}
     return {"$schema": schema, "width": 640, "height": height, "autosize": fit, **parts}
 
 
 def number(value: float, digits: int = 5) -> float | None:
-    """As it goes into a page: short, and None for what is none."""
+    """Return a number rounded for a page; None if it is not finite."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 
 def rows(**columns: Column) -> Rows:
-    """A data set; numbers are shortened, and what is one value for all rows is repeated."""
+    """Return a data set from columns; numbers are rounded, and single values are repeated in all rows."""
     lists = {name: column.tolist() if isinstance(column, np.ndarray) else column for name, column in columns.items()}
     length = max(len(column) for column in lists.values() if isinstance(column, list))
     filled = [column if isinstance(column, list) else [column] * length for column in lists.values()]
@@ -189,16 +189,16 @@ def rows(**columns: Column) -> Rows:
 
 
 def quantity(field: str, title: str, **more: Any) -> Spec:
-    """An encoding by numbers."""
+    """Return a quantitative encoding of a field."""
     return {"field": field, "type": "quantitative", "title": title, **more}
 
 
 def tip(**fields: str) -> Rows:
-    """The text at the pointer: titles by fields of numbers."""
+    """Return a tooltip encoding, from titles by field."""
     return [quantity(name, title, format=".4~g") for name, title in fields.items()]
 
 
 def axis_scale(*, log: bool = False, ends: Sequence[float] = ()) -> Spec:
-    """Scale of an axis or of colours, from the smallest to the largest value or between two ends."""
+    """Return the scale of an axis or of colours: from the smallest to the largest value, or between two ends."""
     kind: Spec = {"type": "log", "nice": False} if log else {"type": "linear", "nice": False, "zero": False}
     return kind | ({"domain": [number(end, 6) for end in ends]} if len(ends) else {})

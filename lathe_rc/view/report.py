@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a bag: one HTML page that needs nothing else.
+"""Report of a bag: one self-contained HTML page.
 
-Texts of a bag are foreign: they are escaped by the template, cut to a length, and shown without characters that do not
-print.
+Strings from a bag are not trusted: the template escapes them, they are truncated, and non-printable characters are
+removed.
 """
 
 import json
@@ -41,7 +41,7 @@ _RPM = 60.0 / (2.0 * np.pi)
 
 @dataclass(frozen=True)
 class Grid:
-    """A table; ``texts`` are the columns that are no numbers."""
+    """Table of a report; ``texts`` are the columns without numbers."""
 
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -49,7 +49,7 @@ class Grid:
 
 
 def printable(text: str, longest: int = _LONGEST_TEXT) -> str:
-    """A text from a bag: of bounded length, and of what prints, line ends and tabs."""
+    """Return a string from a bag, truncated and reduced to printable characters, line ends and tabs."""
     cut = text[:longest] + (f" … ({len(text)} characters)" if len(text) > longest else "")
     return "".join(letter if letter.isprintable() or letter in "\n\t" else "\ufffd" for letter in cut)
 
@@ -61,7 +61,7 @@ def _number(value: float) -> str:
 def _grid(
     columns: Sequence[str], rows: Iterable[Sequence[object]], texts: Sequence[str] = (), count: int = 0
 ) -> Grid | None:
-    """A table of the first rows, and how many more there are of ``count``; None without rows."""
+    """Return a table of the first rows and the number of omitted rows out of ``count``; None without rows."""
     cells = [
         [_number(cell) if isinstance(cell, float) else printable(str(cell)) for cell in row]
         for row in islice(rows, _MOST_ROWS)
@@ -83,7 +83,7 @@ def _metrics(form: Form) -> Grid | None:
 
 
 def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
-    """Section of a tool; ``maps``: number of maps in the page."""
+    """Return the section of a tool; ``maps``: number of maps in the page."""
     if form.first is None:
         return {"form": form, "refused": form.refused or "the bag holds no complete revolution", "metrics": None}
     drawn = {
@@ -137,7 +137,7 @@ def _nodes(data: Gathered) -> Grid | None:
 
 
 def losses(data: Gathered) -> list[str]:
-    """Refusals, losses and failures, a line each."""
+    """Return rejected messages, losses and failures, one line each."""
     host = data.host
     found = [f"reading stopped: {data.stopped}"] if data.stopped else []
     for topic, tally in islice(data.topics.items(), _MOST_ROWS):
@@ -217,7 +217,7 @@ def _budget(found: Budget) -> Grid | None:
 
 
 def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
-    """The figures of the run at the top: name, value and mood."""
+    """Return the key figures at the top of the report: name, value and mood."""
     yield ("recording", "complete", "good") if data.complete else ("recording", "incomplete", "bad")
     yield "simulated", f"{data.seconds:.4g} s", ""
     yield "samples", f"{data.samples:,}".replace(",", " "), ""
@@ -231,13 +231,13 @@ def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
 
 
 def render(data: Gathered, name: str, command: str, made_of: Budget | None = None) -> str:
-    """Return the page as HTML.
+    """Return the report as an HTML page.
 
     Args:
         data: figures of the bag.
-        name: of the bag.
-        command: that makes the page again.
-        made_of: budget of the form error; None: without one.
+        name: name of the bag.
+        command: command that reproduces the page.
+        made_of: budget of the form error; None: no budget.
     """
     charts = Charts()
     template = page_template(Path(__file__).with_name("report.html.j2"), printable=printable)
@@ -276,7 +276,7 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
 
 
 def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, with_budget: bool = False) -> Gathered:
-    """Write the report of a bag; an older one of the same name is replaced once the new one is whole.
+    """Write the report of a bag; an existing report of the same name is replaced atomically.
 
     Args:
         bag: the bag.
@@ -284,8 +284,8 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
         with_budget: add the budget of the form error, by runs of the bag's scenario.
 
     Raises:
-        InputError: not a bag, or no place for a page; with a budget, a bag without a scenario that can run offline.
-        LatheError: the disk does not take it, or a run of the budget failed.
+        InputError: not a bag, or the page cannot be created; with a budget, the bag has no scenario that can run offline.
+        LatheError: the page cannot be written, or a run of the budget failed.
 
     Example:
         >>> import lathe_rc

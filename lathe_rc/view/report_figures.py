@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, as specifications of Vega-Lite; on a screen they can be enlarged."""
+"""Figures of a report as Vega-Lite specifications; they can be enlarged on a screen."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -36,18 +36,18 @@ _GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength":
 
 
 def _plain(text: str) -> str:
-    """A text from a bag, for a label."""
+    """Return a string from a bag as a label: printable ASCII, truncated."""
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text[:_LONGEST_LABEL])
 
 
 def um(length: Samples) -> Samples:
-    """Lengths [m] in µm; absurd ones are cut at 1 km, for figures of a bag that holds just anything."""
+    """Return lengths [m] in µm, clipped to ±1 km, since a bag may hold arbitrary values."""
     cut: Samples = np.clip(np.nan_to_num(length), -_LONGEST_LENGTH, _LONGEST_LENGTH) * 1e6
     return cut
 
 
 def _clipped(values: Samples) -> Samples:
-    """Other signals; absurd values are cut."""
+    """Return the values of other signals, clipped to a plausible range."""
     cut: Samples = np.clip(values, -_MOST_VALUE, _MOST_VALUE)
     return cut
 
@@ -57,7 +57,7 @@ def _figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: 
 
 
 def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: Rows, **parts: Any) -> Spec:
-    """Rectangles from u to u2 across, and from y to y2."""
+    """Return a figure of rectangles from u to u2 horizontally and from y to y2 vertically."""
     encoding = {"x": x, "x2": {"field": "u2"}, "y": y, "y2": y2, "color": colour, "tooltip": tooltip}
     if colour["type"] == "quantitative":  # no gaps between the fields of a map
         encoding["stroke"] = {key: value for key, value in colour.items() if key != "legend"}
@@ -66,7 +66,7 @@ def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: 
 
 
 def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
-    """Colours by label: those of the page, by their places."""
+    """Return a colour encoding by label, with the page's colours of the given indices."""
     domain = [f"_{place}" for place in range(_COLOURS)]
     for label, place in places.items():
         domain[place] = label
@@ -78,9 +78,9 @@ def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool)
 
 
 def colour_range(map_rows: Samples) -> tuple[float, float]:
-    """Largest magnitude of a map [µm], and up to which its colours are linear: the largest of its quietest quarter.
+    """Return the largest magnitude of a map [µm], and the limit of linear colours: the maximum of its quietest quarter.
 
-    So the first cycles, the rest, and a fault can be seen.
+    With these limits the first cycles, the remaining error and faults are all visible.
     """
     each = np.sort(np.abs(map_rows).max(axis=1))
     largest = max(float(each[-1]), _FLOOR)
@@ -88,7 +88,7 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 
 
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
-    """A field for each number; across and up say where they begin, how large they are, and how their axis looks."""
+    """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis of each direction."""
     # The page holds one number a field; Vega computes the places. Written out, they would make it five times as large.
     place = "(datum.k - 1)"
     return _rectangles(
@@ -123,7 +123,7 @@ def _downsample(fields: Samples, most: int) -> tuple[Samples, int]:
 
 
 def form_map(form: Form, maps: int) -> Spec:
-    """Radius deviation by revolution and angle; ``maps``: of the page."""
+    """Return a map of the radius deviation by revolution and angle; ``maps``: number of maps in the page."""
     fields = um(form.map.rows())
     largest, linear = colour_range(fields)
     fields = fields.reshape(len(fields), _ACROSS, -1).mean(axis=-1)
@@ -140,7 +140,7 @@ def form_map(form: Form, maps: int) -> Spec:
 
 
 def along(surface: Lay) -> list[Spec]:
-    """The surface along the part over angle and height, and one trace of it."""
+    """Return a map of the surface along the part over angle and height, and one trace along the height."""
     deviation = um(surface.surface)  # by angle and height
     place = np.clip(surface.height, -_LONGEST_LENGTH, _LONGEST_LENGTH) * 1e3
     low, high = float(place[0]), float(place[-1])
@@ -168,7 +168,7 @@ def along(surface: Lay) -> list[Spec]:
 
 
 def polar(form: Form) -> list[Spec]:
-    """Radius deviation of the first and the last revolution, each in its own scale."""
+    """Return polar plots of the radius deviation of the first and the last revolution, each with its own scale."""
     return [_polar(each, colour) for each, colour in ((form.first, _FIRST), (form.last, _LAST)) if each]
 
 
@@ -180,7 +180,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     numbers = revolution.numbers
 
     def at(radius: Samples | float, angle: Samples | float, **more: Any) -> Rows:
-        """Places, the desired form in the middle and the largest deviation 1 from it."""
+        """Return points at a radius and angle, in units where the largest deviation is 1."""
         return rows(u=radius * np.cos(angle), v=radius * np.sin(angle), **more)
 
     angle, turn, eighths = (np.linspace(0.0, 2.0 * np.pi, points) for points in (deviation.size, 181, 9))
@@ -232,7 +232,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
 
 
 def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
-    """First, best and last revolution with what they are, each once."""
+    """Return the first, best and last revolution with their labels, without repetitions."""
     shown: dict[int, tuple[str, Revolution]] = {}
     for name, revolution in (("first", form.first), ("best", form.best), ("last", form.last)):
         if revolution:
@@ -242,14 +242,14 @@ def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
 
 
 def spectrum_range(form: Form) -> tuple[float, float]:
-    """Range of amplitudes [µm] in which each shown revolution has three decades; (0, 0) without any amplitude."""
+    """Return a range of amplitudes [µm] with three decades for each shown revolution; (0, 0) without any amplitude."""
     tops = [float(um(revolution.amplitude[1:]).max()) for _, revolution in shown_revolutions(form)]
     tops = [top for top in tops if top > 0.0]
     return (min(min(tops) * 1e-3, max(tops) * 1e-6), max(tops) * 2.0) if tops else (0.0, 0.0)
 
 
 def spectrum(form: Form) -> Spec:
-    """Amplitude by undulations per revolution."""
+    """Return a bar chart of the amplitude by undulations per revolution."""
     places = {"first": _FIRST, "best": _BEST, "last": _LAST}
     shown = {f"{name} revolution ({each.numbers['revolution']})": each for name, each in shown_revolutions(form)}
     low, high = spectrum_range(form)
@@ -289,17 +289,17 @@ def _lines(
     log: bool,
     limit: float = 0.0,
 ) -> Spec:
-    """Lines by name, each with a band where it stands for several values; a limit as a dashed one.
+    """Return a plot of named lines, with a band where a point stands for several values; a limit is a dashed line.
 
-    Of what has no place on a logarithmic axis nothing is drawn.
+    Values that a logarithmic axis cannot show are omitted.
 
     Args:
-        curves: see there.
-        scaled: places and values, to the units of the axes.
-        titles: of the axes.
-        height: [px].
-        log: values are on a logarithmic axis.
-        limit: 0: none.
+        curves: curves by name (see `_Drawn`).
+        scaled: functions that convert places and values to the units of the axes.
+        titles: titles of the axes.
+        height: height of the plot [px].
+        log: use a logarithmic axis for the values.
+        limit: value of the limit line; 0: no limit.
     """
     across, up = titles
     data: Rows = []
@@ -349,7 +349,7 @@ def _lines(
 
 
 def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
-    """Form error by revolution, and by name what the controllers say of each cycle [m]."""
+    """Return a plot of the form error by revolution, and of the controllers' named cycle reports [m]."""
     own = {"form error, RMS": (form.rms, _LAST), "form error, largest": (form.largest, _GREY)} if form else {}
     drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}
     for colour, (name, series) in enumerate(list(cycles.items())[:_OTHERS], start=1):
@@ -360,13 +360,13 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
 
 
 def against_time(gathered: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
-    """Signals by simulated time, their extremes as a band.
+    """Return a plot of signals over simulated time, with their extremes as a band.
 
     Args:
-        gathered: holds the sampling step.
-        signals: by name.
-        unit: of the axis, with its quantity.
-        scale: from the signals' unit to that one.
+        gathered: figures of the bag, with the sampling step.
+        signals: envelopes by name.
+        unit: quantity and unit of the axis.
+        scale: factor from the signals' unit to the axis unit.
     """
     drawn = {_plain(name): (series, colour, False) for colour, (name, series) in enumerate(signals.items())}
     scaled = gathered.at, lambda values: _clipped(values) * scale
@@ -377,7 +377,7 @@ def against_time(gathered: Gathered, signals: Mapping[str, Envelope], unit: str,
 
 
 def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str], colour: int, *, log: bool) -> Spec:
-    """Counts of bins: shape (bins,), their edges (bins + 1,), and what the axes say."""
+    """Return a histogram from counts, shape (bins,), bin edges, shape (bins + 1,), and axis titles."""
     across, up = axes
     scale = axis_scale(log=log, ends=(edges[0], edges[-1]))
     return _rectangles(
@@ -393,7 +393,7 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
 
 
 def timing(host: Host, step: float) -> list[Spec]:
-    """Histograms of pace, and of lateness and latency of blocks where there are any; ``step`` in s."""
+    """Return histograms of the pace, and of block lateness and latency if there are any; ``step`` in s."""
     pace = _clipped(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))

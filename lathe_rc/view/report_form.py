@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form of the part from a stream: measured revolution by revolution as soon as each is complete."""
+"""Form of the part from a stream of samples, measured as soon as each revolution is complete."""
 
 from array import array
 from collections import deque
@@ -29,12 +29,12 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Revolution:
-    """A revolution in the report.
+    """Form of one revolution in the report.
 
     Attributes:
-        numbers: see `lathe_rc.part.numbers`.
+        numbers: figures of the revolution (see `lathe_rc.part.numbers`).
         profile: deviation of the radius at even angles [m], shape (points,).
-        amplitude: of its undulations [m], from 0 UPR on.
+        amplitude: amplitudes of the undulations [m], starting at 0 UPR.
     """
 
     numbers: Mapping[str, Any]
@@ -43,22 +43,22 @@ class Revolution:
 
 
 class Form:
-    """Form error of one tool, by revolution; a sink, see `lathe_rc.cell.engine.Sink`.
+    """Form error of one tool by revolution; a sink (see `lathe_rc.cell.engine.Sink`).
 
     Args:
         encoder: topic with the angle.
         tool: topic with the form error.
-        tolerance: form error that is allowed to each side [m]; 0: none.
-        nose_radius: of the tool in the plane of the feed [m]; 0: without the surface along the part.
+        tolerance: allowed form error to each side [m]; 0: no tolerance.
+        nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
 
     Attributes:
-        tool, tolerance: see above.
-        first, last, best: revolutions, the best by RMS; None before there is one.
-        rms, largest: envelope by revolution [m].
+        tool, tolerance: see the arguments.
+        first, last, best: first, last and best (by RMS) revolution; None before the first.
+        rms, largest: envelopes over the revolutions [m].
         map: radius deviation [m], by revolution and angle.
         newest: radius deviation of the last revolutions at even angles [m], shape (points,) each.
-        surface: along the part, or why there is none; None without a nose radius.
-        refused: why the form, or its rest, is not measured; empty if it is.
+        surface: surface along the part, or the reason why it is missing; None without a nose radius.
+        refused: reason why the form, or the rest of it, is not measured; empty if it is.
     """
 
     def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
@@ -79,7 +79,7 @@ class Form:
         self.refused = ""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take consecutive samples; revolutions are measured as soon as they are complete."""
+        """Add consecutive samples; revolutions are measured as soon as they are complete."""
         if self.refused:
             return
         angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
@@ -92,18 +92,18 @@ class Form:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Whether the form is in tolerance; None if it has none, or cannot be measured to its end."""
+        """Return whether the form is in tolerance; None without a tolerance, or if it cannot be measured to the end."""
         if not self.tolerance or self.refused:
             return None
         return judge(np.array(self._largest), self.tolerance, self._before)
 
     @property
     def growth(self) -> Growth | None:
-        """The growth of the form error in the revolutions that were measured; None if it does not grow."""
+        """Return the growth of the form error over the measured revolutions; None if it does not grow."""
         return growth(np.array(self._largest), self._before)
 
     def finish(self) -> None:
-        """Measure what is left."""
+        """Measure the remaining revolutions."""
         if not self.refused:
             self._measure(0)
         if self._nose_radius and self._along:
@@ -115,7 +115,7 @@ class Form:
                 self.surface = str(error)
 
     def _measure(self, margin: int) -> None:
-        """Measure the complete revolutions that end ``margin`` samples or more before the newest, or one not finite."""
+        """Measure complete revolutions that end ``margin`` samples or more before the newest or a non-finite sample."""
         finite = np.isfinite(self._held).all(axis=0)
         broken = not finite.all()
         if broken:
@@ -136,10 +136,10 @@ class Form:
         self._held = np.empty((3, 0))
 
     def _check(self) -> None:
-        """Refuse what would take memory or give no form.
+        """Reject samples that would take too much memory or give no form.
 
         Raises:
-            InputError: says why.
+            InputError: the samples are rejected, with the reason.
         """
         angle = self._held[0]
         step = np.diff(angle)
@@ -151,7 +151,7 @@ class Form:
             raise InputError(f"a revolution longer than {_LONGEST} samples")
 
     def _measure_some(self, margin: int) -> bool:
-        """Measure some revolutions; whether there were any."""
+        """Measure some revolutions; return True if any were complete."""
         _, error, height = self._held
         angle = self._held[0] - self._done * _TURN
         edges = np.searchsorted(angle, _TURN * np.arange(_AT_ONCE + 1))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report, gathered in one pass over the bag.
+"""Figures of a report, gathered in one pass over the bag.
 
-Memory grows by 8 bytes a revolution and a report of the time master.
+Memory grows by 8 bytes per revolution and per report of the time master.
 """
 
 from collections.abc import Mapping
@@ -36,13 +36,13 @@ _CYCLES = ((messages.LEARNING, "rms_error"), (messages.PERIODIC, "max_error"))
 
 @dataclass
 class Tally:
-    """Messages of a topic.
+    """Message counts of a topic.
 
     Attributes:
         type: message type.
-        count, size: messages and their bytes.
-        first_ns, last_ns: log times.
-        open_end: it has no block that says that the run ends with it.
+        count, size: number of messages, and their total size [B].
+        first_ns, last_ns: first and last log time [ns].
+        open_end: the topic has no block that is marked as the last of the run.
     """
 
     type: str
@@ -54,19 +54,19 @@ class Tally:
 
     @property
     def rate(self) -> float:
-        """Messages by simulated second; NaN where there is no time between them."""
+        """Return the number of messages per simulated second; NaN for a time span of zero."""
         span = self.last_ns - self.first_ns
         return (self.count - 1) / (span * 1e-9) if span > 0 else np.nan
 
 
 @dataclass
 class EventKind:
-    """Events of a topic with the same text, but for numbers behind a colon.
+    """Events of a topic with the same text, except for numbers after a colon.
 
     Attributes:
-        topic, text: of the first.
-        alarm: it is of a supervisor, and the cell is not as it should be.
-        first, last: samples of the first and the last.
+        topic, text: topic and text of the first event.
+        alarm: the event is a supervisor's, and the cell is not in its nominal state.
+        first, last: samples of the first and the last event.
         count: number of events.
     """
 
@@ -79,13 +79,13 @@ class EventKind:
 
 
 class Curves:
-    """Signals and cycles to be drawn; a sink, see `lathe_rc.cell.engine.Sink`.
+    """Plotted signals and cycles of a bag; a sink (see `lathe_rc.cell.engine.Sink`).
 
     Attributes:
         signals: envelope by topic and field.
-        cycles: the same, of what a controller achieved in each cycle.
-        events: the first of them; ``event_count`` counts all.
-        kinds: of events, by topic and what is the same in them; the first of them.
+        cycles: envelope of a controller's result in each cycle, by topic and field.
+        events: the first events; ``event_count`` counts all.
+        kinds: the first kinds of events, by topic and common text.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
@@ -97,7 +97,7 @@ class Curves:
         self.kinds: dict[tuple[str, str], EventKind] = {}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take consecutive samples and the messages among them."""
+        """Add consecutive samples and the messages among them."""
         for (topic, name), envelope in self.signals.items():
             envelope.add(dense[topic][name])
         for (topic, name), envelope in self.cycles.items():
@@ -118,7 +118,7 @@ class Curves:
 
 
 def of_type(types: Mapping[str, str], kind: str) -> list[str]:
-    """The first topics of a type."""
+    """Return the first topics of a message type."""
     return [topic for topic, given in sorted(types.items()) if given == kind][:_MOST_OF_A_TYPE]
 
 
@@ -127,17 +127,17 @@ class Gathered:
     """Figures of a bag for its report.
 
     Attributes:
-        about: what the bag says of itself.
-        topics: by name.
-        samples: of every dense topic.
+        about: metadata of the bag.
+        topics: message counts by topic.
+        samples: number of samples of every dense topic.
         step_ns: sampling step [ns].
         run_id: identity of the run.
-        forms: of each tool.
+        forms: form error of each tool.
         curves: signals and cycles.
         host: figures of the host topics.
-        stopped: why the bag was not read to its end; empty if it was.
-        nodes: values of the bag's scenario by node and parameter, none of them checked; empty if it has none.
-        unjudged: why nothing is known of the scenario, tolerances among it; empty if it is.
+        stopped: reason why the bag was not read to its end; empty if it was.
+        nodes: unchecked values of the bag's scenario by node and parameter; empty without a scenario.
+        unjudged: reason why the scenario, and so the tolerance, is unknown; empty if it is known.
     """
 
     about: Mapping[str, str]
@@ -154,35 +154,35 @@ class Gathered:
 
     @property
     def complete(self) -> bool:
-        """Whether the whole bag was read and each dense topic ends with the run, or where a snapshot does."""
+        """Return True if the whole bag was read and each dense topic ends with the run, or with the snapshot."""
         dense = [tally for tally in self.topics.values() if tally.type in messages.block_types()]
         snapshot = span_of(self.about)
         ends = 0 < snapshot[1] == self.samples if snapshot else not any(tally.open_end for tally in dense)
         return bool(dense) and not self.stopped and ends
 
     def has(self, kind: str) -> bool:
-        """Whether there are messages of a type."""
+        """Return True if the bag has messages of a type."""
         return any(tally.count for tally in self.topics.values() if tally.type == kind)
 
     @property
     def missing(self) -> str:
-        """Name the missing ones of encoder and tool."""
+        """Return which of encoder and tool the bag lacks."""
         kinds = {tally.type for tally in self.topics.values()}
         named = {"encoder": messages.ENCODER, "tool": messages.TOOL}
         return f"the bag has no {' and no '.join(name for name, kind in named.items() if kind not in kinds)}"
 
     @property
     def seconds(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self.samples * self.step_ns * 1e-9
 
     def at(self, place: Samples) -> Samples:
-        """Time since sample 0 [s] of samples."""
+        """Return the times of samples since sample 0 [s]."""
         return place * (self.step_ns * 1e-9)
 
 
 def gather(path: Path) -> Gathered:
-    """Read a bag once.
+    """Gather the figures of a bag in one pass.
 
     Raises:
         InputError: not a bag.
@@ -217,7 +217,7 @@ def gather(path: Path) -> Gathered:
 
 
 def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
-    """Count every message, and hand it to the feeder or to the host's figures."""
+    """Count every message, and pass it to the feeder or to the host figures."""
     newest: dict[str, bytes] = {}
     for topic, log_ns, data in source.messages():
         tally = gathered.topics[topic]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorded host topics: the state of the nodes, and how late the cell was."""
+"""Recorded host topics: state of the nodes, and lateness of the cell."""
 
 import math
 from array import array
@@ -22,13 +22,13 @@ _MOST_VALUES = 64  # of a status
 
 @dataclass
 class Node:
-    """The newest state that a node has reported.
+    """Newest reported state of a node.
 
     Attributes:
-        reports: how many times.
-        level: the worst.
-        message: the last.
-        values: the last.
+        reports: number of reports.
+        level: worst level.
+        message: last message.
+        values: last values.
     """
 
     reports: int = 0
@@ -41,13 +41,13 @@ class Host:
     """Figures from the messages of host topics.
 
     Attributes:
-        nodes: by name.
-        states: texts of what the time master declared.
-        errors: texts of what failed.
-        unreadable: messages that could not be decoded.
-        left_out: nodes, states and errors beyond what is shown.
+        nodes: state of each node, by name.
+        states: lines for the cell states that the time master declared.
+        errors: lines for failures.
+        unreadable: number of messages that could not be decoded.
+        left_out: number of nodes, states and errors beyond the limits.
         pace: samples by wall time [1/s], between two reports of the time master.
-        lateness, latency: of blocks, as the time master last reported them; by its name.
+        lateness, latency: lateness and latency of blocks in the last report of each time master, by its name.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Host:
         self._marks: dict[str, tuple[float, float, float]] = {}  # wall time [s], blocks and samples of the last report
 
     def add(self, msgtype: str, data: bytes) -> None:
-        """Take a message of one of `TYPES`."""
+        """Add a message of one of `TYPES`."""
         try:
             message = messages.decode(msgtype, data)
         except ValueError:
@@ -74,7 +74,7 @@ class Host:
             self._status(messages.stamp_ns(message) * 1e-9, status)
 
     def _append(self, lines: list[str], text: str) -> None:
-        """Add a line, unless it repeats the last one or there are too many."""
+        """Append a line, unless it repeats the last one or the list is full."""
         if text in lines[-1:]:
             return
         if len(lines) < _MOST_LINES:
@@ -106,7 +106,7 @@ class Host:
         self._compare_reports(status.name, wall, node.values)
 
     def _compare_reports(self, name: str, wall: float, values: dict[str, str]) -> None:
-        """Compare a report of the time master with the one before."""
+        """Compute the pace from two consecutive reports of the time master."""
         if "schedule slipped [s]" not in values:
             return  # of another node
         try:
@@ -124,6 +124,6 @@ class Host:
 
     @property
     def lost_blocks(self) -> dict[str, int]:
-        """By node, where there are any."""
+        """Return the number of lost blocks by node, without nodes that lost none."""
         counts = {name: node.values.get("lost blocks", "0") for name, node in self.nodes.items()}
         return {name: int(count) for name, count in counts.items() if count.isdecimal() and count.strip("0")}

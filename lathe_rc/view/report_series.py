@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Series of any length in bounded memory: neighbours are combined until they fit."""
+"""Series of any length in bounded memory: neighbouring values are combined when there are too many."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from lathe_rc.messages import Samples
 
 
 class _Groups:
-    """Groups of neighbouring values; when there are too many, two become one.
+    """Groups of neighbouring values; when there are too many groups, pairs are merged.
 
     Args:
-        capacity: groups that are kept, even.
-        shape: of a value.
+        capacity: largest number of groups, even.
+        shape: shape of a value.
         how: ufuncs that combine the values of a group, each with its identity.
 
     Attributes:
-        group: values in a group.
-        size: values so far.
+        group: number of values per group.
+        size: number of values so far.
     """
 
     def __init__(self, capacity: int, shape: tuple[int, ...], *how: tuple[np.ufunc, float]) -> None:
@@ -25,7 +25,7 @@ class _Groups:
         self._how = [(ufunc, empty, np.full((capacity, *shape), empty)) for ufunc, empty in how]
 
     def add(self, values: Samples) -> None:
-        """Append, shape (n, *shape)."""
+        """Append values, shape (n, *shape)."""
         first, self.size = self.size, self.size + len(values)
         while self.size > self.group * self._capacity:
             self.group *= 2
@@ -45,7 +45,7 @@ class _Groups:
 
 
 class Envelope(_Groups):
-    """Smallest and largest value of groups of neighbours; what is no finite number is left out.
+    """Smallest and largest value of groups of neighbours; values that are not finite are omitted.
 
     Args:
         capacity: groups that are kept, even.
@@ -55,36 +55,36 @@ class Envelope(_Groups):
         super().__init__(capacity, (), (np.fmin, np.nan), (np.fmax, np.nan))
 
     def add(self, values: Samples) -> None:
-        """Append, shape (n,)."""
+        """Append values, shape (n,)."""
         if values.size:
             super().add(np.where(np.isfinite(values), values, np.nan))
 
     def curve(self) -> tuple[Samples, Samples, Samples]:
-        """Place of the middle of each group, counted in values from 0, and its extremes."""
+        """Return the middle of each group, counted in values from 0, and the extremes of each group."""
         low, high = self._kept()
         place = np.arange(low.size) * self.group + (self.group - 1) / 2
         return np.minimum(place, max(self.size - 1, 0)), low, high
 
     @property
     def extremes(self) -> tuple[float, float]:
-        """Smallest and largest of all; NaN without any."""
+        """Return the smallest and the largest value; NaN without values."""
         low, high = self._kept()
         return float(np.fmin.reduce(low, initial=np.nan)), float(np.fmax.reduce(high, initial=np.nan))
 
 
 class MeanRows(_Groups):
-    """Rows of a map; neighbours are averaged when there are too many.
+    """Rows of a map; neighbouring rows are averaged when there are too many.
 
     Args:
-        width: of a row.
-        capacity: rows that are kept, even.
+        width: length of a row.
+        capacity: largest number of rows, even.
     """
 
     def __init__(self, width: int, capacity: int = 400) -> None:
         super().__init__(capacity, (width,), (np.add, 0.0))
 
     def rows(self) -> Samples:
-        """The mean of each group, shape (groups, width)."""
+        """Return the mean of each group, shape (groups, width)."""
         (sums,) = self._kept()
         counts = np.minimum(self.size - np.arange(len(sums)) * self.group, self.group)  # the last may be smaller
         mean: Samples = sums / counts[:, None]

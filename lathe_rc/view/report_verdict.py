@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The head of a report: whether the part is in tolerance, failures and faults, and the limits of the form error.
+"""Head of a report: whether the part is in tolerance, failures and faults, and the limits of the form error.
 
-All of it comes from the one pass through the bag: how the form error ends, how much of it repeats, the spindle speed,
-and the events of the nodes. The share of each cause is known by a budget alone.
+The data comes from a single pass over the bag: the final form error, its repeatable part, the spindle speed and the
+events of the nodes. Only a budget gives the share of each cause.
 """
 
 import math
@@ -30,7 +30,7 @@ _MOST = 6  # kinds of things that went wrong
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence, and whether it is good or bad news."""
+    """Finding of the report: a sentence, and whether it is good or bad news."""
 
     text: str
     mood: str = ""
@@ -38,12 +38,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Assessment:
-    """The head of the page.
+    """Contents of the report's head.
 
     Attributes:
-        verdict: in tolerance or not.
+        verdict: whether the part is in tolerance.
         wrong: failures and faults.
-        limits: what keeps the form error from being smaller, the first the most.
+        limits: causes that limit the form error, the most important first.
     """
 
     verdict: Finding
@@ -52,12 +52,12 @@ class Assessment:
 
 
 def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Assessment:
-    """Judge what was data.
+    """Assess the run from the figures of its bag.
 
     Args:
-        data: of the bag.
-        losses: what was refused, lost or failed, a line each.
-        made_of: budget of the form error, if one was asked for.
+        data: figures of the bag.
+        losses: rejected messages, losses and failures, one line each.
+        made_of: budget of the form error, if requested.
     """
     form = next(iter(data.forms), None)
     incidents = list(_incidents(data))
@@ -100,7 +100,7 @@ def _verdict(data: Gathered, form: Form | None) -> Finding:
 
 
 def _when(data: Gathered, kind: EventKind) -> str:
-    """Time of an event, or the span of several."""
+    """Return the time of an event, or the time span of several."""
     first, last = (sample * data.step_ns * 1e-9 for sample in (kind.first, kind.last))
     if kind.count == 1:
         return f"at {first:.4g} s"
@@ -108,7 +108,7 @@ def _when(data: Gathered, kind: EventKind) -> str:
 
 
 def _incidents(data: Gathered) -> Iterator[str]:
-    """Faults, and what the supervisor did."""
+    """Yield faults and reactions of the supervisor."""
     kinds = [kind for kind in data.curves.kinds.values() if kind.text.startswith("fault ") or kind.alarm]
     for kind in kinds[:_MOST]:
         yield f"{kind.topic.strip('/')}: {kind.text}, {_when(data, kind)}"
@@ -117,7 +117,7 @@ def _incidents(data: Gathered) -> Iterator[str]:
 
 
 def _form(data: Gathered, form: Form) -> Iterator[Finding]:
-    """How the form error ends, and of what kind it is."""
+    """Return findings on the final form error and its composition."""
     profiles = um(np.array(form.newest))
     if len(profiles) < _FEWEST:
         return
@@ -144,7 +144,7 @@ def _form(data: Gathered, form: Form) -> Iterator[Finding]:
 
 
 def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
-    """Whether learning goes on, by the halves of the last revolutions: all of one below all of the other."""
+    """Return the trend of the learning; it continues if one half of the last revolutions lies entirely below the other."""
     half = len(rms) // 2
     before, after = rms[:half], rms[-half:]
     factor = float(after.mean() / before.mean()) if before.mean() else 1.0
@@ -160,7 +160,7 @@ def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
 
 
 def _speed(data: Gathered) -> Iterator[str]:
-    """By how much the spindle speed varies, if it does."""
+    """Return a finding on the variation of the spindle speed, if it varies."""
     for (_, name), series in data.curves.signals.items():
         low, high = series.extremes
         if name == "speed_true" and low > 0.0 and math.isfinite(high):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag in Rerun: logged to a recording, or written as an .rrd file."""
+"""Rerun view of a bag: logged to a recording, or written as an .rrd file."""
 
 import os
 from collections import deque
@@ -27,7 +27,7 @@ _POINTS = 300_000  # of a curve: a long bag gets fewer in a second
 
 
 def _block(source: Source, topic: str, *, last: bool = False) -> Block | None:
-    """The first block of a topic, or the last if it is near the end of the bag."""
+    """Return the first block of a topic, or the last if it is near the end of the bag."""
     try:
         if last:
             return next(iter(deque(source.blocks(topic, start_ns=source.last_ns - _END_NS), maxlen=1)), None)
@@ -37,7 +37,7 @@ def _block(source: Source, topic: str, *, last: bool = False) -> Block | None:
 
 
 def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
-    """The scene of a bag, scaled to the revolutions and the travel that are ahead."""
+    """Return the scene of a bag, scaled to the bag's number of revolutions and feed travel."""
     from lathe_rc.view.rerun_part import Outlook
     from lathe_rc.view.rerun_scene import Scene
 
@@ -63,19 +63,19 @@ def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
 
 
 def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
-    """Log a bag.
+    """Log a bag to a recording.
 
     Args:
-        recording: with a sink; stays open.
-        bag: the bag.
-        rate: points of a curve in a second, at most.
+        recording: recording with a sink; stays open.
+        bag: path of the bag.
+        rate: largest number of curve points per second.
 
     Returns:
-        Samples of each signal.
+        Number of samples of each signal.
 
     Raises:
         InputError: not a bag of a cell.
-        LatheError: the bag is not whole, or the recording cannot be written.
+        LatheError: the bag is incomplete, or the recording cannot be written.
     """
     scene = _scene(recording, bag, rate)
     # Pieces of whole windows: the points of the curves then do not depend on where the bag is cut.
@@ -85,14 +85,14 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
 
 
 def write(bag: Path, output: Path, *, rate: float = RERUN_RATE) -> int:
-    """Write a bag's .rrd file: whole, or not at all.
+    """Write the .rrd file of a bag atomically.
 
     Returns:
-        Samples of each signal.
+        Number of samples of each signal.
 
     Raises:
-        InputError: not a bag of a cell, or a file that cannot be made.
-        LatheError: the bag is not whole, or the disk is full.
+        InputError: not a bag of a cell, or the file cannot be created.
+        LatheError: the bag is incomplete, or the disk is full.
     """
     import rerun as rr
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a run opens in Rerun: the form error above, the part and its error map on the left, curves on the right."""
+"""Layout of a run in Rerun: form error at the top, part and error map on the left, curves on the right."""
 
 from collections.abc import Collection, Mapping
 
@@ -16,7 +16,7 @@ _COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plo
 
 
 def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary) -> list[rrb.VisibleTimeRange]:
-    """Ranges that a view shows: from these starts to the time cursor."""
+    """Return the visible time ranges from the given starts to the time cursor."""
     end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
     starts = {"time": time, "revolution": revolution}
     return [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline, start in starts.items()]
@@ -31,9 +31,9 @@ _LATEST = _until_cursor(  # a plot takes its scale from that
 
 
 def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
-    """A plot of curves each, of those that there are.
+    """Return one plot per group of curves, for the curves that exist.
 
-    A legend would lie on the curves: where they are few, the title names their colours instead.
+    A legend would cover the curves: with few curves, the title names their colours instead.
     """
     paths: dict[str, list[str]] = {}
     labels: dict[str, list[str]] = {}
@@ -87,12 +87,12 @@ def _part() -> rrb.Vertical:
 
 
 def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collection[str] = ()) -> rrb.Blueprint:
-    """The layout for a run with these topics.
+    """Return the layout for a run with the given topics.
 
     Args:
         types: message type by topic.
-        live: the picture follows what comes in.
-        silent: topics on which nothing was said.
+        live: the view follows incoming data.
+        silent: topics without messages.
     """
     kinds = set(types.values())
     said = {kind for topic, kind in types.items() if topic not in silent}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running cells, shown from their messages; knows nothing of ROS.
+"""Live view of running cells, fed with their messages; independent of ROS.
 
-The view delays no member. Messages that come faster than it can show are left out, counted and reported; a run that
-begins anew, under whatever name, is a recording of its own.
+The view delays no member. Messages that arrive faster than they can be shown are dropped, counted and reported; each
+new run, even of the same name, is a separate recording.
 """
 
 import math
@@ -33,12 +33,12 @@ PIECE = 0.1  #: length of a piece, about [s] of simulated time
 
 
 class Backlog:
-    """Messages that have not been shown yet. When it is full, all of them are left out: later pieces are whole again.
+    """Queue of messages to be shown. When it is full, all of them are dropped, so that later chunks are complete again.
 
-    To leave out every second message instead would leave no piece without a gap.
+    If every second message were dropped instead, no chunk would be without a gap.
 
     Args:
-        limit: its size [B].
+        limit: size of the queue [B].
     """
 
     def __init__(self, limit: int) -> None:
@@ -61,13 +61,13 @@ class Backlog:
             self._news.notify()
 
     def close(self) -> None:
-        """Let the reader end when it has taken all messages."""
+        """Close the queue: the reader ends after the last message."""
         with self._news:
             self._closed = True
             self._news.notify()
 
     def __iter__(self) -> Iterator[Message | None]:
-        """Take messages as they come, until it is closed and empty."""
+        """Yield messages as they arrive, until the queue is closed and empty."""
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._messages or self._closed)
@@ -79,10 +79,10 @@ class Backlog:
 
 
 class RunOrder:
-    """Assigns the samples of many topics to runs; each topic has its own order, none is in step with the others.
+    """Assignment of samples of many topics to runs; the order holds within each topic only, not across topics.
 
-    A run has a name, but equal scenarios have equal names: it also begins anew when a topic goes back. What a topic
-    still brings of the run before goes on from where that topic was.
+    Runs have run ids, but equal scenarios have equal ids: a topic whose sample index decreases also starts a new run.
+    Late samples of the previous run are recognized because they continue that topic.
     """
 
     def __init__(self) -> None:
@@ -92,7 +92,7 @@ class RunOrder:
         self._old: dict[str, int] = {}  # and in the one before
 
     def place(self, topic: str, run: str, first: int, end: int) -> Literal["same", "new", "old"]:
-        """Where samples of a topic belong: to the run that goes on, to a new one, or to the one before."""
+        """Return the run that a topic's samples belong to: the current one, a new one, or the previous one."""
         newest = max(self._ends.values(), default=0)
         if run == self._run and first >= self._ends.get(topic, 0):
             # The same name twice in a row: a topic that is first heard may still belong to the run before, if it goes
@@ -111,16 +111,16 @@ class RunOrder:
 
 @dataclass
 class ShownRun:
-    """The view of a run.
+    """Summary of a run that was shown.
 
     Attributes:
-        run_id: of the run.
-        file: that it was saved to; None if it went to a viewer.
-        first: first sample that is shown; above 0 if the view came late.
-        end: sample after the last that was heard.
-        revolutions: shown, of the part.
-        left_out: pieces that lack some topic, or everything.
-        complete: the last block of every topic was heard.
+        run_id: run id.
+        file: file of the recording; None if it was sent to a viewer.
+        first: first sample shown; above 0 if the view was started late.
+        end: sample after the last one received.
+        revolutions: number of revolutions shown.
+        left_out: number of chunks that lack some topics or all.
+        complete: the last block of every topic was received.
     """
 
     run_id: str
@@ -133,14 +133,14 @@ class ShownRun:
 
 
 class _RunView:
-    """One run, on its way to a recording; a sink between `Pieces` and `Scene`.
+    """View of one run: passes chunks from `Pieces` to `Scene`.
 
     Args:
-        block: the first that was heard.
-        types: message type by topic, of those that are known to be there.
-        open_recording: makes its recording.
-        rate: points of a curve in a second, at most.
-        say: takes lines for the user.
+        block: first block received.
+        types: message type by topic, for the topics known so far.
+        open_recording: creates the recording of the run.
+        rate: largest number of curve points per second.
+        say: called with each line for the user.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class _RunView:
         self.message = self._pieces.message
 
     def block(self, topic: str, msgtype: str, block: Block) -> bool:
-        """Take a block; tells whether the run is over with it."""
+        """Add a block; return True if the run ends with it."""
         if block.step_ns != self._step_ns:
             raise LatheError(f"{topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
         if topic not in self._types:
@@ -174,7 +174,7 @@ class _RunView:
         return block.last and all(self._ended.values())
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Hand consecutive samples on to the scene, and what was left out before them."""
+        """Pass consecutive samples on to the scene, after a note about dropped chunks before them."""
         if not self._begun:
             self._begun = True
             late = f" from {self._pieces.first * self._step_ns * 1e-9:.2f} s on" if self._pieces.first else ""
@@ -183,7 +183,7 @@ class _RunView:
         self._scene.chunk(first, samples, dense, sparse)
 
     def _report_losses(self, index: int) -> None:
-        """Say what has been left out before a sample since this was last said."""
+        """Report the chunks dropped before a sample since the last report."""
         if missing := self._pieces.lost - self._shown.left_out:
             self._shown.left_out = self._pieces.lost
             piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
@@ -192,7 +192,7 @@ class _RunView:
             self._say(f"{self._name}: {text}")
 
     def close(self) -> ShownRun:
-        """Show what is left, and end the recording."""
+        """Show the remaining samples, and end the recording."""
         shown = self._shown
         self._pieces.close()
         self._report_losses(shown.end)
@@ -210,16 +210,16 @@ class _RunView:
 
 
 class Live:
-    """View of running cells, one run after the other.
+    """Live view of running cells, one run after the other.
 
     Args:
-        open_recording: makes a recording of a name, and says what file it goes to.
-        rate: points of a curve in a second, at most.
-        say: takes lines for the user.
+        open_recording: creates a recording of a given name, and returns it with its file.
+        rate: largest number of curve points per second.
+        say: called with each line for the user.
 
     Attributes:
-        present: message type by topic, of all topics that can be heard; a run begins with these.
-        shown: the runs that are over.
+        present: message type by topic, for all topics with publishers; a new run begins with these.
+        shown: summaries of the finished runs.
     """
 
     def __init__(self, open_recording: Open, *, rate: float, say: Callable[[str], None]) -> None:
@@ -233,10 +233,10 @@ class Live:
         self._early: list[Sparse] = []  # before the first block
 
     def take(self, topic: str, msgtype: str, data: bytes) -> None:
-        """Take an encoded message of a topic that is drawn.
+        """Add an encoded message of a plotted topic.
 
         Raises:
-            LatheError: it is broken, or the view cannot be written.
+            LatheError: the message is malformed, or the view cannot be written.
         """
         try:
             if msgtype in messages.block_types():
@@ -263,7 +263,7 @@ class Live:
             self.end()
 
     def _belongs(self, topic: str, run_id: str, first: int, end: int) -> bool:
-        """Whether samples belong to the run that is shown; one that begins with them is from now on."""
+        """Return True if samples belong to the current run, after starting a new one if necessary."""
         where = self._order.place(topic, run_id, first, end)
         if where == "new":
             self.end()
@@ -271,7 +271,7 @@ class Live:
         return where != "old" and not self._over
 
     def end(self) -> None:
-        """Close the view of the run: it is over, or its publishers are gone.
+        """Close the view of the current run, after its end or without publishers.
 
         Raises:
             LatheError: the view cannot be written.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a view goes: a file, a window, a page for the browser, or a viewer that runs already."""
+"""Destination of a view: a file, a window, a page for the browser, or a running viewer."""
 
 import contextlib
 import os
@@ -29,16 +29,16 @@ def require() -> None:
     """Check that Rerun is installed.
 
     Raises:
-        LatheError: it is not.
+        LatheError: Rerun is not installed.
     """
     extras.require("rerun_bindings")
     os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
 
 
 def _free_port() -> int:
-    """Return a port that is free now.
+    """Return a free port.
 
-    Another program may take it before the viewer does: then the viewer does not start, which is reported.
+    If another program takes the port before the viewer does, the viewer does not start, which is reported.
     """
     with socket.socket() as listener:
         listener.bind((_HOST, 0))
@@ -55,12 +55,12 @@ def _answers(host: str, port: int) -> bool:
 
 @dataclass(frozen=True)
 class Viewer:
-    """Rerun's own program, as it is to be started.
+    """Command of a Rerun viewer that is to be started.
 
     Attributes:
-        options: of its command line.
-        port: where it takes recordings.
-        message: for the user.
+        options: command-line options.
+        port: port that receives recordings.
+        message: message for the user.
     """
 
     options: list[str]
@@ -68,7 +68,7 @@ class Viewer:
     message: str
 
     def start(self, *files: Path) -> "subprocess.Popen[bytes]":
-        """Start it, with files to show; it gets no Ctrl-C of its own."""
+        """Start the viewer with the files to show; it does not receive Ctrl-C itself."""
         return subprocess.Popen(
             [*allowed_code.interpreter("rerun"), *self.options, *map(str, files)],
             env=os.environ | {"RUST_LOG": "error"},
@@ -78,21 +78,21 @@ class Viewer:
 
 
 def end_viewer(process: "subprocess.Popen[bytes]") -> None:
-    """End a viewer that was started: what Python started is but the parent of the viewer itself."""
+    """End a viewer that was started, including the child process that is the actual viewer."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGTERM)
     process.wait()
 
 
 def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
-    """The viewer for ``spawn`` or ``serve``.
+    """Return the viewer command for ``spawn`` or ``serve``.
 
     Args:
-        kind: a window, or a page.
-        port: of the page.
+        kind: ``spawn`` for a window, ``serve`` for a page.
+        port: port of the page.
 
     Raises:
-        InputError: a window without a display.
+        InputError: no display for a window.
     """
     data = _free_port()
     options = ["--bind", _HOST, "--port", str(data)]  # by itself, Rerun listens on all interfaces
@@ -105,16 +105,17 @@ def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
 
 
 class Output:
-    """Takes the recordings of a live view, one a run; a context manager.
+    """Output of a live view: one recording per run; a context manager.
 
     Args:
-        kind: see the module.
-        file: of the first recording, for ``save``; those after it have a number in their names. None is overwritten.
-        url: of a viewer, for ``connect``, as rerun+http://127.0.0.1:9876/proxy.
-        port: of the page, for ``serve``.
+        kind: destination: ``save``, ``spawn``, ``serve`` or ``connect``.
+        file: file of the first recording, for ``save``; later files have a number in their names. No file is
+            overwritten.
+        url: URL of a viewer, for ``connect``, as rerun+http://127.0.0.1:9876/proxy.
+        port: port of the page, for ``serve``.
 
     Raises:
-        InputError: a file that cannot be made, a URL that is none, or no display.
+        InputError: the file cannot be created, the URL is invalid, or there is no display.
     """
 
     def __init__(self, kind: RerunOutput, *, file: Path, url: str, port: int) -> None:
@@ -134,7 +135,7 @@ class Output:
         """Start the viewer and wait until it answers.
 
         Raises:
-            LatheError: it does not.
+            LatheError: the viewer does not answer.
         """
         if self._kind == "connect":
             self._check_viewer(self._url)
@@ -152,7 +153,7 @@ class Output:
 
     @staticmethod
     def _check_viewer(url: str) -> None:
-        """Refuse what is no viewer's URL, or one where nobody answers."""
+        """Check that the URL is a viewer's and that the viewer answers."""
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
@@ -170,11 +171,11 @@ class Output:
 
     @property
     def ended(self) -> bool:
-        """Whether the viewer that was started is gone: its window was closed."""
+        """Return True if the viewer that was started has ended, for example because its window was closed."""
         return self._process is not None and self._process.poll() is not None
 
     def open(self, name: str) -> tuple["rr.RecordingStream", Path | None]:
-        """The recording of one more run, and the file that it goes to, if it does.
+        """Create the recording of the next run; return it with its file, if it has one.
 
         Raises:
             InputError: the file cannot be written.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes and colours of the three-dimensional picture: the part ring by ring, the tool, the scale of colours.
+"""Shapes and colours of the three-dimensional view: rings of the part, the tool, and the colour scale.
 
 The axes are those of a lathe: Z along the spindle, X from it to the tool. Lengths are in millimetres; the part is
 drawn with a radius of its own, since a recording does not hold it.
@@ -32,23 +32,23 @@ _SMALLEST = 1e-9  # form error that is told from 0 [m]
 
 
 def log_um(error: Array) -> Array:
-    """Magnitude of an error [m] as log10 of micrometres."""
+    """Return the magnitude of an error [m] as log10 of micrometres."""
     return np.asarray(np.log10(np.maximum(np.abs(error), _SMALLEST) * 1e6))
 
 
 def colours(error: Array) -> npt.NDArray[np.uint8]:
-    """RGBA colours of form errors [m], shape (n, 4)."""
+    """Return RGBA colours of form errors [m], shape (n, 4)."""
     low, high = LOG_RANGE
     return np.asarray(mpl.colormaps[COLOURS]((log_um(error) - low) / (high - low), bytes=True))
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """Facts of a run before it is drawn.
+    """Properties of a run that are known before it is drawn.
 
     Attributes:
-        revolutions: that will be turned; 0: unknown.
-        travel: along the part [m]; 0: unknown, or the tool stays where it is.
+        revolutions: number of revolutions of the run; 0: unknown.
+        travel: feed travel along the part [m]; 0: unknown, or no feed.
     """
 
     revolutions: float = 0.0
@@ -57,12 +57,12 @@ class Outlook:
 
 @dataclass(frozen=True)
 class Scale:
-    """How the part is drawn.
+    """Scale factors of the part in the view.
 
     Attributes:
-        deviation: of radii [mm/m].
-        height: [mm/m]; 0: revolutions are stacked instead.
-        pitch: between revolutions that are stacked [mm].
+        deviation: scale of radius deviations [mm/m].
+        height: scale of heights [mm/m]; 0: revolutions are stacked instead.
+        pitch: distance between stacked revolutions [mm].
     """
 
     deviation: float
@@ -71,7 +71,7 @@ class Scale:
 
     @classmethod
     def of(cls, outlook: Outlook, reference: Array) -> "Scale":
-        """A scale for what lies ahead and the first desired deviations [m], shape (n,)."""
+        """Return a scale that suits the outlook of the run and its first desired deviations [m], shape (n,)."""
         swing = float(np.ptp(reference))
         wanted = _SWING / (max(swing if np.isfinite(swing) else 0.0, _LEAST) * 1e3)
         decade = 10.0 ** np.floor(np.log10(wanted))
@@ -81,21 +81,21 @@ class Scale:
         return cls(float(exaggeration) * 1e3, height, pitch)
 
     def z(self, turns: Array, height: Array) -> Array:
-        """Places along the spindle [mm], by angle [revolution] and height [m]."""
+        """Return positions along the spindle [mm], from angle [revolution] and height [m]."""
         return height * self.height if self.height else turns * self.pitch
 
     def x(self, deviation: Array) -> Array:
-        """Distance from the spindle [mm] of radius deviations [m]."""
+        """Return distances from the spindle axis [mm], from radius deviations [m]."""
         return RADIUS + np.clip(deviation * self.deviation, -_DEEPEST, _DEEPEST)
 
     def text(self) -> str:
-        """In words."""
+        """Return a description of the scale factors."""
         along = f"height ×{self.height / 1e3:.3g}" if self.height else "one revolution after the other"
         return f"radius deviation ×{self.deviation / 1e3:.0f}, {along}"
 
 
 def ring(revolution: Revolution, scale: Scale) -> Ring:
-    """The part in a revolution; two of them are a strip, see `TRIANGLES`."""
+    """Return vertices, normals and colours of the part's ring in one revolution; two rings form a strip (see `TRIANGLES`)."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
     z = float(scale.z(np.array(revolution.number - 0.5), np.array(revolution.height)))
@@ -126,7 +126,7 @@ TOOL = (
 
 
 def rotations(angle: Array) -> Array:
-    """Quaternions that turn the place under the tool at a spindle angle [rad] to it, shape (n, 4)."""
+    """Return quaternions that rotate the point under the tool at a spindle angle [rad] to the tool, shape (n, 4)."""
     # A quaternion has half the angle, so that 4π is its period: with 2π its sign would jump at every revolution.
     half = -0.5 * np.mod(angle, 4.0 * np.pi)
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of many topics, as they come, made into pieces of one length that all topics share.
+"""Chunks of equal length that all topics share, assembled from the blocks of many topics.
 
-Pieces begin at fixed samples, so that a picture does not depend on how a run was cut. They join what several
-publishers send, and go on where something is missing: a viewer has no claim on every block.
+Chunks begin at fixed samples, so that the view does not depend on the block size. They combine the blocks of several
+publishers and tolerate missing blocks, since delivery to a viewer is best effort.
 """
 
 from collections import defaultdict
@@ -25,7 +25,7 @@ def _length(signals: Mapping[str, Samples]) -> int:
 
 
 def _join(first: int, cuts: _Cuts) -> Signals | None:
-    """The signals from a sample on; None if there is a gap."""
+    """Return the signals starting at a sample; None if there is a gap."""
     for begin, signals in cuts:
         if begin != first:
             return None
@@ -34,16 +34,16 @@ def _join(first: int, cuts: _Cuts) -> Signals | None:
 
 
 class Pieces:
-    """Hands pieces on to a sink: in order, with the topics that are complete in them.
+    """Assembler of chunks: passes them to a sink in order, with the topics that are complete in them.
 
     Args:
-        types: message type by topic, with or without a leading slash; only block types that are drawn are kept.
-        size: samples in a piece; pieces begin at its multiples.
-        sink: gets them, by fully qualified topic.
+        types: message type by topic, with or without a leading slash; only plotted block types are used.
+        size: length of a chunk [sample]; chunks begin at its multiples.
+        sink: receives the chunks, by fully qualified topic.
 
     Attributes:
-        first: sample that the first piece begins with. A view that joins amid a run begins where all topics are whole.
-        lost: pieces that were handed on without some topic, or not at all.
+        first: first sample of the first chunk. A view that joins in mid-run begins where all topics are complete.
+        lost: number of chunks passed on without some topics, or dropped.
     """
 
     def __init__(self, types: Mapping[str, str], size: int, sink: Sink) -> None:
@@ -59,17 +59,17 @@ class Pieces:
         self.learn(types)
 
     def learn(self, types: Mapping[str, str]) -> None:
-        """Wait for these topics as well from now on."""
+        """Add topics that later chunks wait for."""
         new = {full(topic): fields for topic, kind in types.items() if (fields := drawn_fields(kind))}
         if self._begun:
             self._late |= new.keys() - self._fields.keys()
         self._fields |= new
 
     def block(self, topic: str, first: int, signals: Mapping[str, Samples]) -> None:
-        """Take consecutive samples of one topic; those that come too late are passed over.
+        """Add consecutive samples of one topic; samples that arrive too late are ignored.
 
         Args:
-            topic: of those given at the start; others are passed over.
+            topic: topic name; unknown topics are ignored.
             first: index of the first sample.
             signals: by field, shape (samples,).
         """
@@ -96,11 +96,11 @@ class Pieces:
             self._emit(oldest)
 
     def message(self, message: Sparse) -> None:
-        """Take a message at a chosen sample."""
+        """Add a message at a chosen sample."""
         self._sparse.append(message)
 
     def close(self) -> None:
-        """Hand on what is left."""
+        """Pass on the remaining chunks."""
         while self._waiting:
             self._emit(min(self._waiting), closing=True)
         if self._sparse:
@@ -120,7 +120,7 @@ class Pieces:
             self._sink.chunk(begin, samples, dense, self._messages(begin + samples))
 
     def _messages(self, end: int) -> dict[str, list[Sparse]]:
-        """Those up to a sample, by topic."""
+        """Return the messages up to a sample, by topic."""
         taken: dict[str, list[Sparse]] = {}
         for message in self._sparse:
             if message.index < end:

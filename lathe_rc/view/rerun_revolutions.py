@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form of the part, revolution by revolution, from pieces of a run; memory does not grow with its length."""
+"""Form of the part by revolution, computed from chunks of a run; memory does not grow with its length."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ _LONGEST = 2**22  # samples of one revolution
 
 @dataclass(frozen=True)
 class Revolution:
-    """One complete revolution.
+    """Form of the part in one complete revolution.
 
     Attributes:
         number: from 1.
         end: index of the first sample after it.
-        error: form error, mean of the samples in each of `ANGLES` parts [m], shape (ANGLES,).
-        radius: what the part has of the form, as deviation of its radius: desired less error [m], shape (ANGLES,).
+        error: form error, mean of the samples in each of `ANGLES` sectors [m], shape (ANGLES,).
+        radius: radius deviation of the part, desired form minus form error [m], shape (ANGLES,).
         height: mean position along the part [m].
-        rms: of the form error, over the angle [m].
-        largest: magnitude of the form error [m].
+        rms: RMS of the form error over the angle [m].
+        largest: largest magnitude of the form error [m].
     """
 
     number: int
@@ -42,14 +42,14 @@ class Revolution:
     largest: float
 
     def harmonics(self) -> Array:
-        """Amplitudes of the form error by undulations per revolution [m], shape (HIGHEST + 1,)."""
+        """Return the amplitudes of the form error by undulations per revolution [m], shape (HIGHEST + 1,)."""
         amplitude = undulations(self.error[None], HIGHEST).amplitude[0]
         # A mean over a part of the circle weakens an undulation by the sine cardinal of what it covers of it.
         return np.asarray(amplitude / np.sinc(np.arange(HIGHEST + 1) / ANGLES))
 
 
 def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
-    """The revolution of samples, each of which stands for a step [revolution]; none if the spindle stood still."""
+    """Return the revolution of samples that each cover an angle step [revolution]; None if the spindle stood still."""
     turns, error, reference, height = samples
     if not step.any():
         return
@@ -67,9 +67,9 @@ def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
 
 
 class Revolutions:
-    """Collects samples and gives the revolutions that are complete.
+    """Accumulator of samples that yields complete revolutions.
 
-    RMS and largest error are those of `lathe_rc.analysis.form_errors`.
+    RMS and largest error agree with `lathe_rc.analysis.form_errors`.
     """
 
     def __init__(self) -> None:
@@ -81,7 +81,7 @@ class Revolutions:
         self._entire: bool | None = None  # whether the first samples of the revolution are there; None: not known yet
 
     def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[Revolution]:
-        """Take consecutive samples; where some are missing before them, the revolution under way is dropped.
+        """Add consecutive samples and return complete revolutions; a gap before them drops the current revolution.
 
         Args:
             first: index of the first sample.
@@ -91,7 +91,7 @@ class Revolutions:
             height: position along the part [m], shape (n,).
 
         Raises:
-            LatheError: the angle goes back, or faster than any spindle.
+            LatheError: the angle decreases, or increases faster than any spindle.
         """
         if first != self._next:
             self._held, self._entire = np.empty((4, 0)), None
@@ -119,7 +119,7 @@ class Revolutions:
         self._held = held[:, begins[-1] if self._entire else -1 :]  # one sample at least, for the step to the next
 
     def finish(self) -> Iterator[Revolution]:
-        """The last revolution, if less than two samples of it are missing."""
+        """Return the last revolution, if fewer than two of its samples are missing."""
         turns = self._held[0]
         if self._entire and self._step > 0.0 and turns[-1] + 2.0 * self._step >= np.floor(turns[-1]) + 1.0:
             yield from _measured(self._held, np.append(np.diff(turns), self._step), self._next)

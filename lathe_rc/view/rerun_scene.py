@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run in Rerun: the part, the tool, the signals and what was learned, logged in columns, piece by piece.
+"""Rerun scene of a run: part, tool, signals and learning progress, logged in columns, chunk by chunk.
 
 Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1. Memory does not grow with the run.
 """
@@ -34,24 +34,24 @@ _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240,
 
 
 class Scene:
-    """Logs pieces of a run; a sink of `bag.reading.stream.feed`, or behind `lathe_rc.view.rerun_pieces.Pieces`.
+    """Scene that logs chunks of a run; a sink of `bag.reading.stream.feed` or `lathe_rc.view.rerun_pieces.Pieces`.
 
-    A piece may lack topics, and there may be gaps between pieces. Curves have the same points however a run is cut if
-    pieces begin at multiples of ``window``.
+    A chunk may lack topics, and there may be gaps between chunks. The points of a curve do not depend on the chunks if
+    these begin at multiples of ``window``.
 
     Args:
-        recording: where to.
+        recording: recording that receives the scene.
         types: message type by topic.
         step_ns: sampling step [ns].
-        outlook: on the whole run.
-        rate: points of a curve in a second, at most.
-        live: the picture follows what comes in.
-        silent: topics on which nothing was said.
+        outlook: outlook on the whole run.
+        rate: largest number of curve points per second.
+        live: the view follows incoming data.
+        silent: topics without messages.
 
     Attributes:
-        window: samples that two points of a curve stand for.
-        points: logged so far, of all curves.
-        revolutions: logged so far.
+        window: number of samples represented by two points of a curve.
+        points: number of curve points logged so far.
+        revolutions: number of revolutions logged so far.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Scene:
         self.learn(types)
 
     def learn(self, types: Mapping[str, str]) -> None:
-        """Draw these topics as well from now on.
+        """Add topics to the scene.
 
         Raises:
             LatheError: the recording cannot be written.
@@ -99,7 +99,7 @@ class Scene:
         """Log consecutive samples and the messages among them.
 
         Raises:
-            LatheError: the recording cannot be written, or no part can have been turned with such an angle.
+            LatheError: the recording cannot be written, or the spindle angle is not plausible.
         """
         del samples
         self._log_nominal(first)
@@ -116,10 +116,10 @@ class Scene:
             self._log_part(first, angle, named[self._tool])
 
     def close(self) -> None:
-        """Log what is left and wait until it is written; the recording stays open.
+        """Log the remaining samples and flush the recording, which stays open.
 
         Raises:
-            LatheError: it cannot be written.
+            LatheError: the recording cannot be written.
         """
         self._log_revolutions(list(self._revolutions.finish()))
         if self._newest and self._sent != len(self._rows):
@@ -128,13 +128,13 @@ class Scene:
             self._recording.flush(timeout_sec=_FLUSH if self._live else _EVER)
 
     def note(self, index: int, text: str) -> None:
-        """Write a line at a sample among the events."""
+        """Log a line at a sample among the events."""
         self._send("events", rr.TextLog.columns(text=[text], level=["WARN"]), np.array([index]))
 
     # --- what never changes
 
     def _describe(self) -> None:
-        """Colours, names and shapes."""
+        """Log the static properties: colours, names and shapes."""
         names = {"learning/form_error/rms": "part, RMS", "learning/form_error/largest": "part, largest"}
         names |= {f"learning{t}": f"{t.strip('/')} {CYCLES[k].label}" for t, k in self._types.items() if k in CYCLES}
         plots = {"learning": list(names)}
@@ -158,7 +158,7 @@ class Scene:
             self._send_legend()
 
     def _send_legend(self) -> None:
-        """The scale of colours, as dots beside the part."""
+        """Log the colour scale as dots beside the part."""
         dots = np.linspace(*parts.LOG_RANGE, 33)
         decade = np.isclose(dots, np.round(dots))
         z = np.linspace(0.0, parts.LENGTH, dots.size)
@@ -175,7 +175,7 @@ class Scene:
     # --- pieces
 
     def _log_nominal(self, first: int) -> None:
-        """A supervisor says nothing until it changes: until then the cell is nominal."""
+        """Log the nominal state of a supervisor, which sends no message until its state changes."""
         for topic, kind in self._types.items():
             if kind == messages.SAFETY_STATUS and topic not in self._nominal:
                 self._nominal.add(topic)
@@ -184,14 +184,14 @@ class Scene:
                 self._log_state(supervisor(topic), next(iter(STATE_COLOURS)), first)
 
     def _log_curve(self, path: str, first: int, values: Samples, turns: Samples | None) -> None:
-        """Points of a curve."""
+        """Log the points of a curve."""
         at = extreme_samples(values, self.window)
         self.points += at.size
         number = None if turns is None else np.floor(turns[at]) + 1
         self._send(path, rr.Scalars.columns(scalars=values[at]), first + at, number)
 
     def _log_messages(self, topic: str, found: list[Sparse]) -> None:
-        """The controllers' reports of their cycles, and events."""
+        """Log the controllers' cycle reports, and events."""
         index, kind = np.array([message.index for message in found]), found[0].type
         if kind in CYCLES:
             cycle = CYCLES[kind]
@@ -206,7 +206,7 @@ class Scene:
             self._send("events", rr.TextLog.columns(text=texts), index)
 
     def _log_part(self, first: int, angle: Samples, tool: Signals) -> None:
-        """The part, the tool and the form error."""
+        """Log the part, the tool and the form error."""
         error, reference, height = tool["error"], tool["reference"], tool["height"]
         if self._scale is None:
             self._scale = parts.Scale.of(self._outlook, reference)
@@ -226,7 +226,7 @@ class Scene:
     # --- revolutions
 
     def _log_revolutions(self, complete: list[Revolution]) -> None:
-        """Rings, rows, spectra and the learning curve of revolutions that are complete."""
+        """Log rings, map rows, spectra and the learning curve of complete revolutions."""
         if not complete:
             return
         self._newest = complete[-1]
@@ -252,7 +252,7 @@ class Scene:
             self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_times_of(rings))
 
     def _add_row(self, revolution: Revolution) -> None:
-        """Add a row to the map; when it is full, every second one goes."""
+        """Add a row to the map; when the map is full, every second row is dropped."""
         self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the scale of colours
         # Each map is sent whole: after a part more rows, so that all of them together stay a multiple of the last.
         if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
@@ -278,7 +278,7 @@ class Scene:
     def _send(
         self, path: str, columns: rr.ComponentColumnList, index: Samples, revolution: Samples | None = None
     ) -> None:
-        """Log at samples on both timelines, or on time alone where the spindle angle is not known."""
+        """Log columns at samples on both timelines, or on time only if the spindle angle is not known."""
         when = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
         if revolution is not None:
             when.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
@@ -287,7 +287,7 @@ class Scene:
 
 
 def _times_of(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
-    """Samples after revolutions, and their numbers."""
+    """Return the samples after revolutions, and the revolution numbers."""
     return np.array([each.end for each in revolutions]), np.array([each.number for each in revolutions])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawn parts of a recording: fields as curves, thinned out where they are long, and states as bands over time."""
+"""Plotted parts of a recording: fields as curves, downsampled where they are long, and states as bands over time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from lathe_rc.safety.state_machine import State
 
 @dataclass(frozen=True)
 class Curve:
-    """How a field is drawn.
+    """Plot style of a field.
 
     Attributes:
-        plot: name of the plot that it belongs to.
-        label: in the legend, after the name of its topic.
-        scale: from the field's unit to that of the plot.
+        plot: name of the field's plot.
+        label: label in the legend, after the name of the topic.
+        scale: factor from the field's unit to the plot's unit.
     """
 
     plot: str
@@ -54,7 +54,7 @@ _SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # of a state that a servo co
 
 @dataclass(frozen=True)
 class Cycle:
-    """How controllers report a cycle: field of its error [m], field of its number, and a word for the error."""
+    """Format of a controller's cycle reports: error field [m], number field, and a word for the error."""
 
     error: str
     counter: str
@@ -73,7 +73,7 @@ _PART = {
 
 
 def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
-    """The drawn curves of a recording, by fully qualified topic and field.
+    """Return the plotted curves of a recording, by fully qualified topic and field.
 
     Args:
         types: message type by topic.
@@ -86,28 +86,28 @@ def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
 
 
 def drawn_fields(msgtype: str) -> set[str]:
-    """The fields of a block type that a scene uses."""
+    """Return the fields of a block type that a scene uses."""
     return set(_CURVES.get(msgtype, {})) | _PART.get(msgtype, set())
 
 
 def is_drawn(msgtype: str) -> bool:
-    """Whether a scene has any use for messages of a type."""
+    """Return True if a scene uses messages of a type."""
     return bool(drawn_fields(msgtype)) or msgtype in CYCLES or msgtype in LOGGED
 
 
 def curve_path(topic: str, field: str) -> str:
-    """Where a curve is in the view."""
+    """Return the entity path of a curve in the view."""
     return f"signals{full(topic)}/{field}"
 
 
 def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
-    """Places of the smallest and the largest value in every ``window`` samples, in order.
+    """Return the indices of the smallest and the largest value in every ``window`` samples, in order.
 
-    What is drawn of a signal are then samples of it at their own times, and no peak is lost.
+    A curve through these samples keeps their original times and loses no peak.
 
     Args:
         values: shape (n,).
-        window: [sample]; 1 or 2 keeps everything.
+        window: length [sample]; 1 or 2 keeps all samples.
 
     Returns:
         Indices, shape (up to 2·⌈n/window⌉,).
@@ -130,12 +130,12 @@ _FAULT, _REPAIR = "fault ", "repair "  # how the events of faults begin
 
 
 def supervisor(topic: str) -> str:
-    """Where the band of a supervisor is, by the topic of its status."""
+    """Return the entity path of a supervisor's band, given the topic of its status."""
     return f"{STATES}/cell{full(topic).removesuffix('/status')}"
 
 
 def band(message: Sparse) -> tuple[str, str] | None:
-    """Which band changes with a message, and to what; an empty text ends a band. None: no band does."""
+    """Return path and new state of the band that a message changes; an empty state ends the band; None: no change."""
     topic = full(message.topic)
     if message.type == messages.SAFETY_STATUS:
         state = message.values["state"]
