@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated cells: members with the real protocol, a network and a clock in one thread, and a seed for all of it.
+"""Simulated cells: members with the real protocol, a network and a clock in one thread, all driven by one seed.
 
-A schedule draws a cell of 3 to 13 members and what happens to them: delays, kills, stops, cuts, slow members, lifecycle
-calls, strangers. `Cell.run` plays it and `Cell.check` looks at the promises of docs/cell.md. The same seed gives the
-same schedule.
+A schedule draws a cell of 3 to 13 members and its disturbances: delays, kills, stops, cuts, slow members, lifecycle
+calls, foreign nodes. `Simulation.run` plays it and `violations` checks the guarantees of docs/cell.md. The same seed
+gives the same schedule.
 """
 
 import heapq
@@ -37,7 +37,7 @@ HORIZON = 60.0  # [s] of simulated wall time after which a member that is still 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of one topic; `value` stands for its samples and depends on all that it was computed from."""
+    """Block of one topic; `value` stands for its samples and depends on all inputs of the computation."""
 
     source: str
     index: int
@@ -47,12 +47,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Design:
-    """A member as the scenario has it.
+    """Member of the cell in the scenario.
 
     Attributes:
-        name: fully qualified; it publishes the topic of the same name.
-        inputs: name of each publisher that it reads, and by how many blocks later.
-        restarts: another process may take its place.
+        name: fully qualified name, also of the published topic.
+        inputs: name of each publisher that the member reads, and the delay in blocks.
+        restarts: the member can be restarted in another process.
     """
 
     name: str
@@ -61,12 +61,12 @@ class Design:
 
     @property
     def records(self) -> bool:
-        """Whether it is the recorder, which publishes nothing."""
+        """Return True for the recorder, which publishes nothing."""
         return self.name == "/recorder"
 
 
 class Network:
-    """Reliable channels between processes, in order on each topic and in any order across topics."""
+    """Reliable channels between processes: in order on each topic, in any order across topics."""
 
     def __init__(self, cell: "Simulation") -> None:
         self._cell = cell
@@ -79,7 +79,7 @@ class Network:
         self._history.setdefault((writer, topic), deque(maxlen=depth))
 
     def match(self, writer: str, reader: str, topic: str) -> None:
-        """A reader has found a writer: it gets the newest messages, and all that follow."""
+        """Match a reader with a writer: it receives the newest messages, and all later ones."""
         if (writer, topic) in self._history and (writer, reader, topic) not in self._matched:
             self._matched.add((writer, reader, topic))
             for message in self._history[writer, topic]:
@@ -115,18 +115,18 @@ class Network:
         return self._cut.get(frozenset((one, other)), 0.0)
 
     def acknowledged(self, writer: str) -> float:
-        """When the last message of a process arrives."""
+        """Return the arrival time of the last message of a process [s]."""
         return max((time for channel, time in self._newest.items() if channel[0] == writer), default=0.0)
 
     def forget(self, process: str) -> None:
-        """A process is gone: messages that are on their way may be lost, for it sends none again."""
+        """Remove an ended process: its messages in transit may be lost, since they are not repeated."""
         self._history = {key: queue for key, queue in self._history.items() if key[0] != process}
         gone = {key for key in self._matched if process in key[:2]}
         self._matched -= {key for key in gone if key[1] == process or self._cell.random.random() < 0.5}
 
 
 class Process:
-    """A process with one member: as `lathe_rc.nodes.cell_node.CellNode` and its roles, without ROS."""
+    """Process with one member: `lathe_rc.nodes.cell_node.CellNode` and its roles, without ROS."""
 
     def __init__(self, cell: "Simulation", design: Design, pid: int) -> None:
         self.cell, self.design, self.pid = cell, design, pid
@@ -143,7 +143,7 @@ class Process:
     # ---- lifecycle
 
     def configure(self) -> None:
-        """Be as before the first activation."""
+        """Reset the process to the state before the first activation."""
         cell, design = self.cell, self.design
         self._performs = self.listens = self._has_work = False
         self.blocks = 0
@@ -207,7 +207,7 @@ class Process:
     # ---- messages
 
     def take(self, topic: str, message: object) -> None:
-        """A message has arrived."""
+        """Receive a message."""
         if self._waits or self.stopped or self._inbox or self.free_at > self.cell.now:
             self._inbox.append(partial(self._receive, topic, message))
             self.wake()
@@ -217,7 +217,7 @@ class Process:
         self._step()
 
     def wake(self) -> None:
-        """Handle what waits, one after the other, as the process has time."""
+        """Process the waiting messages one after the other, when the process is free."""
         if self._waits or self.stopped or not self._inbox:
             return
         self._waits = True
@@ -279,7 +279,7 @@ class Process:
     # ---- protocol
 
     def look(self) -> None:
-        """Let the protocol see the time, the others and the graph."""
+        """Pass the time, the state of the other members and the graph to the protocol."""
         silent, ended = self.cell.seen_by(self)
         self.protocol.look(self.cell.now, silent, ended)
         self._step()
@@ -382,7 +382,7 @@ class Process:
             self._keep()
 
     def _keep(self) -> None:
-        """Keep the state; another process begins with that of a window ago."""
+        """Store the state; a new process resumes from the state of one window ago."""
         kept = self.cell.files.setdefault(self.design.name, deque())
         queues = {name: (order.end, order.received, list(self.taken[name])) for name, order in self.orders.items()}
         kept.append((self.blocks, list(self.values), queues))
@@ -417,14 +417,14 @@ class Process:
             self._follow(self.cell.master)
 
     def _follow(self, master: str) -> None:
-        """Go no further than the spindle."""
+        """Limit the member to the spindle's progress."""
         self._pace = BlockOrder(master, self.cell.run_id)
         self._pace.expect(master, self.blocks * SIZE)
         self._pace.repeats = True
         self.cell.discover(self)
 
     def _block(self, name: str, index: int) -> int | None:
-        """Value of a block of an input; None while it is missing."""
+        """Return the value of an input's block; None while it is missing."""
         if index < 0:
             return 0
         taken = self.taken[name]
@@ -454,7 +454,7 @@ class Process:
             self._perform_all()
 
     def _compute(self, *, last: bool) -> bool:
-        """Compute the next block, if its inputs are there."""
+        """Compute the next block, if its inputs have arrived; return True if it was computed."""
         if self._pace is not None and self.blocks * SIZE >= self._pace.end:
             return False
         inputs = []
@@ -483,13 +483,13 @@ class Process:
 
 
 class Simulation:
-    """A cell, its network and its clock.
+    """Simulated cell with its network and clock.
 
     Args:
-        seed: of everything that is drawn.
+        seed: seed of all random draws.
         designs: members; the first is the time master.
-        window: blocks that may be in flight.
-        length: of the run [block].
+        window: largest number of blocks in flight.
+        length: length of the run [block].
         stalls: reaction to silence, ``wait`` or ``safe``.
     """
 
@@ -516,7 +516,7 @@ class Simulation:
         self.overrun = ""
 
     def delay(self) -> float:
-        """How long a message takes [s]: mostly little, now and then much."""
+        """Return a random transmission time of a message [s]: mostly short, sometimes long."""
         draw = self.random.random()
         return 1e-4 * draw if draw < 0.9 else 0.02 * (draw - 0.9) / 0.1
 
@@ -536,7 +536,7 @@ class Simulation:
         return process
 
     def discover(self, new: Process) -> None:
-        """Let a process and the others meet, topic by topic, at some time."""
+        """Schedule the discovery between a process and the others, at a random time for each topic."""
         for other in self.processes.values():
             if other is new or not other.listens:
                 continue
@@ -550,7 +550,7 @@ class Simulation:
         return next((each for each in self.processes.values() if each.design.name == name), None)
 
     def seen_by(self, process: Process) -> tuple[dict[str, float], set[str]]:
-        """Members that a process does not hear, since when; and those whose process has ended."""
+        """Return the silent members, as seen by a process, with their times, and the members whose process has ended."""
         silent: dict[str, float] = {}
         ended: set[str] = set()
         for name, member in process.protocol.members.items():
@@ -568,7 +568,7 @@ class Simulation:
         return silent, ended
 
     def look_at_window(self, master: Process) -> None:
-        """Note a time master that has released more blocks than the window allows."""
+        """Record an error if the time master has released more blocks than the window allows."""
         assert isinstance(master.protocol, TimeMasterProtocol)
         counted = [
             process.blocks
@@ -581,7 +581,7 @@ class Simulation:
             self.overrun = f"{master.blocks - slowest} blocks are in flight"
 
     def leave(self, process: Process) -> None:
-        """A process ends in order."""
+        """End a process in order."""
         if process.alive:
             del self.processes[process.identity]
             self.gone.append(process)
@@ -606,7 +606,7 @@ class Simulation:
             process.wake()
 
     def run(self, until: float = HORIZON) -> None:
-        """Play events until every process has ended, or for so long [s]."""
+        """Play events until every process has ended, or until a simulated time [s]."""
         while self._events and (self.processes or self._pids < 100 + len(self.designs)):
             time, _, call = heapq.heappop(self._events)
             if time > until:
@@ -615,7 +615,7 @@ class Simulation:
             call()
 
     def expected(self) -> dict[str, list[int]]:
-        """The values that each member computes in an undisturbed run."""
+        """Return the values that each member computes in an undisturbed run."""
         values: dict[str, list[int]] = {design.name: [] for design in self.designs}
         for index in range(self.length):
             for design in self.designs:
@@ -628,7 +628,7 @@ class Simulation:
 
 
 def draw_designs(draw: random.Random) -> tuple[Design, ...]:
-    """A cell: a chain of stages with branches and feedback, and a recorder of everything."""
+    """Draw a cell: a chain of stages with branches and feedback, and a recorder of all topics."""
     count = draw.choice((1, 2, 2, 3, 3, 3, 4, 4, 5, 7, 11))
     names = ["/spindle", *(f"/stage_{number}" for number in range(count))]
     designs = []
@@ -644,7 +644,7 @@ def draw_designs(draw: random.Random) -> tuple[Design, ...]:
 
 
 class Schedule:
-    """Disturbances of a cell, drawn by a seed; `Simulation.plan` has it in words."""
+    """Disturbances of a cell, drawn from a seed; described in `Simulation.plan`."""
 
     def __init__(self, seed: int) -> None:
         draw = random.Random(f"schedule {seed}")  # noqa: S311 - as above
@@ -675,7 +675,7 @@ class Schedule:
         self.cell.start(design)
 
     def _running(self) -> bool:
-        """Whether block 0 has been released."""
+        """Return True if block 0 has been released."""
         return any(event == "block0" for _, _, event, _ in self.cell.reports)
 
     def _process(self, design: Design) -> Process | None:
@@ -713,14 +713,14 @@ class Schedule:
             process.activate()
 
     def _stranger(self, design: Design, seconds: float, other: Design) -> None:
-        """A node of another run says that it is a member."""
+        """Send announcements and a cell state from outside the cell."""
         if process := self._process(design):
             process.take("members", Announcement("another", "/spindle", "spindle_encoder", 2, ("/spindle",)))
             process.take("members", Announcement("run", "/second", "spindle_encoder", 2, ("/second",)))
             process.take("cell_state", CellState("another", 3, 0))
 
     def _namesake(self, design: Design, seconds: float, other: Design) -> None:
-        """A second node has a member's name."""
+        """Start a second node with a member's name."""
         if self._process(design) and self._running():
             self.cell.start(design).namesake = True
 
@@ -735,12 +735,12 @@ class Schedule:
             self.cell.culprits.add(design.name)
 
     def _bring_back(self, design: Design, seconds: float) -> None:
-        """The harness starts a member again that can go on; an operator any, before the run."""
+        """Restart a member: the harness, if the member can resume; an operator, any member before the run."""
         if design.restarts or not self._running():
             self.cell.at(self.cell.now + min(seconds, 0.5), partial(self._launch, design))
 
     def _interrupt(self, design: Design, seconds: float, other: Design) -> None:
-        """SIGTERM."""
+        """End a process by SIGTERM."""
         if process := self._process(design):
             self._blame(design)
             process.protocol.interrupt("SIGTERM")
@@ -769,7 +769,7 @@ class Schedule:
             process.activate()
 
     def _claim(self, design: Design, seconds: float, other: Design) -> None:
-        """A member claims blocks that were never sent."""
+        """Report progress of a member for blocks that were never sent."""
         master = self._process(self.cell.designs[0])
         if master and design.name != self.cell.master and self._running():
             self._blame(design)
@@ -777,7 +777,7 @@ class Schedule:
 
 
 def violations(cell: Simulation) -> list[str]:
-    """Promises that a cell has broken, after `Simulation.run`."""
+    """Return the guarantees that a cell has violated, after `Simulation.run`."""
     found = [f"{process.identity} hangs" for process in cell.processes.values() if not _waits_for_another(process)]
     found += [cell.overrun] if cell.overrun else []
     expected = cell.expected()
@@ -813,9 +813,9 @@ def violations(cell: Simulation) -> list[str]:
 
 
 def _waits_for_another(process: Process) -> bool:
-    """Whether the time master of a process is gone, or it is a second node of a name, for which no cell waits.
+    """Return True if a process has lost its time master, or is a second node of one name, which no cell waits for.
 
-    It says so, and an operator ends it, or starts another time master.
+    Such a process reports this; an operator ends it, or starts another time master.
     """
     master = process.protocol.master
     named = master is not None and process.design.name in master.members
@@ -823,7 +823,7 @@ def _waits_for_another(process: Process) -> bool:
 
 
 def play(seed: int) -> tuple[Simulation, list[str]]:
-    """Play the schedule of a seed."""
+    """Play the schedule of a seed; return the cell and its violations."""
     cell = Schedule(seed).cell
     cell.run()
     return cell, violations(cell)

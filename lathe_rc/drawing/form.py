@@ -52,7 +52,7 @@ class RunFigure(Figure):
 
 
 def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> RunFigure:
-    """Draw the desired form, the form error over angle in the first and last revolution, and the form error by revolution.
+    """Draw the desired form, the form error over angle in the first and last revolution, and by revolution.
 
     Args:
         run: form that the run has turned.

@@ -142,7 +142,7 @@ class Inputs:
         self._shared = []
 
     def pass_over(self, inside: Collection[str], first: int) -> None:
-        """Drop or load queued blocks of the chain's topics ``inside``, as a stage without a chain does up to ``first``."""
+        """Load or drop queued blocks of the chain's topics ``inside``, as a stage alone does, up to sample ``first``."""
         for topic in self.buffers.keys() & inside:
             queue, buffer = self.queues[topic], self.buffers[topic]
             if buffer.delay:

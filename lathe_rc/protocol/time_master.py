@@ -292,7 +292,7 @@ class TimeMasterProtocol(MemberProtocol):
             self._tell_stall(name, self.completed[name])
 
     def member_failed(self, member: Announcement, now: float) -> None:
-        """Handle the failure of a member: the others go on to the safe state if the cell has a window, else the cell fails."""
+        """Handle the failure of a member: the others go to the safe state if there is a window, else the cell fails."""
         if member.message == given_up(self.own.name):
             why = f"{self.own.name} stood still at sample {self.samples}: the others have given it up"
             self.fail(LatheError(why))

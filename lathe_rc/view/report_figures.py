@@ -88,7 +88,7 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 
 
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
-    """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis of each direction."""
+    """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis of a direction."""
     # The page holds one number a field; Vega computes the places. Written out, they would make it five times as large.
     place = "(datum.k - 1)"
     return _rectangles(

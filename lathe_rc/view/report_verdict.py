@@ -117,7 +117,7 @@ def _incidents(data: Gathered) -> Iterator[str]:
 
 
 def _form(data: Gathered, form: Form) -> Iterator[Finding]:
-    """Return findings on the final form error and its composition."""
+    """Yield findings on the final form error and on its repeatable and variable parts."""
     profiles = um(np.array(form.newest))
     if len(profiles) < _FEWEST:
         return
@@ -144,7 +144,7 @@ def _form(data: Gathered, form: Form) -> Iterator[Finding]:
 
 
 def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
-    """Return the trend of the learning; it continues if one half of the last revolutions lies entirely below the other."""
+    """Yield a finding on the trend of the form error, if the last revolutions fall or grow clearly."""
     half = len(rms) // 2
     before, after = rms[:half], rms[-half:]
     factor = float(after.mean() / before.mean()) if before.mean() else 1.0
@@ -160,7 +160,7 @@ def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
 
 
 def _speed(data: Gathered) -> Iterator[str]:
-    """Return a finding on the variation of the spindle speed, if it varies."""
+    """Yield the variation of the spindle speed, if it is large enough."""
     for (_, name), series in data.curves.signals.items():
         low, high = series.extremes
         if name == "speed_true" and low > 0.0 and math.isfinite(high):

@@ -95,7 +95,7 @@ class Scale:
 
 
 def ring(revolution: Revolution, scale: Scale) -> Ring:
-    """Return vertices, normals and colours of the part's ring in one revolution; two rings form a strip (see `TRIANGLES`)."""
+    """Return vertices, normals and colours of the part's ring in a revolution; two rings form a strip."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
     z = float(scale.z(np.array(revolution.number - 0.5), np.array(revolution.height)))

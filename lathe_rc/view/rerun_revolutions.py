@@ -49,7 +49,7 @@ class Revolution:
 
 
 def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
-    """Return the revolution of samples that each cover an angle step [revolution]; None if the spindle stood still."""
+    """Yield the revolution of samples that each cover an angle step [revolution]; none if the spindle stood still."""
     turns, error, reference, height = samples
     if not step.any():
         return
