@@ -550,7 +550,7 @@ class Simulation:
         return next((each for each in self.processes.values() if each.design.name == name), None)
 
     def seen_by(self, process: Process) -> tuple[dict[str, float], set[str]]:
-        """Return the silent members, as seen by a process, with their times, and the members whose process has ended."""
+        """Return silent members, as seen by a process, with their times, and members whose process has ended."""
         silent: dict[str, float] = {}
         ended: set[str] = set()
         for name, member in process.protocol.members.items():

@@ -142,7 +142,7 @@ class Inputs:
         self._shared = []
 
     def pass_over(self, inside: Collection[str], first: int) -> None:
-        """Load or drop queued blocks of the chain's topics ``inside``, as a stage alone does, up to sample ``first``."""
+        """Load or drop queued blocks of the chain's topics ``inside`` up to ``first``, as a stage without a chain does."""
         for topic in self.buffers.keys() & inside:
             queue, buffer = self.queues[topic], self.buffers[topic]
             if buffer.delay:

@@ -512,8 +512,8 @@ class MemberProtocol:
     def complete_part(self) -> None:
         """Complete this member's part; it stays until the cell has ended, or until its messages are acknowledged.
 
-        DDS repeats a lost message only as long as the sending process lives. A failed node stays as well while the others
-        go on: its announcement holds the reason, also for members that read it later.
+        DDS repeats a lost message only as long as the sending process lives. A failed node stays as well while the
+        others go on: its announcement holds the reason, also for members that read it later.
         """
         self.over = True
         if self.master is None or self.master.name == self.own.name:

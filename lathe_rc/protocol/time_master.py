@@ -277,8 +277,8 @@ class TimeMasterProtocol(MemberProtocol):
     def _forgive(self, passed: float) -> None:
         """Extend all silence deadlines by the time ``passed`` [s] during which this node itself was stopped.
 
-        Members that have failed meanwhile repeat their announcement: the time master waits for it before it gives up any
-        member.
+        Members that have failed meanwhile repeat their announcement: the time master waits for it before it gives up
+        any member.
         """
         if passed > SILENCE:
             passed += GIVEN_UP if passed > GIVEN_UP else 0.0

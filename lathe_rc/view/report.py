@@ -284,7 +284,7 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
         with_budget: add the budget of the form error, by runs of the bag's scenario.
 
     Raises:
-        InputError: not a bag, or the page cannot be created; with a budget, the bag has no scenario that can run offline.
+        InputError: not a bag, or the page cannot be created; with a budget, the bag has no scenario for an offline run.
         LatheError: the page cannot be written, or a run of the budget failed.
 
     Example:
