@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of a drive while it runs, from its command u and its measured position x.
+"""Online identification of a drive from its command u and its measured position x.
 
     u(t - τ) = x + a1·dx/dt + a2·d²x/dt²        a1 = 2ζ/ωn, a2 = 1/ωn², τ known
 
-Both sides pass the same low-pass (ω/(p + ω))³, whose stages give the filtered derivatives: nothing is differentiated.
+Both sides pass the same low-pass (ω/(p + ω))³, whose stages give the filtered derivatives without any numerical
+differentiation.
 
-**Learning controller**: least squares over the cycles that have ended, older ones with a forgetting factor. One
-harmonic is enough for both coefficients; the speed of the spindle may vary.
+**Learning controller**: least squares over the completed cycles, with a forgetting factor. One harmonic is enough for
+both coefficients; the speed of the spindle may vary.
 
-**Under a disturbance** f that is unknown, but repeats with the angle: the difference from the last revolution at the
-same angle has no f. It needs a speed that varies; otherwise the equation itself counts, with a small weight, and beside
-it the model that was given, the more the larger f is.
+**Unknown disturbance** f that repeats with the angle: the difference from the previous revolution at the same angle
+cancels f. This requires a varying speed. In addition the equation itself is used with a small weight, and the given
+model as a prior, whose weight increases with f.
 """
 
 from dataclasses import dataclass
@@ -29,12 +30,12 @@ _LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent 
 
 
 class LowPass(NamedTuple):
-    """1/(1 + p/ω)³ by the bilinear rule, for the two signals of a drive.
+    """Low-pass 1/(1 + p/ω)³, discretised by the bilinear rule, for the two signals of a drive.
 
     Attributes:
         bandwidth: ω [rad/s].
-        keep, take: of a stage.
-        position, command: their values before and after each stage, shape (4,) [m].
+        keep, take: feedback and input coefficient of a stage.
+        position, command: values before and after each stage, shape (4,) [m].
     """
 
     bandwidth: float
@@ -45,7 +46,7 @@ class LowPass(NamedTuple):
 
 
 def low_pass(bandwidth: float, step: float) -> LowPass:
-    """Low-pass of a ``bandwidth`` [rad/s], at rest at 0; ``step`` in s."""
+    """Create a low-pass of a ``bandwidth`` [rad/s], at rest at 0; ``step`` in s."""
     half = 0.5 * bandwidth * step
     return LowPass(
         bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(STAGES + 1), np.zeros(STAGES + 1)
@@ -54,7 +55,7 @@ def low_pass(bandwidth: float, step: float) -> LowPass:
 
 @inlined
 def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
-    """Step a low-pass of one signal."""
+    """Advance the low-pass of one signal by a sample."""
     new = value
     for stage in range(STAGES):
         old = stages[stage]
@@ -65,14 +66,14 @@ def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
 
 @inlined
 def derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
-    """First two derivatives of the output of a low-pass."""
+    """First and second time derivative of the output of a low-pass."""
     first = bandwidth * (stages[STAGES - 1] - stages[STAGES])
     return first, bandwidth**2 * (stages[STAGES - 2] - 2.0 * stages[STAGES - 1] + stages[STAGES])
 
 
 @inlined
 def add_products(sums: Array, place: int, velocity: float, acceleration: float, rest: float) -> None:
-    """Add the products of dx/dt, d²x/dt² and u - x to five ``sums``, ``place`` on: vv, va, aa, vr and ar."""
+    """Add the products vv, va, aa, vr and ar of dx/dt, d²x/dt² and u - x to five ``sums`` starting at ``place``."""
     sums[place] += velocity * velocity
     sums[place + 1] += velocity * acceleration
     sums[place + 2] += acceleration * acceleration
@@ -82,31 +83,31 @@ def add_products(sums: Array, place: int, velocity: float, acceleration: float, 
 
 @inlined
 def excited(vv: float, va: float, aa: float) -> bool:
-    """Whether sums of the squares of dx/dt and d²x/dt² and of their product tell the two apart.
+    """Whether dx/dt and d²x/dt² are linearly independent, from the sums of their squares and of their product.
 
-    That is relative to independent regressors: the units of the two differ by orders of magnitude.
+    The determinant is compared with the one of orthogonal regressors, since the magnitudes of the two differ by orders.
     """
     return bool(vv * aa - va * va > _LEAST_EXCITED * vv * aa > 0.0)
 
 
 @inlined
 def coefficients(vv: float, va: float, aa: float, vr: float, ar: float) -> tuple[float, float]:
-    """a1 [s] and a2 [s²] by least squares, from the same sums and those of the products with u - x."""
+    """Solve the normal equations for a1 [s] and a2 [s²], given the sums of `add_products`."""
     determinant = vv * aa - va * va
     return (vr * aa - ar * va) / determinant, (ar * vv - vr * va) / determinant
 
 
-_LOOK_BACK = 2  # samples of the command that a delay with a fraction needs
+_LOOK_BACK = 2  # samples of the command needed for a fractional delay
 
 
 class IdentifierTable(NamedTuple):
-    """A `DriveIdentifier` for kernels.
+    """State of a `DriveIdentifier` for kernels.
 
     Attributes:
-        delay, part: of the command against the position that is seen: whole samples, and the rest in samples.
-        commands: of the past; sample n stands at n modulo their number, a power of two [m].
+        delay, part: delay between the command and the visible position: whole samples, and the fraction of a sample.
+        commands: past commands; sample n is at index n modulo the length, a power of two [m].
         low: low-pass of both sides.
-        sums: of the normal equations.
+        sums: sums of the normal equations.
     """
 
     delay: int
@@ -118,7 +119,7 @@ class IdentifierTable(NamedTuple):
 
 @kernel
 def command_sent(identifier: IdentifierTable, first: int, start: int, stop: int, command: Array) -> None:
-    """Remember the set points ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+    """Store the set points ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
     mask = identifier.commands.size - 1
     for k in range(start, stop):
         identifier.commands[(first + k) & mask] = command[k]
@@ -126,7 +127,7 @@ def command_sent(identifier: IdentifierTable, first: int, start: int, stop: int,
 
 @kernel
 def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, position: Array) -> None:
-    """Filter and sum the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+    """Add the positions ``start`` to ``stop`` of a block that begins at sample ``first`` to the normal equations [m]."""
     delay, part, low = identifier.delay, identifier.part, identifier.low
     commands, sums = identifier.commands, identifier.sums
     mask = commands.size - 1
@@ -148,12 +149,12 @@ def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, p
 
 @dataclass(frozen=True)
 class Identified:
-    """A drive model from measurements.
+    """Identified second-order drive model.
 
     Attributes:
         natural_frequency: ωn [rad/s].
         damping: ζ.
-        residual: RMS of what the model does not explain over the RMS of the command.
+        residual: RMS of the model residual over the RMS of the command.
     """
 
     natural_frequency: float
@@ -162,18 +163,18 @@ class Identified:
 
 
 class DriveIdentifier:
-    """Fits ωn and ζ of a second-order drive behind a known delay.
+    """Identifier of ωn and ζ of a second-order drive with a known delay.
 
     Args:
         model_delay: τ [s].
         feedback_delay: samples until a measured position is visible.
         bandwidth: λ of the filters [rad/s]: above the profile's harmonics, below the noise.
-        forgetting: weight of a cycle when the next one ends, 0 up to 1.
+        forgetting: weight of a cycle at the end of the next one, 0 to 1.
         step: sampling step [s].
         block: longest block [sample].
 
     Attributes:
-        table: for `accumulate` and `command_sent`.
+        table: state for `accumulate` and `command_sent`.
     """
 
     def __init__(
@@ -198,15 +199,19 @@ class DriveIdentifier:
         )
 
     def block(self, first: int, start: int, stop: int, position: Array) -> None:
-        """Take the measured positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+        """Process the positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
         accumulate(self.table, first, start, stop, position)
 
     def commanded(self, first: int, command: Array) -> None:
-        """Remember the set points of a block [m], once all of it is known."""
+        """Store the set points of a complete block that begins at sample ``first`` [m]."""
         command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
-        """Estimate from the measurements so far, None while there are too few; those so far weigh less from then on."""
+        """Estimate the drive model, and apply the forgetting factor to the measurements so far.
+
+        Returns:
+            The model; None if the measurements do not determine it.
+        """
         s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
         if excited(s11, s12, s22):
@@ -219,19 +224,19 @@ class DriveIdentifier:
         return found
 
 
-_WHOLE = 3e-4  # weight of the equation itself beside its difference from the last revolution
-_UNSURE = (0.3, 0.4)  # standard deviations of a1 and a2 as they are given, relative
+_WHOLE = 3e-4  # weight of the equation itself relative to its difference from the previous revolution
+_UNSURE = (0.3, 0.4)  # relative standard deviations of the given a1 and a2
 
 
 class FitTable(NamedTuple):
-    """The measurements of the drive.
+    """Accumulated measurements for the fit of a drive under a disturbance.
 
     Attributes:
-        given: a1 [s] and a2 [s²] as they are told, shape (2,).
-        before: dx/dt, d²x/dt² and u - x of the last revolution, shape (3, n).
-        sums: of the normal equations, differences first.
-        means: how many, sums of dx/dt, d²x/dt², u - x and (u - x)²: a steady force counts for nothing.
-        forgetting: what a revolution leaves of both.
+        given: a1 [s] and a2 [s²] of the given model, shape (2,).
+        before: dx/dt, d²x/dt² and u - x of the previous revolution, shape (3, n).
+        sums: sums of the normal equations, those of the differences first, shape (10,).
+        means: count, and sums of dx/dt, d²x/dt², u - x and (u - x)², which remove the influence of a constant force.
+        forgetting: factor applied to ``sums`` and ``means`` at the end of a revolution.
     """
 
     given: Array
@@ -242,12 +247,12 @@ class FitTable(NamedTuple):
 
 
 def no_measurements(given: Array, points: int, forgetting: float) -> FitTable:
-    """Fit without measurements; ``points`` of the grid per revolution."""
+    """Create an empty fit table for ``points`` grid points per revolution."""
     return FitTable(given, np.zeros((3, points)), np.zeros(10), np.zeros(5), forgetting)
 
 
 def forget_measurements(m: FitTable) -> None:
-    """Forget all measurements."""
+    """Reset a fit table to no measurements."""
     for array in (m.before, m.sums, m.means):
         array[:] = 0.0
 
@@ -261,7 +266,7 @@ def sum_up(
     acceleration: float,
     rest: float,
 ) -> None:
-    """Take dx/dt, d²x/dt² and u - x at grid point ``here``, ``again`` if they were taken a revolution ago as well."""
+    """Add dx/dt, d²x/dt² and u - x at grid point ``here``; ``again``: the previous revolution has a value there too."""
     sums, before = m.sums, m.before
     if again:
         v, a, r = velocity - before[0, here], acceleration - before[1, here], rest - before[2, here]
@@ -278,16 +283,16 @@ def sum_up(
 
 @inlined
 def fitted(m: FitTable) -> tuple[float, float]:
-    """Least-squares a1 [s] and a2 [s²]; not above 0 if the measurements do not determine them."""
+    """Fit a1 [s] and a2 [s²] by least squares; not above 0 if the measurements do not determine them."""
     count, v, a, r, rr = m.means[0], m.means[1], m.means[2], m.means[3], m.means[4]
     whole, s = m.sums[5:].copy(), m.sums[:5].copy()
-    # About their means: a steady force is no lag.
+    # Centred, so that a constant force is not taken for a lag.
     for k, mean in enumerate((v * v, v * a, a * a, v * r, a * r)):
         whole[k] -= mean / count
     if not excited(whole[0], whole[1], whole[2]):
         return 0.0, 0.0
     a1, a2 = coefficients(whole[0], whole[1], whole[2], whole[3], whole[4])
-    # The force is as large in the waves that the drive moves in as in the others, where it is what is left.
+    # The force is assumed as large at the harmonics of the motion as at the others, where it equals the residual.
     left = _WHOLE * max(rr - r * r / count - a1 * whole[3] - a2 * whole[4], 0.0)
     sure1, sure2 = left / (_UNSURE[0] * m.given[0]) ** 2, left / (_UNSURE[1] * m.given[1]) ** 2
     s += _WHOLE * whole
@@ -300,6 +305,6 @@ def fitted(m: FitTable) -> tuple[float, float]:
 
 @inlined
 def fade(m: FitTable) -> None:
-    """End a revolution: measurements so far count less."""
+    """Apply the forgetting factor to the measurements at the end of a revolution."""
     put_scaled(m.sums, m.forgetting, m.sums)
     put_scaled(m.means, m.forgetting, m.means)

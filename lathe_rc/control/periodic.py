@@ -7,16 +7,16 @@
     u2(t) = (h11·I + h12·s·v·δ̃)·s,   I' = s·v·δ̃,   s = sat(y_F)
     τ·δ̃' + δ̃ = δ,   δ̃(0) = 0,   δ = 1 where (S(u) - u)·v ≥ 0 and δ0 elsewhere
 
-S limits at ±S0. The paper does not define sat; here it is the unit saturation. r, y and u are numbers without a unit,
-as in the paper: who controls metres scales them.
+S limits at ±S0. The paper does not define sat; here it is the unit saturation. r, y and u are dimensionless as in the
+paper; positions in metres have to be scaled by the caller.
 
-What the paper has not, and what is on by default:
+Additions to the paper, on by default:
 
-- The memory is read through a Gaussian of standard deviation σ, symmetric in time: what it needs on both sides of
-  t - T̄ is past. Without it the memory grows at frequencies where the factor of a period exceeds 1, see
-  `lathe_papers.formulas.hyperstability.learning_factor`.
-- Anti-windup: while (S(u) - u)·v < 0, I stands still and the memory stores what it read, limited to ±S0. The switch
-  alone only slows winding up.
+- The memory is read through a Gaussian filter of standard deviation σ, symmetric in time; the samples on both sides of
+  t - T̄ are all in the past. Without the filter the memory grows at frequencies where the factor of a period exceeds 1,
+  see `lathe_papers.formulas.hyperstability.learning_factor`.
+- Anti-windup: while (S(u) - u)·v < 0, I is constant and the memory stores the value read, limited to ±S0. The switch
+  alone only slows down the windup.
 """
 
 from dataclasses import dataclass
@@ -35,18 +35,18 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PeriodicGains:
-    """Numbers of the law, named as in the paper.
+    """Parameters of the periodic control law, named as in the paper.
 
     Attributes:
-        h0: of the memory [1].
-        h11: of the adaptive gain [1/s].
-        h12: of the nonlinear gain [1].
+        h0: gain of the memory [1].
+        h11: coefficient of the adaptive gain [1/s].
+        h12: coefficient of the nonlinear gain [1].
         lead, lag: T and T* of the filters on r and y [s].
         switch_time: τ [s].
         switch_low: δ0 [1].
-        memory_filter: σ of the Gaussian on the memory [s]; 0 for none.
-        reference_gain: χ* of eq. 12 [1], for the integral of eq. 15 alone; with T* = 0 it meets eq. 14 for all drives.
-        doc: where they are from.
+        memory_filter: σ of the Gaussian filter of the memory [s]; 0 for none.
+        reference_gain: χ* of eq. 12 [1], for the integral of eq. 15 only; with T* = 0 it meets eq. 14 for all drives.
+        doc: source of the parameters.
     """
 
     h0: float
@@ -62,7 +62,7 @@ class PeriodicGains:
 
     @property
     def filter(self) -> TransferFunction:
-        """W of eqs 6 and 10."""
+        """Filter W of eqs 6 and 10."""
         top, bottom = np.poly([-1.0 / self.lead] * 3), np.poly([-1.0 / self.lag] * 3)
         return TransferFunction(tuple(top * self.lead**3), tuple(bottom * self.lag**3))
 
@@ -83,7 +83,7 @@ PRESETS = {
 def _check(
     gains: PeriodicGains, *, limit: float, step_s: float, memory_filter: float, quantisation: tuple[float, float]
 ) -> None:
-    """Refuse numbers that make no law."""
+    """Reject parameters out of their range with an `InputError`."""
     positive = {
         "h0": gains.h0, "h11": gains.h11, "lead": gains.lead, "lag": gains.lag, "switch_time": gains.switch_time,
         "limit": limit, "step": step_s,
@@ -103,28 +103,28 @@ def _check(
 
 
 _REACH = 5.0  # of the Gaussian, in standard deviations
-_CHUNK = 128  # samples of the memory that are smoothed at a time, if the period allows
-# Places in the state: I, δ̃, the integral of eq. 15, its lower bound, the least distance of both so far, the largest
-# demand |u|, the largest |sample| stored; whether it is frozen; samples in which the command was limited.
+_CHUNK = 128  # samples of the memory smoothed at a time, if the period allows
+# Indices in the state: I, δ̃, the integral of eq. 15, its lower bound, the least distance of both so far, the largest
+# demand |u|, the largest |sample| stored, whether learning is frozen, number of samples with a limited command.
 _INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY, _FROZEN, _SATURATED, _SIZE = range(10)
 
 
 class PeriodicLaw(NamedTuple):
-    """Constants of the law for kernels.
+    """Constants of the periodic control law for kernels.
 
     Attributes:
         filter: W.
         samples: T̄ in samples.
-        weights: Gaussian from its middle on, shape (reach + 1,).
+        weights: Gaussian weights, starting at the middle, shape (reach + 1,).
         h0, h11, h12: gains.
         limit: S0.
-        keep: what remains of δ̃ after a sample.
+        keep: decay factor of δ̃ per sample.
         switch_low: δ0.
         anti_windup: False for the paper's law.
         measurement_step, command_step: quantisation; 0 for none.
         step: sampling step [s].
         reference_gain: χ* of eq. 12.
-        knows_ideal: False where S(u) of a period before stands for what the drive needs.
+        knows_ideal: False if S(u) of the previous period approximates the ideal input u°.
     """
 
     filter: System
@@ -145,14 +145,14 @@ class PeriodicLaw(NamedTuple):
 
 
 class PeriodicState(NamedTuple):
-    """The state of the law, for kernels.
+    """State of the periodic control law for kernels.
 
     Attributes:
         values: scalars, shape (9,).
         reference, output: states of the filters.
-        ring: stored samples of u1, shape (samples + reach,); sample n stands at n modulo its length.
-        smoothed: what is read in the chunk at hand.
-        window: room for its samples with their neighbours, shape (chunk + 2·reach,).
+        ring: stored samples of u1, shape (samples + reach,); sample n is at index n modulo the length.
+        smoothed: smoothed memory of the current chunk, shape (chunk,).
+        window: scratch for the samples of the chunk and their neighbours, shape (chunk + 2·reach,).
         ideal: u° over a period, shape (samples,).
     """
 
@@ -167,7 +167,7 @@ class PeriodicState(NamedTuple):
 
 @kernel
 def _smooth(law: PeriodicLaw, state: PeriodicState, n: int) -> None:
-    """Read the chunk that begins at sample ``n`` from the memory."""
+    """Smooth the memory for the chunk that begins at sample ``n``."""
     ring, smoothed, window, weights = state.ring, state.smoothed, state.window, law.weights
     chunk, reach = smoothed.size, weights.size - 1
     first = n - law.samples - reach
@@ -203,12 +203,12 @@ def _monitor(law: PeriodicLaw, state: PeriodicState, n: int, wanted: float, v: f
 
 @kernel
 def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, measurement: float) -> float:
-    """Limited command of one sample; samples in which the limit was in use are counted.
+    """Compute the limited, quantised command of one sample, and count the samples with a limited command.
 
     Args:
-        law: its constants.
-        state: its memory, changed.
-        n: absolute index of the sample; each is one more than the last.
+        law: constants of the law.
+        state: state of the law, updated in place.
+        n: absolute index of the sample; increases by 1 from call to call.
         reference: r.
         measurement: y, before its quantisation.
     """
@@ -217,7 +217,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     output = step(law.filter, state.output, quantise(measurement, law.measurement_step))
     v = wanted - output
     s = min(max(output, -1.0), 1.0)
-    # Chunks begin at multiples of their size, so that the cutting into blocks changes no bit.
+    # Chunks begin at multiples of their size, so that results are bit-identical for all block lengths.
     place = n % state.smoothed.size
     if place == 0:
         _smooth(law, state, n)
@@ -229,7 +229,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     winding = (applied - demand) * v < 0.0
     frozen = values[_FROZEN] > 0.0
     if frozen:
-        stored = state.ring[(n - law.samples) % state.ring.size]  # not what is read, which the filter would flatten
+        stored = state.ring[(n - law.samples) % state.ring.size]  # unfiltered: repeated filtering would flatten the memory
     elif winding and law.anti_windup:
         stored = min(max(read, -law.limit), law.limit)
     else:
@@ -254,23 +254,23 @@ def _block(
 
 @kernel
 def freeze(state: PeriodicState, on: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
-    """Freeze memory and I, or let them change again."""
+    """Freeze the memory and I, or resume their learning."""
     state.values[_FROZEN] = 1.0 if on else 0.0
 
 
 @kernel
 def achieved(state: PeriodicState, row: Array) -> None:
-    """Fill in the largest demand, the largest memory, the saturated samples, the integral, its bound, and clearance."""
+    """Fill ``row`` with largest demand, largest memory, saturated samples, Popov integral, its bound and clearance."""
     values = state.values
     row[0], row[1], row[2] = values[_DEMAND], values[_MEMORY], values[_SATURATED]
     row[3], row[4], row[5] = values[_POPOV], values[_BOUND], values[_CLEARANCE]
 
 
 def samples_in(period: float, step_s: float) -> int:
-    """Samples in ``period`` [s].
+    """Number of samples in a period [s].
 
     Raises:
-        InputError: it is no whole number of steps.
+        InputError: the period is not a whole number of steps.
     """
     exact = period / step_s
     whole = round(exact)
@@ -285,24 +285,24 @@ def samples_in(period: float, step_s: float) -> int:
 
 
 class PeriodicController:
-    """The law with its memory; at rest at 0, with an empty memory, before the first sample.
+    """Nonlinear periodic controller with a memory; initially at rest at 0 with an empty memory.
 
     Args:
-        gains: see `PRESETS`.
+        gains: parameters of the law, such as a preset of `PRESETS`.
         period: T̄, a multiple of the period of reference and disturbance [s].
-        limit: S0, the same as the drive's [1].
+        limit: S0, equal to the limit of the drive [1].
         step_s: sampling step [s].
-        memory_filter: σ of the Gaussian on the memory [s], 0 for none; None for that of ``gains``.
+        memory_filter: σ of the Gaussian filter of the memory [s], 0 for none; None for the value in ``gains``.
         anti_windup: see the module; False for the paper's switch alone.
         measurement_step, command_step: quantisation of y and u [1]; 0 for none.
-        ideal: u°, the input that keeps y at r, over the first period, shape (period/step,); None takes what was applied
-            a period before for it, which is the same once the law has learned.
+        ideal: u°, the input that keeps y at r, over the first period, shape (period/step,); None uses the command
+            applied one period earlier, which is the same after learning.
 
     Attributes:
-        law, state: for `advance`, where a kernel closes the loop.
+        law, state: constants and state for `advance`, for loops closed in a kernel.
 
     Raises:
-        InputError: a gain, limit or period that cannot be, or a Gaussian wider than the period allows.
+        InputError: a gain, limit or period is out of range, or the Gaussian is wider than the period allows.
     """
 
     def __init__(
@@ -358,22 +358,22 @@ class PeriodicController:
             window=np.zeros(chunk + 2 * reach),
             ideal=np.zeros(samples) if ideal is None else ideal.copy(),
         )
-        # What a falling adaptive gain may give: the integral of (h11·I + χ*) over I is never below this.
+        # Contribution of a falling adaptive gain: the integral of (h11·I + χ*) over I is never below this bound.
         self.state.values[_BOUND] = -(gains.reference_gain**2) / (2.0 * gains.h11)
         self.state.values[_CLEARANCE] = -self.state.values[_BOUND]
 
     def block(self, first: int, reference: Array, measurement: Array, command: Array) -> None:
-        """Step from sample ``first`` on; arrays of shape (n,) [1]; ``command`` is limited and quantised."""
+        """Compute the limited, quantised commands of a block starting at sample ``first``; arrays of shape (n,) [1]."""
         _block(self.law, self.state, first, reference, measurement, command)
 
     @property
     def saturated(self) -> int:
-        """Samples so far in which the command was limited."""
+        """Number of samples so far with a limited command."""
         return int(self.state.values[_SATURATED])
 
     @property
     def learning(self) -> bool:
-        """Whether memory and I change; otherwise the memory repeats what it holds, and eq. 15 is not watched."""
+        """Whether the memory and I are updated; if not, the memory repeats, and eq. 15 is not monitored."""
         return not self.state.values[_FROZEN]
 
     @learning.setter
@@ -382,7 +382,7 @@ class PeriodicController:
 
     @property
     def integrator(self) -> float:
-        """I of the adaptive gain [s]."""
+        """Integrator state I of the adaptive gain [s]."""
         return float(self.state.values[_INTEGRATOR])
 
     @property
@@ -392,20 +392,23 @@ class PeriodicController:
 
     @property
     def largest_memory(self) -> float:
-        """Largest magnitude that was stored in the memory so far [1]."""
+        """Largest magnitude stored in the memory so far [1]."""
         return float(self.state.values[_MEMORY])
 
     @property
     def popov_integral(self) -> float:
-        """The integral of eq. 15 so far [s]."""
+        """Popov integral of eq. 15 up to the current sample [s]."""
         return float(self.state.values[_POPOV])
 
     @property
     def popov_bound(self) -> float:
-        """-η0 of eq. 15, see `lathe_papers.formulas.hyperstability.popov_bound`; falls during the first period [s]."""
+        """Lower bound -η0 of the Popov integral in eq. 15 [s]; decreases during the first period.
+
+        See `lathe_papers.formulas.hyperstability.popov_bound`.
+        """
         return float(self.state.values[_BOUND])
 
     @property
     def popov_holds(self) -> bool:
-        """Whether the integral has been above its bound in every sample so far."""
+        """Whether the Popov integral was at or above its bound in every sample so far."""
         return bool(self.state.values[_CLEARANCE] >= 0.0)

@@ -6,21 +6,23 @@ The drive K/(p·(T1·p + 1)) behind a zero-order hold of period T is from sample
     W(z) = (b1·z + b0)/((z - 1)·(z - d)),
     d = e^{-T/T1},  b1 = K·(T - T1 + T1·d),  b0 = K·(T1·(1 - d) - d·T)
 
-and the link D(z) stands before the hold and works on the error. Laws:
+and the link D(z), placed before the hold, filters the error. Laws:
 
     paper         D = K·T·(z - d)/(b1·z + b0)
     ripple_free   D = 1/(b1 + b0)·(z - d)/(z + b0/(b1 + b0))
 
-The paper's makes D·W the desired function K·(1 - T/2·jλ)/jλ, which is K·T/(z - 1). It settles in one period if
-K·T = 1, but at the samples only: it cancels the zero -b0/b1, so that the command alternates for many periods and the
-drive swings between the samples. The ripple-free link leaves the zero alone. Its command for a step is 1/(b1 + b0),
--d/(b1 + b0), 0, 0, …: the drive speeds up for one period, slows down to a stop in the next, and never turns back.
+The paper's link makes D·W equal to the desired function K·(1 - T/2·jλ)/jλ, which is K·T/(z - 1). The loop settles in
+one period if K·T = 1, but at the samples only: the link cancels the zero -b0/b1, so that the command alternates for
+many periods and the drive oscillates between the samples. The ripple-free link does not cancel the zero. Its command
+for a step is 1/(b1 + b0), -d/(b1 + b0), 0, 0, …: the drive accelerates for one period, decelerates to a stop in the
+next, and never reverses.
 
-A measurement that comes late by τ ≤ T makes the drive B(z)/(z·(z - 1)·(z - d)) with
+With a measurement delayed by τ ≤ T the drive is B(z)/(z·(z - 1)·(z - d)) with
 
     B = b1·z + b0 + K·T1·(1 - e)·(1 - d)·(z - 1) + K·(T - τ - T1·(1 - e))·(z - 1)·(z - d),  e = e^{-(T-τ)/T1}
 
-for which the link D = z·(z - 1)·(z - d)/(B(1)·z³ - B) gives the same command for a step; it is the one above if τ = 0.
+for which the link D = z·(z - 1)·(z - d)/(B(1)·z³ - B) gives the same command for a step; for τ = 0 it equals the
+ripple-free link above.
 """
 
 from dataclasses import dataclass
@@ -35,12 +37,12 @@ from lathe_rc.jit import kernel
 Array = npt.NDArray[np.float64]
 Law = Literal["paper", "ripple_free"]
 
-_DIGITS = 9  # of the magnitude of a pole that are told from 1
+_DIGITS = 9  # decimals of a pole magnitude that distinguish it from 1
 
 
 @dataclass(frozen=True)
 class SampledDrive:
-    """K/(p·(T1·p + 1)) behind a zero-order hold (paper 003, eqs 1 and 2).
+    """Drive K/(p·(T1·p + 1)) behind a zero-order hold (paper 003, eqs 1 and 2).
 
     Attributes:
         gain: K [1/s].
@@ -48,7 +50,7 @@ class SampledDrive:
         period: T [s].
 
     Raises:
-        InputError: one of them is not positive and finite.
+        InputError: a parameter is not positive and finite.
     """
 
     gain: float
@@ -62,34 +64,34 @@ class SampledDrive:
 
     @property
     def d(self) -> float:
-        """e^{-T/T1}."""
+        """Discrete pole d = e^{-T/T1} of the lag."""
         return float(np.exp(-self.period / self.lag))
 
     @property
     def b1(self) -> float:
-        """Coefficient of z."""
+        """Coefficient b1 of z in the numerator of W(z)."""
         return float(self.gain * (self.period + self.lag * np.expm1(-self.period / self.lag)))
 
     @property
     def b0(self) -> float:
-        """Coefficient of 1."""
+        """Constant coefficient b0 in the numerator of W(z)."""
         return float(self.gain * (-self.lag * np.expm1(-self.period / self.lag) - self.d * self.period))
 
     @property
     def numerator(self) -> Array:
-        """Of W(z), falling powers of z."""
+        """Numerator of W(z), falling powers of z, shape (2,)."""
         return np.array([self.b1, self.b0])
 
     @property
     def denominator(self) -> Array:
-        """Of W(z), falling powers of z."""
+        """Denominator of W(z), falling powers of z, shape (3,)."""
         return np.array([1.0, -1.0 - self.d, self.d])
 
     def late(self, delay: float) -> Array:
-        """B(z), shape (3,), for a measurement that comes ``delay`` [s] late; without a delay it is z·(b1·z + b0).
+        """Numerator B(z) with a measurement delay [s], shape (3,); z·(b1·z + b0) without a delay.
 
         Raises:
-            InputError: it comes later than a period.
+            InputError: the delay is negative or exceeds a period.
         """
         if not 0.0 <= delay <= self.period:
             raise InputError(f"sampled link: delay = {delay:g} s; allowed: from 0 to the period, {self.period:g} s")
@@ -101,7 +103,7 @@ class SampledDrive:
 
 @dataclass(frozen=True)
 class Link:
-    """D(z), command over error.
+    """Corrective link D(z), the transfer function from error to command.
 
     Attributes:
         numerator, denominator: falling powers of z, of the same length; the first of the denominator is 1.
@@ -120,7 +122,7 @@ def _link(numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Link:
 
 
 def towards(drive: SampledDrive, ratio: float) -> Link:
-    """Link that makes D·W the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
+    """Link that makes D·W equal to the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
 
     Wd = K·(1 - jλ·T/2)·(1 + jλ·Te)/(jλ·(1 + jλ·T/2)) = (K·T/2)·((1 + ratio)·z + 1 - ratio)/(z·(z - 1))
     """
@@ -129,19 +131,19 @@ def towards(drive: SampledDrive, ratio: float) -> Link:
 
 
 def paper(drive: SampledDrive) -> Link:
-    """The paper's link, which is `towards` 1."""
+    """Corrective link of paper 003, equal to `towards` with ratio 1."""
     return _link(drive.gain * drive.period * np.array([1.0, -drive.d]), drive.numerator)
 
 
 def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
-    """Link whose command for a step ends with the second period.
+    """Link whose command for a step is 0 after the second period.
 
     Args:
-        drive: what it is for.
-        delay: by which the measurement comes late [s].
+        drive: drive that the link corrects.
+        delay: delay of the measurement [s].
 
     Raises:
-        InputError: it comes later than a period.
+        InputError: the delay is negative or exceeds a period.
     """
     whole = drive.b1 + drive.b0
     if delay == 0.0:
@@ -152,20 +154,20 @@ def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
 
 
 def design(law: Law, drive: SampledDrive, delay: float = 0.0) -> Link:
-    """Link of a law, by `paper` or `ripple_free`; the paper's makes no allowance for a delay [s]."""
+    """Design the link of a law with `paper` or `ripple_free`; only the latter accounts for the delay [s]."""
     return paper(drive) if law == "paper" else ripple_free(drive, delay)
 
 
 def closed_loop(drive: SampledDrive, link: Link, delay: float = 0.0) -> Array:
-    """Characteristic polynomial of the closed loop, falling powers of z; nothing is cancelled.
+    """Characteristic polynomial of the closed loop, falling powers of z, without pole-zero cancellation.
 
     Args:
-        drive: of the loop.
-        link: before the drive.
-        delay: by which the measurement comes late [s].
+        drive: drive of the loop.
+        link: corrective link before the drive.
+        delay: delay of the measurement [s].
 
     Raises:
-        InputError: it comes later than a period.
+        InputError: the delay is negative or exceeds a period.
     """
     top, bottom = drive.numerator, drive.denominator
     if delay > 0.0:
@@ -174,7 +176,7 @@ def closed_loop(drive: SampledDrive, link: Link, delay: float = 0.0) -> Array:
 
 
 def largest_pole(drive: SampledDrive, link: Link, delay: float = 0.0) -> float:
-    """Largest magnitude of the poles of the closed loop, 1 if it is that but for rounding; see `closed_loop`."""
+    """Largest pole magnitude of the closed loop, rounded to 9 decimals; arguments as for `closed_loop`."""
     return round(float(np.abs(np.roots(closed_loop(drive, link, delay))).max()), _DIGITS)
 
 
@@ -182,9 +184,9 @@ class LinkTable(NamedTuple):
     """Constants of a link for kernels.
 
     Attributes:
-        errors: weights of the error and of those before it, shape (m + 1,).
-        commands: weights of the commands before, shape (m,).
-        limit: the command is cut off at ± this.
+        errors: weights of the current and the previous errors, shape (m + 1,).
+        commands: weights of the previous commands, shape (m,).
+        limit: limit of the command's magnitude.
     """
 
     errors: Array
@@ -198,15 +200,15 @@ def table(link: Link, limit: float = np.inf) -> LinkTable:
 
 
 def rest(link: Link) -> Array:
-    """The state for `correct` of a link that has rested at 0: past errors, then past commands."""
+    """Zero initial state of a link for `correct`: past errors, then past commands."""
     return np.zeros(2 * len(link.denominator) - 2)
 
 
 @kernel
 def correct(link: LinkTable, state: Array, error: float) -> tuple[float, bool]:
-    """Command of one more period, and whether it was cut off.
+    """Compute the command of the next period, and whether it was limited.
 
-    The link remembers the command that it gave, not the one that it would have liked to give.
+    The state stores the limited command, not the unlimited one.
     """
     order = link.commands.size
     wanted = link.errors[0] * error
@@ -221,13 +223,13 @@ def correct(link: LinkTable, state: Array, error: float) -> tuple[float, bool]:
 
 
 class HeldLink(NamedTuple):
-    """A `SampledLink` for kernels.
+    """Constants and state of a `SampledLink` for kernels.
 
     Attributes:
-        link: its constants.
-        state: for `correct`.
+        link: constants of the link.
+        state: past errors and commands for `correct`.
         divisor: samples in a period.
-        held: the command, and how many were cut off so far.
+        held: the held command, and the number of limited commands so far.
     """
 
     link: LinkTable
@@ -238,7 +240,7 @@ class HeldLink(NamedTuple):
 
 @kernel
 def correct_along(link: HeldLink, first: int, set_point: Array, measurement: Array, command: Array) -> None:
-    """`correct` for a block that begins at sample ``first``, shape (n,)."""
+    """Compute the held commands of a block that begins at sample ``first`` with `correct`, shape (n,)."""
     held = link.held
     for k in range(command.size):
         if (first + k) % link.divisor == 0:
@@ -248,9 +250,9 @@ def correct_along(link: HeldLink, first: int, set_point: Array, measurement: Arr
 
 
 class SampledLink:
-    """The link as a controller: set point and measurement in, held command out.
+    """Controller with a sampled link: set point and measurement in, held command out.
 
-    It computes at samples that are multiples of the divisor, which make the period T.
+    A command is computed every ``divisor`` samples, at multiples of it; this is the period T.
 
     Args:
         law: ``paper`` or ``ripple_free``.
@@ -258,16 +260,16 @@ class SampledLink:
         lag: T1 of the drive [s].
         step: sampling step [s].
         divisor: samples in a period.
-        delay: by which the measurement comes late [s]; the ripple-free link allows for it.
-        limit: the command is cut off at ± this, in the unit of the position.
+        delay: delay of the measurement [s]; only the ripple-free link accounts for it.
+        limit: limit of the command's magnitude, in the unit of the position.
 
     Attributes:
-        drive: what the link is for.
-        link: its coefficients.
-        table: for `correct_along`.
+        drive: drive that the link corrects.
+        link: coefficients of the link.
+        table: constants and state for `correct_along`.
 
     Raises:
-        InputError: a value that is out of range, or a loop that would be unstable.
+        InputError: a value is out of range, or the closed loop would be unstable.
     """
 
     def __init__(
@@ -297,16 +299,16 @@ class SampledLink:
 
     @property
     def saturated(self) -> int:
-        """Commands so far that were cut off."""
+        """Number of limited commands so far."""
         return int(self.table.held[1])
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
-        """Step from sample ``first`` on; at rest at 0 before sample 0.
+        """Compute the commands of a block starting at sample ``first``; the link is at rest at 0 before sample 0.
 
         Args:
             first: index of the first sample.
             set_point: shape (n,).
             measurement: position, in the same unit, shape (n,).
-            command: filled, in the same unit, shape (n,).
+            command: output, in the same unit, shape (n,).
         """
         correct_along(self.table, first, set_point, measurement, command)
