@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Angle, speed and acceleration of a spindle from the counts of its encoder: a Kalman filter.
+"""Kalman filter for angle, speed and acceleration of a spindle from its encoder counts.
 
     φ' = Ω,  Ω' = α,  α' = γ,  γ' = white noise
 
-A count says that the angle lies within it. Where the spindle passes several counts in a sample, each sample measures
-the angle to a count, and its middle is the measurement. Where a count lasts several samples, only its edges do, but
-better: the edge was passed within the last sample. γ is then more than such an encoder tells, and α' is white noise.
+A count bounds the angle to an interval. If the spindle passes several counts in a sample, each sample measures the
+angle to one count, and the middle of the interval is the measurement. If a count lasts several samples, only its edges
+are measurements, but more accurate ones: the edge was passed within the last sample. Such an encoder does not resolve
+γ, and α' is modelled as white noise instead.
 
-The intensity of the noise follows from what the speed is expected to do: a deviation of relative amplitude d at the
-frequency w has a derivative of order k of d·Ω0·w^k, which lasts about 1/w. The filter is then as fast as the counts
-allow.
+The intensity of the noise follows from the expected deviation of the speed: with the relative amplitude d at the
+frequency w, its derivative of order k is d·Ω0·w^k and lasts about 1/w. The filter is then as fast as the counts allow.
 
-It takes the rounding to a count for white noise. It is none where the counts per sample c are near a ratio p/m of small
-numbers: the rounding then repeats every m samples but for a beat of m·|c - p/m| per sample, which the filter follows if
-it is slow enough.
+The filter models the rounding to a count as white noise. This is wrong where the counts per sample c are near a ratio
+p/m of small integers: the rounding then repeats every m samples except for a beat of m·|c - p/m| per sample, which the
+filter follows if the beat is slow enough.
 """
 
 from collections.abc import Collection
@@ -30,20 +30,21 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 _ROUNDING = 1e-18  # [rad²] variance of an ideal encoder
 _LEAST_SPREAD = 0.2  # of the speed before the first sample, relative to the nominal one
-_FOLLOWED = 1.75  # beats up to so many times the filter's bandwidth are: by simulation at 16 and 64 kHz, 1000, 3000 rpm
+# Largest beat that the filter follows, over its bandwidth; by simulation at 16 and 64 kHz, 1000 and 3000 rpm.
+_FOLLOWED = 1.75
 
 
 class AngleFilterTable(NamedTuple):
-    """The filter for kernels.
+    """Parameters and state of the angle filter for kernels.
 
     Attributes:
         step: sampling step [s].
-        quantum: angle of a count [rad]; 0: ideal.
-        order: states that it has, 4, or 3 without γ.
-        intensity: of the noise, per second, of the last of them.
+        quantum: angle of a count [rad]; 0 for an ideal encoder.
+        order: number of states: 4, or 3 without γ.
+        intensity: noise intensity of the last state, per second.
         state: φ [rad], Ω [rad/s], α [rad/s²], γ [rad/s³], shape (4,).
-        covariance: of the state, shape (4, 4).
-        before: the measured angle of the last sample [rad], NaN before the first, shape (1,).
+        covariance: covariance of the state, shape (4, 4).
+        before: measured angle of the last sample [rad], NaN before the first, shape (1,).
     """
 
     step: float
@@ -56,14 +57,14 @@ class AngleFilterTable(NamedTuple):
 
 
 def angle_filter(step: float, counts: int, nominal: float, deviation: float, frequency: float) -> AngleFilterTable:
-    """Filter before its first sample.
+    """Create an angle filter in its initial state.
 
     Args:
         step: sampling step [s].
-        counts: of the encoder per revolution; 0: ideal.
-        nominal: speed Ω0 [rad/s].
+        counts: encoder counts per revolution; 0 for an ideal encoder.
+        nominal: nominal speed Ω0 [rad/s].
         deviation: expected amplitude of the speed deviation, relative to Ω0.
-        frequency: up to which it is expected [rad/s].
+        frequency: highest expected frequency of the deviation [rad/s].
     """
     quantum = _TURN / counts if counts else 0.0
     order = 4 if quantum <= nominal * step else 3
@@ -76,26 +77,26 @@ def angle_filter(step: float, counts: int, nominal: float, deviation: float, fre
 
 
 def counts_per_sample(filter_: AngleFilterTable, speed: float) -> float:
-    """Counts that the encoder passes in a sample at a speed [rad/s]; 0: it is ideal."""
+    """Compute the encoder counts per sample at a speed [rad/s]; 0 for an ideal encoder."""
     return speed * filter_.step / filter_.quantum if filter_.quantum else 0.0
 
 
 def followed_ratio(filter_: AngleFilterTable, low: float, high: float, ratios: Collection[Fraction]) -> Fraction | None:
-    """Ratio of counts per sample whose beat is so slow that the filter follows it.
+    """Find a ratio of counts per sample whose beat is slow enough to be followed by the filter.
 
     Args:
-        filter_: before its first sample.
-        low: least speed of the spindle [rad/s].
-        high: largest one [rad/s].
-        ratios: of counts per sample that are looked at.
+        filter_: angle filter in its initial state.
+        low: lowest speed of the spindle [rad/s].
+        high: highest speed of the spindle [rad/s].
+        ratios: ratios of counts per sample to check.
 
     Returns:
-        The one of the smallest numbers; None: near none of them.
+        The ratio with the smallest product of numerator and denominator; None if no ratio is near.
     """
     if not filter_.quantum:
         return None
     passed = counts_per_sample(filter_, float(filter_.state[1]))
-    width = filter_.quantum * min(passed, 1.0)  # of a reading, of which there is one in 1/c samples where c is below 1
+    width = filter_.quantum * min(passed, 1.0)  # of a reading; one reading per 1/c samples if c is below 1
     power = width**2 / 12.0 * filter_.step / min(passed, 1.0)
     bandwidth = (filter_.intensity / power) ** (0.5 / filter_.order)  # [rad/s]
     beat = _FOLLOWED * bandwidth * filter_.step / _TURN  # per sample
@@ -106,8 +107,8 @@ def followed_ratio(filter_: AngleFilterTable, low: float, high: float, ratios: C
 
 @inlined
 def _advance(step: float, p: Array) -> None:
-    """Covariance of the next sample, F·P·Fᵀ in place."""
-    # A row takes up rows below it alone, which are still those of before; then the columns likewise.
+    """Propagate the covariance to the next sample, F·P·Fᵀ in place."""
+    # Each row adds only rows below it, which are still unchanged; then the columns likewise.
     half, sixth = 0.5 * step * step, step * step * step / 6.0
     for j in range(4):
         p[0, j] += step * p[1, j] + half * p[2, j] + sixth * p[3, j]
@@ -133,13 +134,13 @@ def follow(m: AngleFilterTable, measured: float) -> None:
     passed = state[1] * step
     every = m.quantum <= abs(passed)
     if every or measured != m.before[0]:
-        # Where a count lasts several samples, its edge tells the angle to the way of one sample.
+        # If a count lasts several samples, its edge is known to within the angle of one sample.
         width = m.quantum if every else passed
         spread = p[0, 0] + width * width / 12.0 + _ROUNDING
         off = (measured + 0.5 * width - state[0]) / spread
         for i in range(4):
             state[i] += p[i, 0] * off
-        # From the last element to the first: row 0, which all others read, changes last.
+        # From the last element to the first: row 0, used by all others, changes last.
         for i in range(3, -1, -1):
             for j in range(3, i - 1, -1):
                 p[i, j] -= p[0, i] * p[0, j] / spread
@@ -149,7 +150,7 @@ def follow(m: AngleFilterTable, measured: float) -> None:
 
 @kernel
 def at(m: AngleFilterTable, later: float) -> tuple[float, float, float]:
-    """Angle [rad], speed [rad/s] and acceleration [rad/s²] at a time ``later`` than the last sample [s]."""
+    """Predict angle [rad], speed [rad/s] and acceleration [rad/s²] at a time ``later`` [s] after the last sample."""
     angle, speed, acceleration, jerk = m.state[0], m.state[1], m.state[2], m.state[3]
     turned = later * (speed + later * (acceleration / 2.0 + later * jerk / 6.0))
     return angle + turned, speed + later * (acceleration + later * jerk / 2.0), acceleration + later * jerk

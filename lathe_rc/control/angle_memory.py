@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of the memory of repetitive control: learning at the grid points, reading between them.
 
-Samples come as blocks, grid points as they fall between samples. So a block is taken in passes: which points fall
-between which samples (`find`), what they learn (`_learn_piece`), and what the drive is told (`_send`). The passes do
-the same operations in the same order as one sample after the other would, and most of them for eight at a time.
+Samples come in blocks, and grid points lie anywhere between them. A block is therefore processed in passes: assignment
+of the points to the samples (`find`), learning of the points (`_learn_piece`), and set points of the drive (`_send`).
+The passes do the same operations in the same order as a sample-by-sample loop, but mostly vectorised by eight.
 """
 
 from typing import NamedTuple
@@ -21,56 +21,55 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
-PIECE = 512  #: grid points that are learned at a time
+PIECE = 512  #: grid points learned at a time
 
-# Places in the integer state: next grid point to learn, samples seen, first point of the smoothed chunk, grid point
-# from which errors count, whether a cycle ended in the sample at hand, whether the memory was replaced since the last
-# sample, whether the channel learns if it has joined, whether it has, cycles in the log, whether to stop after each.
+# Indices in the integer state: next grid point to learn, samples seen, first point of the smoothed chunk, grid point
+# from which errors are learned, whether a cycle ended in the current sample, whether the memory was replaced since the
+# last sample, whether learning is on, whether the channel has joined, cycles in the log, whether to stop after each.
 NEXT, SEEN, CHUNK, FROM, ENDED, REPLACED, LEARNS, JOINED, LOGGED, ASKS = range(10)
 INTEGERS = 10
-# Places in the real state: sum of squares and largest error of the cycle at hand and of the last one, the newest
-# three angles and errors, v and v' of Wk2, its last place and input, the lead-lag term's state and last input.
+# Indices in the real state: sum of squares and largest error of the current cycle and of the last one, the newest
+# three angles and errors, v and v' of Wk2, its last place and input, state of the lead-lag term.
 SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE, INPUT, LAG = (
     0, 1, 2, 3, 4, 7, 10, 12, 13, 14,
 )  # fmt: skip
 REALS = 15
 NO_CHUNK = -(1 << 62)  # further back than any grid point
 
-DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: why `advance` stopped
-LOG = 64  #: cycles that end until somebody reads of them, at most
+DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: reasons for `advance` to return
+LOG = 64  #: largest number of completed cycles in the log
 
-_BACK = 8  # grid points by which an angle that trembles may be behind the cycle that is still being read
-ROOM = _BACK + 8  #: grid points that a memory keeps beside a cycle, for what is read around a place
+_BACK = 8  # grid points by which a jittering angle may turn back behind the cycle being read
+ROOM = _BACK + 8  #: grid points stored in addition to a cycle, for the points around a read position
 
 
 @inlined
 def soft(u: float) -> float:
-    """Smooth step from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
+    """Compute a smooth step from 0 at ``u`` = 0 to 1 at ``u`` = 1."""
     return 1.0 if u >= 1.0 else u * u * (3.0 - 2.0 * u)
 
 
 class AngleMemory(NamedTuple):
-    """A memory of repetitive control with its law, for kernels.
+    """Memory of repetitive control with its law, for kernels.
 
     Attributes:
         delay: samples until a measured error is visible.
         grid: memory points per revolution.
         cycle: memory points in a cycle.
         gain: learning gain.
-        ramp: grid points over which it rises.
-        join_below: largest error of a cycle with which the channel joins [m].
-        ratio, reach: of an exponential Q; a ratio below 0: another makes the smoothed chunks.
-        law, looks_ahead: of the correction.
-        settings: its numbers.
-        memory: what is learned, a power of two of points.
-        chunk: points of the cycle before, smoothed by Q.
-        scratch: for that.
-        windows: angles and errors of a block behind the newest three before it, shape (2, n + 3) or more.
+        ramp: grid points over which the gain rises.
+        join_below: largest error of a cycle at which the channel joins [m].
+        ratio, reach: parameters of an exponential Q; ratio below 0: chunks are smoothed outside the kernel.
+        law, looks_ahead: law of the correction, and grid points that it reads ahead.
+        settings: parameters of the correction.
+        memory: learned points, in number a power of two [m].
+        chunk: points of the previous cycle, smoothed by Q.
+        scratch: scratch for the smoothing.
+        windows: angles and errors of a block, preceded by the newest three before it, shape (2, n + 3) or more.
         ahead: lead, its rate and bend along a block, shape (3, n) or more.
-        sample, work: of the points that are learned at a time.
-        whole, real: see above.
-        log: of each cycle the sample it ended with, sum of squares, largest error, whether it learned, whether the
-            channel has joined since; shape (LOG, 5).
+        sample, work: scratch for the points learned at a time.
+        whole, real: integer and real state, indexed by the constants of the module.
+        log: last sample, sum of squares, largest error, learning flag and joined flag of each cycle, shape (LOG, 5).
     """
 
     delay: int
@@ -98,14 +97,14 @@ class AngleMemory(NamedTuple):
 
 @inlined
 def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Array) -> None:
-    """Begin a block: set the errors that arrive in it behind the newest three before it, shape (n + 3,).
+    """Begin a block: store its angles and errors after the newest three of the block before, shape (n + 3,).
 
-    Errors are there from sample ``delay`` on; before it, and at it, the angle stands still, so that nothing is learned.
+    Errors are available starting at sample ``delay``; up to it the stored angle is constant, so that nothing is learned.
     """
     n, per_radian, delay = error.size, m.grid / _TURN, m.delay
     whole, real, angles, errors = m.whole, m.real, m.windows[0, : error.size + 3], m.windows[1, : error.size + 3]
     if whole[REPLACED] and n:
-        # Errors that are still on their way belong to the memory that was replaced.
+        # Errors still delayed belong to the memory that was replaced.
         whole[REPLACED] = 0
         whole[FROM] = int(np.ceil(angle[0] * per_radian))
     start = min(max(delay - first, 0), n)
@@ -133,8 +132,11 @@ def find(
 ) -> tuple[int, int, int, int]:
     """Assign the grid points from ``point`` up to ``stop`` to the samples in whose interval of angle they lie.
 
-    Stops after the sample in which a cycle ends. Returns the sample that is reached, the number of points, why it
-    stopped (`SMOOTH`: at the last point), and whether a cycle ended in the sample at hand.
+    The search stops after the sample in which a cycle ends.
+
+    Returns:
+        The sample reached, the number of points assigned, the reason of the stop (`SMOOTH`: at the last point), and
+        whether a cycle ended in the current sample.
     """
     cycle, per_radian, looks_ahead, ended = m.cycle, m.grid / _TURN, m.looks_ahead, m.whole[ENDED]
     sample, place = m.sample, m.work[6]
@@ -145,7 +147,7 @@ def find(
     to_end = cycle - point % cycle
     for k in range(start, angle.size):
         before, now = angles[k + 1], angles[k + 2]
-        # A spindle that turned half a revolution in a sample could not be learned from; it is a wrong angle.
+        # Half a revolution in a sample is a wrong angle, and could not be learned from.
         if abs(angles[k + 3] - now) > np.pi:
             return k, count, JUMPED, ended
         if now > before:
@@ -156,7 +158,7 @@ def find(
                     ended = 1
         if point + count == stop:
             return k, count, SMOOTH, ended
-        # Points that are read have to be learned by now, and not yet be written over by the next cycle.
+        # Points to be read must already be learned, and not yet be overwritten by the next cycle.
         if np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point + count:
             return k, count, AHEAD, ended
         if np.floor((angle[k] + lead[k]) * per_radian) + _BACK < point + count:
@@ -168,11 +170,11 @@ def find(
 
 @kernel
 def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: Array, errors: Array) -> None:
-    """Learn ``count`` grid points from ``point`` on, each from the middle of four errors."""
+    """Learn ``count`` grid points starting at ``point``, each from an error interpolated between four samples."""
     cycle, gain, ramp, sample, place, work = m.cycle, m.gain, m.ramp, m.sample, m.work[6], m.work
     chunk, memory, whole, real = m.chunk, m.memory, m.whole, m.real
     mask = memory.size - 1
-    # Gathered first, so that the compiler can make vectors of the loop after it.
+    # Gathered first, so that the compiler can vectorise the loop after it.
     for j in range(count):
         k = sample[j]
         work[0, j], work[1, j] = angles[k + 1], angles[k + 2]
@@ -191,7 +193,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
     else:
         for j in range(count):
             memory[(point + j) & mask] = memory[(point + j - cycle) & mask]
-    # Summed one after the other: the order must not depend on how the points fall into pieces.
+    # Summed one after the other: the order must not depend on the division of the points into chunks.
     squares, largest = real[SQUARES], real[LARGEST]
     end = cycle - 1 - point % cycle
     for j in range(count):
@@ -206,7 +208,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
 
 @kernel
 def _smooth(base: int, cycle: int, reach: int, ratio: float, memory: Array, scratch: Array, chunk: Array) -> None:
-    """Fill ``chunk``, the grid points ``base`` on, with what Q makes of the cycle before; see `Exponential`."""
+    """Fill ``chunk``, starting at grid point ``base``, with the previous cycle smoothed by an exponential Q."""
     mask = memory.size - 1
     for k in range(scratch.shape[1]):
         scratch[0, k] = memory[(base - cycle - reach + k) & mask]
@@ -224,11 +226,15 @@ def _learn(
     angles: Array,
     errors: Array,
 ) -> tuple[int, int]:
-    """Learn from sample ``start`` of the block until something has to be done outside; see `_step`."""
+    """Learn from sample ``start`` of the block until the caller has to act.
+
+    Returns:
+        The sample of the block reached, and the reason as for `_step`.
+    """
     cycle, memory, chunk, whole = m.cycle, m.memory, m.chunk, m.whole
     k = max(start, min(arrives, angle.size))
     reason = DONE
-    last = whole[NEXT] + memory.size - cycle - ROOM  # beyond it, points would be lost that are still to be read
+    last = whole[NEXT] + memory.size - cycle - ROOM  # limit up to which no point still to be read is overwritten
     while reason == DONE and k < angle.size and whole[NEXT] < last:
         point = whole[NEXT]
         stop = min(point + PIECE, last)
@@ -249,7 +255,7 @@ def _learn(
 
 @kernel
 def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
-    """Set point of the drive for the memory at ``place`` [grid point]."""
+    """Compute the set point of the drive from the memory at ``place`` [grid point]."""
     law, per_radian, settings, memory, real = m.law, m.grid / _TURN, m.settings, m.memory, m.real
     i = int(np.floor(place))
     u = place - i
@@ -274,9 +280,9 @@ def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
 
 @inlined
 def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> None:
-    """Fill the set points of the drive, ``told``, for some samples of the block.
+    """Fill ``told`` with the set points of the drive for samples ``start`` to ``stop`` of the block.
 
-    The memory may be ahead of them by a block: it holds more than the cycle that they read.
+    The memory may be ahead of these samples by a block, since it stores more than the cycle they read.
     """
     per_radian, lead, rate, bend = m.grid / _TURN, m.ahead[0], m.ahead[1], m.ahead[2]
     if m.law == 0:
@@ -289,14 +295,15 @@ def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> N
 
 @inlined
 def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
-    """Step from sample ``start`` of a block, whose first one is sample ``first`` of the run, until it needs help.
+    """Advance from sample ``start`` of a block, which begins at sample ``first`` of the run, until the caller must act.
 
-    Returns the sample that is reached and why: `CYCLE_ENDED` after the sample in which one ended, `SMOOTH` where the
-    next chunk of the smoothed cycle is wanted, the errors, and `DONE` at the end of the block or where learning further
-    ahead of what is read would write over it.
+    Returns:
+        The sample reached, and the reason: `CYCLE_ENDED` after the last sample of a cycle, `SMOOTH` if the next
+        smoothed chunk is needed, an error (`AHEAD`, `BEHIND`, `JUMPED`), or `DONE` at the end of the block or where
+        further learning would overwrite points still to be read.
     """
     n, delay = angle.size, m.delay
-    # What is read before the first error arrives is not checked, so nothing is learned ahead of it.
+    # Reads before the arrival of the first error are not checked, so no points are learned ahead of them.
     stop = n if start >= delay - first else min(n, delay - first)
     reached, reason = _learn(
         m, start, delay - first, m.whole[LEARNS] * m.whole[JOINED], angle[:stop], m.ahead[0, :n],
@@ -308,7 +315,7 @@ def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> 
 
 @inlined
 def _end_cycle(m: AngleMemory, sample: int) -> None:
-    """Log a cycle; a channel that waits may join."""
+    """Log a completed cycle, and let the channel join if the error is small enough."""
     whole, real = m.whole, m.real
     row = m.log[whole[LOGGED]]
     row[0], row[1], row[2] = sample, real[CYCLE_SQUARES], real[CYCLE_LARGEST]
@@ -322,17 +329,17 @@ def _end_cycle(m: AngleMemory, sample: int) -> None:
 
 @kernel
 def advance(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
-    """Step from sample ``start`` of a block that has begun until its end (`DONE`), or until it needs help.
+    """Advance from sample ``start`` of a block to its end (`DONE`), or until the caller has to act.
 
     Args:
-        m: the memory, with its look ahead along the block.
+        m: memory, with the lead of the block and after `begin`.
         first: index of the block's first sample.
-        start: sample of the block.
+        start: sample of the block to start at.
         angle: measured spindle angle [rad], shape (n,).
-        told: filled with the set point of the drive [m], shape (n,).
+        told: output, the set point of the drive [m], shape (n,).
 
     Returns:
-        The sample of the block that is reached, and why: see `_step`.
+        The sample of the block reached, and the reason: `DONE`, `CYCLE_ENDED`, `SMOOTH`, `AHEAD`, `BEHIND` or `JUMPED`.
     """
     reached, reason = start, DONE
     while True:

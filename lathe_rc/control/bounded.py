@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions within bounds of velocity, acceleration and jerk, and commands that are taken over and given back by them."""
+"""Motions with bounded velocity, acceleration and jerk, and the takeover of a command by such motions."""
 
 import math
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ from lathe_rc.jit import inlined, kernel
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-_LONGER = 1.05  # factor from one try of a duration to the next
-_LOOKS = 129  # points at which a motion is looked at
+_LONGER = 1.05  # ratio of successive trial durations
+_LOOKS = 129  # points at which the bounds of a motion are checked
 _WITHIN = 1.0 + 1e-9
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a motion, which may begin beyond them.
+    """Bounds of velocity, acceleration and jerk of a motion; its initial velocity may exceed them.
 
     Attributes:
-        velocity: [m/s].
-        acceleration: [m/s²].
-        jerk: [m/s³].
+        velocity: largest velocity [m/s].
+        acceleration: largest acceleration [m/s²].
+        jerk: largest jerk [m/s³].
     """
 
     velocity: float
@@ -36,26 +36,27 @@ class Bounds:
     jerk: float
 
     def reach(self, time: float) -> float:
-        """Longest way of a motion from rest to rest in some time [m].
+        """Compute the longest distance of a rest-to-rest motion within ``time`` [s], in metres.
 
-        The peaks of a way s in the time T are 1.875·s/T, 10/√3·s/T² and 60·s/T³.
+        The peaks of velocity, acceleration and jerk for a distance s in the time T are 1.875·s/T, 10/√3·s/T² and
+        60·s/T³.
         """
         peak = 10.0 / math.sqrt(3.0)
         return min(self.velocity * time / 1.875, self.acceleration * time**2 / peak, self.jerk * time**3 / 60.0)
 
 
 def motion(start: float, velocity: float, end: float | None, bounds: Bounds, step: float) -> Array:
-    """Motion to rest: a polynomial of fifth degree, as short as the bounds allow to 5 %.
+    """Compute a motion to rest: a fifth-degree polynomial, within 5 % of the shortest duration the bounds allow.
 
     Args:
-        start: where it begins [m], without acceleration.
-        velocity: with which it begins [m/s].
-        end: where it ends [m]; None: where it comes to rest the soonest.
-        bounds: that it keeps within; a larger velocity at the start is not exceeded.
+        start: initial position [m]; the initial acceleration is 0.
+        velocity: initial velocity [m/s].
+        end: final position [m]; None for the earliest stop.
+        bounds: bounds of the motion; an initial velocity above the bound is not exceeded.
         step: sampling step [s].
 
     Returns:
-        Positions one step after the start and on, up to the end [m], shape (n,), n at least 1.
+        Positions from one step after the start up to the end [m], shape (n,), n at least 1.
 
     Raises:
         LatheError: start or velocity is NaN or infinite.
@@ -64,7 +65,7 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
         raise LatheError(f"a command of {start} with a rate of {velocity} is taken over; allowed: finite numbers")
     highest = max(bounds.velocity, abs(velocity))
     length = abs(velocity) * step if end is None else abs(end - start)
-    # The shortest that the peaks of a motion from rest to rest could allow; nothing shorter need be tried.
+    # Lower bound of the duration, from the peaks of a rest-to-rest motion.
     duration = max(step, 1.875 * length / highest, (60.0 * length / bounds.jerk) ** (1 / 3) / 2.0)
     while True:
         way = velocity * duration / 2.0 if end is None else end - start
@@ -77,33 +78,33 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
         duration *= _LONGER
     samples = int(np.ceil(duration / step))
     positions: Array = start + path(np.minimum(np.arange(1, samples + 1) * step, duration))
-    positions[-1] = start + way if end is None else end  # without rounding: there a command stands still
+    positions[-1] = start + way if end is None else end  # without rounding error: the command stays at this position
     return positions
 
 
 def prepare() -> None:
-    """Load the part of SciPy that motions use: its import at their first use would stall a run."""
+    """Import the SciPy module used by `motion` in advance: importing it at the first motion would stall a run."""
     motion(0.0, 0.0, 0.0, Bounds(1.0, 1.0, 1.0), 1.0)
 
 
 class Mode(IntEnum):
-    """The side that commands."""
+    """Source of the command: the controller, a hold or a retraction."""
 
-    FOLLOW = 0  #: the controller
-    HOLD = 1  #: nobody: the command comes to rest
-    RETRACT = 2  #: the command goes to its place out of the part
+    FOLLOW = 0  #: the controller's command
+    HOLD = 1  #: the command comes to rest
+    RETRACT = 2  #: the command moves to the retracted position, out of the part
 
 
-_MODE, _PLACE = 0, 1  # places in the state of a takeover: its mode, and how much of its path is behind
+_MODE, _PLACE = 0, 1  # indices in the state of a takeover: its mode, and the samples of its path already output
 
 
 class TakeoverTable(NamedTuple):
-    """A `Takeover` for kernels.
+    """State of a `Takeover` for kernels.
 
     Attributes:
-        path: positions to come; of what is added to the command when it follows [m], shape (n,).
-        whole: mode, and how much of the path is behind.
-        given, wanted: the last two samples, after and before the takeover [m].
+        path: positions of the motion; in the mode FOLLOW, offsets added to the controller's command [m], shape (n,).
+        whole: mode, and number of samples of the path already output.
+        given, wanted: the last two samples of the command after and before the takeover [m].
     """
 
     path: Array
@@ -114,13 +115,13 @@ class TakeoverTable(NamedTuple):
 
 @inlined
 def follows(takeover: TakeoverTable) -> bool:
-    """Whether the command is the controller's, and nothing is added to it."""
+    """Whether the controller's command passes unchanged."""
     return bool(takeover.whole[_MODE] == Mode.FOLLOW.value and takeover.whole[_PLACE] >= takeover.path.size)
 
 
 @inlined
 def _keep_last(last: Array, samples: Array) -> None:
-    """Keep the last two samples, of the blocks before if this one has less."""
+    """Update the last two samples with a block of any length."""
     if samples.size > 1:
         last[0], last[1] = samples[-2], samples[-1]
     elif samples.size == 1:
@@ -129,7 +130,7 @@ def _keep_last(last: Array, samples: Array) -> None:
 
 @kernel
 def take_over(takeover: TakeoverTable, command: Array) -> None:
-    """Replace the command of the controller by that for the drive; in place, shape (n,) [m]."""
+    """Replace the controller's command by the drive's command in place, shape (n,) [m]."""
     path, whole = takeover.path, takeover.whole
     _keep_last(takeover.wanted, command)
     if not follows(takeover):
@@ -144,22 +145,22 @@ def take_over(takeover: TakeoverTable, command: Array) -> None:
 
 
 class Takeover:
-    """A command that is held or retracted, and given back to its controller, without a jump of position.
+    """Takeover of a command for hold or retraction, and its return to the controller, without a jump of position.
 
-    Nor is there one of velocity, unless the command is faster than the bounds allow. A command that is out of reach is
-    where nothing that moves can be: its way begins at the end of the reach.
+    The velocity does not jump either, unless the command is faster than the bounds allow. For a command out of reach,
+    where no drive can be, the motion begins at the end of the reach.
 
     Args:
-        bounds: of what it does itself.
-        retracted: where the command is when retracted [m].
+        bounds: bounds of the takeover's own motions.
+        retracted: retracted position [m].
         step: sampling step [s].
-        reach: how far from its end a motion begins at most [m].
-        carries: whether a motion begins with the velocity that the command has, up to that of the bounds; one that is
-            all steps and noise has none.
+        reach: largest distance between the start and the end of a motion [m].
+        carries: whether a motion begins with the velocity of the command, limited to the bounds; False for a command
+            of steps and noise, which has no meaningful velocity.
 
     Attributes:
-        table: for `take_over`.
-        skipped: by how much the last motion has begun nearer to its end than the command was [m]; 0 within reach.
+        table: state for `take_over`.
+        skipped: distance between the command and the start of the last motion, if out of reach [m]; 0 within reach.
     """
 
     def __init__(
@@ -171,21 +172,21 @@ class Takeover:
 
     @property
     def mode(self) -> Mode:
-        """The side that commands; see `change`."""
+        """Current source of the command, set by `change`."""
         return Mode(self.table.whole[_MODE])
 
     @property
     def newest(self) -> float:
-        """The last output [m]."""
+        """Last command output to the drive [m]."""
         return float(self.table.given[1])
 
     @property
     def remaining(self) -> int:
-        """Samples until the motion that is under way ends."""
+        """Samples until the end of the current motion."""
         return self.table.path.size - int(self.table.whole[_PLACE])
 
     def change(self, mode: Mode) -> None:
-        """Take over, or give back, from the next sample on."""
+        """Switch the source of the command, effective at the next sample."""
         self.skipped = 0.0
         if mode is self.mode:
             return
@@ -200,7 +201,11 @@ class Takeover:
         self.table = self.table._replace(path=np.ascontiguousarray(path))
 
     def _way(self, velocity: float, *, to_goal: bool) -> Array:
-        """The way to rest, or out of the part: a single motion that begins into the part would first go far into it."""
+        """Compute the path to rest or to the retracted position.
+
+        A command that moves away from the retracted position is first stopped: a single motion would go far into the
+        part.
+        """
         start, step = self.newest, self._step
         if not to_goal:
             return motion(start, velocity, None, self._bounds, step)
@@ -216,6 +221,6 @@ class Takeover:
         return within
 
     def _carried(self, command: Array) -> float:
-        """The velocity of the last two samples as far as a motion may have it: what is faster is noise, or a step."""
+        """Velocity of the last two samples, limited to the bounds; a faster change is noise or a step."""
         highest = self._bounds.velocity if self._carries else 0.0
         return float(np.clip((command[1] - command[0]) / self._step, -highest, highest))

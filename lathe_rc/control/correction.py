@@ -8,7 +8,7 @@
     exact                         Wk2 then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
                                   angle domain, then its inverse in time
 
-a1 = 2ζ/ωn, a2 = 1/ωn² belong to a drive model e^{-pτ}/(1 + a1·p + a2·p²); its delay τ is left to the lead.
+a1 = 2ζ/ωn, a2 = 1/ωn² belong to a drive model e^{-pτ}/(1 + a1·p + a2·p²); its delay τ is compensated by the lead.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 
 class CorrectionLaw(IntEnum):
-    """Law between memory and drive; the module describes them."""
+    """Correction law between memory and drive; the laws are described in the module `lathe_rc.control.correction`."""
 
     NONE = 0
     LEAD_LAG = 1
@@ -35,14 +35,14 @@ class CorrectionLaw(IntEnum):
 
 @dataclass(frozen=True)
 class Correction:
-    """A correction with its drive model.
+    """Correction 1/W0 with its drive model.
 
     Args:
-        law: which.
-        natural_frequency: of the drive model, ωn [rad/s].
-        damping: of the drive model, ζ.
+        law: correction law.
+        natural_frequency: ωn of the drive model [rad/s].
+        damping: ζ of the drive model.
         lead: T1 of the lead-lag term [s].
-        lag: T2 of the lead-lag term [s]; above 0 where it is used.
+        lag: T2 of the lead-lag term [s]; above 0 for the law LEAD_LAG.
 
     Raises:
         InputError: the lead-lag term has no lag.
@@ -60,12 +60,12 @@ class Correction:
 
     @property
     def inverse(self) -> tuple[float, float]:
-        """Coefficients a1 [s], a2 [s²] of the inverse 1 + a1·p + a2·p²."""
+        """Coefficients a1 [s] and a2 [s²] of the inverse drive model 1 + a1·p + a2·p²."""
         return 2.0 * self.damping / self.natural_frequency, 1.0 / self.natural_frequency**2
 
     @property
     def looks_ahead(self) -> int:
-        """Grid points after the place where the memory is read that the interpolation looks at."""
+        """Number of grid points after the read position that the interpolation uses."""
         return 4 if self.law in (CorrectionLaw.SECOND_ORDER_INVERSE, CorrectionLaw.SECOND_ORDER_INVERSE_DYNAMIC) else 2
 
 
@@ -73,11 +73,11 @@ class Correction:
 def invariant(
     y: float, before: float, distance: float, rate: float, bend: float, a1: float, a2: float, nominal: float, v: Array
 ) -> float:
-    """Set point of one more sample, by Wk2 and then Wk1.
+    """Compute the set point of the next sample by Wk2 and then Wk1 (law EXACT).
 
     Wk2: a2Ω0²·v'' + a1Ω0·v' + v = Y in the angle (Runge-Kutta of fourth order, Y linear from ``before`` to ``y``
-    over ``distance`` [rad]). Wk1: v + a1·dv/dt + a2·d²v/dt² with d/dt of the angle ``rate`` and ``bend``; v' and v''
-    are there already, so nothing is differentiated. ``v`` holds v and v'.
+    over ``distance`` [rad]). Wk1: v + a1·dv/dt + a2·d²v/dt² with the first and second time derivative of the angle,
+    ``rate`` and ``bend``; v' and v'' follow from Wk2 without differentiation. ``v`` holds v and v'.
     """
     b1, b2 = a1 * nominal, a2 * nominal**2
     middle, half = 0.5 * (before + y), 0.5 * distance

@@ -4,12 +4,12 @@
     F = W1·v1 + W4·x,  x = W2·v2,  y = x + W3·F
     v1 = u1 - K1·u2,   v2 = u2 - K2·u1
 
-Longitudinal feed makes force through W1, cross feed moves the tool by W2. The depth of cut makes force through W4,
-the force deflects tool and part by W3. K1 = W2·W4/W1 takes the effect of u2 off the force, K2 = W1·W3/W2 that of u1 off
-the position. An inverse has more zeros than poles: it gets one lag for each order that is missing. An integrator in K1
-or K2 would keep for ever what a wrong model lets through: 1/p becomes 1/(p + leak).
+The longitudinal feed causes force through W1, the cross feed moves the tool by W2. The depth of cut causes force through
+W4, the force deflects tool and part by W3. K1 = W2·W4/W1 cancels the effect of u2 on the force, K2 = W1·W3/W2 that of
+u1 on the position. An inverse has more zeros than poles: one lag is added for each missing order. An integrator in K1
+or K2 would accumulate the error of an inexact model without limit: 1/p is replaced by 1/(p + leak).
 
-The paper has mm, N and % of the full command; the channels here are in m, N and 1, converted once below.
+The paper uses mm, N and % of the full command; the channels here are in m, N and 1, converted once below.
 """
 
 from collections.abc import Mapping
@@ -26,12 +26,12 @@ from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 Array = npt.NDArray[np.float64]
 
 LAG = 1e-3  #: for each missing order of an inverse [s] (paper 004)
-LEAK = 0.05  #: of the integrators [rad/s]
+LEAK = 0.05  #: leak of the integrators [rad/s]
 _OFF = System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), 0.0)
 
 
 def lags(*times: float) -> TransferFunction:
-    """1/Π(1 + p·T), times in s."""
+    """Create the transfer function 1/Π(1 + p·T) of lags with the time constants ``times`` [s]."""
     whole = gain(1.0)
     for time in times:
         whole *= TransferFunction((1.0,), (time, 1.0))
@@ -39,18 +39,18 @@ def lags(*times: float) -> TransferFunction:
 
 
 def gain(value: float) -> TransferFunction:
-    """Transfer function of a constant."""
+    """Create the transfer function of a constant gain."""
     return TransferFunction((value,), (1.0,))
 
 
 @dataclass(frozen=True)
 class Channels:
-    """The plant of both loops.
+    """Transfer functions of the plant with its force and position loop.
 
     Attributes:
         w1: force over the command of the longitudinal feed [N].
         w2: position of the tool over the command of the cross feed [m].
-        w3: displacement that adds to the position over force [m/N]; negative where force pushes the tool away.
+        w3: displacement added to the position over the force [m/N]; negative if the force pushes the tool away.
         w4: force over the position of the tool [N/m].
     """
 
@@ -71,10 +71,10 @@ PRESETS: Mapping[str, Channels] = MappingProxyType({"paper": PAPER, "realistic":
 
 
 def inverse(transfer: TransferFunction, lag: float = LAG) -> TransferFunction:
-    """1/transfer with 1/(1 + p·lag) for each order that is missing (paper 004, the second stage).
+    """Compute the inverse 1/transfer with a factor 1/(1 + p·lag) for each missing order (paper 004, second stage).
 
     Raises:
-        InputError: the inverse would not be stable, or ``lag`` [s] is not positive.
+        InputError: the inverse would be unstable, or ``lag`` [s] is not positive.
     """
     if lag <= 0.0:
         raise InputError(f"inverse of {transfer}: lag {lag:g} s; allowed: above 0")
@@ -89,7 +89,7 @@ def inverse(transfer: TransferFunction, lag: float = LAG) -> TransferFunction:
 
 
 def _leaking(transfer: TransferFunction, leak: float) -> TransferFunction:
-    """Integrators replaced by 1/(p + leak), after zeros at 0 have cancelled as many."""
+    """Replace the integrators by 1/(p + leak), after cancellation against zeros at 0."""
     top, bottom = np.array(transfer.numerator), np.array(transfer.denominator)
     zeros, poles = (part.size - np.trim_zeros(part, "b").size for part in (top, bottom))
     both = min(zeros, poles)
@@ -100,12 +100,12 @@ def _leaking(transfer: TransferFunction, leak: float) -> TransferFunction:
 
 
 def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tuple[TransferFunction, TransferFunction]:
-    """K1 and K2 of a model of the plant.
+    """Compute the compensators K1 and K2 from a model of the plant.
 
     Args:
-        channels: the model; that of paper 004 has reduced order.
-        lag: of the inverses [s].
-        leak: of the integrators [rad/s].
+        channels: model of the plant; that of paper 004 has reduced order.
+        lag: time constant of the lags in the inverses [s].
+        leak: leak of the integrators [rad/s].
 
     Raises:
         InputError: W1 or W2 has no stable inverse, ``lag`` is not positive or ``leak`` negative.
@@ -119,7 +119,7 @@ def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tu
 
 @inlined
 def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2: float) -> tuple[float, float]:
-    """v1 and v2 of one sample; the states are those of `lathe_rc.transfer.step`."""
+    """Compute the decoupled commands v1 and v2 of one sample; states as for `lathe_rc.transfer.step`."""
     return u1 - step(k1, state1, u2), u2 - step(k2, state2, u1)
 
 
@@ -127,23 +127,23 @@ def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2
 def decouple_along(
     k1: System, state1: Array, k2: System, state2: Array, u1: Array, u2: Array, v1: Array, v2: Array
 ) -> None:
-    """`decouple` for a block, shape (n,)."""
+    """Compute the decoupled commands of a block with `decouple`, shape (n,)."""
     for k in range(u1.size):
         v1[k], v2[k] = decouple(k1, state1, k2, state2, u1[k], u2[k])
 
 
 class Decoupler:
-    """K1 and K2 across both loops; at rest at 0 before the first sample.
+    """Decoupler of two loops by the compensators K1 and K2; at rest at 0 before the first sample.
 
-    v1 and v2 are not limited: the drives do that.
+    v1 and v2 are not limited here, but by the drives.
 
     Args:
-        k1, k2: the compensators, see `compensators`; None for one that is off.
+        k1, k2: compensators from `compensators`; None for none.
         step_s: sampling step [s].
 
     Attributes:
-        k1, k2: the difference equations, exact for commands that are linear between samples.
-        state1, state2: their memories for `decouple`.
+        k1, k2: difference equations, exact for commands that are linear between samples.
+        state1, state2: states of k1 and k2 for `decouple`.
     """
 
     def __init__(self, k1: TransferFunction | None, k2: TransferFunction | None, step_s: float) -> None:
@@ -151,12 +151,12 @@ class Decoupler:
         self.state1, self.state2 = rest(self.k1), rest(self.k2)
 
     def block(self, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
-        """Step through a block of commands, shape (n,) each; the last two are filled.
+        """Decouple a block of commands, shape (n,) each.
 
         Args:
-            u1: of the force controller [1].
-            u2: of the position controller [1].
-            v1: to the longitudinal feed [1].
-            v2: to the cross feed [1].
+            u1: command of the force controller [1].
+            u2: command of the position controller [1].
+            v1: output, command of the longitudinal feed [1].
+            v2: output, command of the cross feed [1].
         """
         decouple_along(self.k1, self.state1, self.k2, self.state2, u1, u2, v1, v2)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The disturbance at a drive's input, learned over the angle and observed in time; and the drive, identified.
+"""Disturbance at a drive's input, learned over the angle and observed in time, with identification of the drive.
 
-The drive is x + a1·dx/dt + a2·d²x/dt² = u(t - τ) + f. What acts on it, in metres of its command, is then
+The drive is x + a1·dx/dt + a2·d²x/dt² = u(t - τ) + f. The disturbance, in metres of the command, is then
 
     w = x + a1·dx/dt + a2·d²x/dt² - u(t - τ)
 
-of the measured position x and the command u. w is no error that a command brings about: with a good model it does not
-depend on u, so that learning it is no loop and cannot diverge. A wrong model makes it one, with the gain
-E = (Wi/Ŵi)·e^{pτ̂} - 1, and it still converges to x = r as long as |E| is below 1.
+with the measured position x and the command u. With a good model w does not depend on u, so that learning it closes no
+loop and cannot diverge. A wrong model closes a loop with the gain E = (Wi/Ŵi)·e^{pτ̂} - 1, which still converges to
+x = r as long as |E| is below 1.
 
 **Memory** (repetitive control), over the angle: `lathe_rc.control.disturbance_memory`.
 
-**Observer** (in time). L·w - L·F̂, L = 1/(1 + p/ωo)³: what the memory does not know yet.
+**Observer** (in time): L·w - L·F̂ with L = 1/(1 + p/ωo)³, the part of the disturbance not yet in the memory.
 
-**Identification** of a1 and a2: `lathe_rc.control.identification`. What the result is wrong by repeats and is
+**Identification** of a1 and a2: `lathe_rc.control.identification`. The effect of an error in the result repeats, and is
 learned as a part of f.
 
 Source: spec/robust.md.
@@ -45,17 +45,17 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
-_SWINGS_IN = 10.0  # of a1 until the drive has
+_SWINGS_IN = 10.0  # settling time of the drive, in units of a1
 
-# Places in the integer state: grid point that is being measured, the first one of all, whether there is one,
-# revolutions that are learned, whether a position has been seen.
+# Indices in the integer state: current grid point, first grid point, whether there is one, learned revolutions,
+# whether a position has been received.
 _POINT, _FIRST, _BEGUN, _REVOLUTIONS, _SEEN = range(5)
-# Places in the sums of a grid point: what is learned and how often, relative speed, dx/dt, d²x/dt², u - x.
+# Indices in the sums of a grid point: learned disturbance and its count, relative speed, dx/dt, d²x/dt², u - x.
 _SUM, _COUNT, _SPEED, _VELOCITY, _ACCELERATION, _REST = range(6)
 
 
 class FormAhead(NamedTuple):
-    """The form that is turned, for kernels; see `lathe_rc.signals.profile_table.derivatives_at`."""
+    """Desired form of the part for kernels: arguments of `lathe_rc.signals.profile_table.derivatives_at`."""
 
     heights: Array
     table: Array
@@ -65,23 +65,23 @@ class FormAhead(NamedTuple):
 
 
 class DisturbanceTable(NamedTuple):
-    """The law's knowledge of drive and disturbance.
+    """Model of drive and disturbance with its learning state, for kernels.
 
     Attributes:
         step: sampling step [s].
-        model: a1 [s] and a2 [s²] as they are identified, shape (2,).
-        late: samples until a position is seen.
-        begins: sample from which on it is learned from: until then the drive swings in.
-        whole, part: of the drive's delay: samples, and the rest in samples.
-        commands: of the past; sample n stands at n modulo their number, a power of two [m].
-        observer, observes: low-pass of the observer, and whether it acts.
-        learned: what the memory says, as it passes that low-pass, shape (4,) [m].
-        learner: low-pass of what is learned.
-        memory: of the disturbance over the angle.
-        identifier, identifies: low-pass of the identification, and whether it acts.
-        fit: of the model.
-        point: sums of the grid point that is being measured.
-        state: see above.
+        model: identified a1 [s] and a2 [s²], shape (2,).
+        late: samples until a measured position is available.
+        begins: first sample used for learning, after the transient of the drive.
+        whole, part: delay of the drive: whole samples, and the fraction of a sample.
+        commands: past commands; sample n is at index n modulo the length, a power of two [m].
+        observer, observes: low-pass of the observer, and whether it is on.
+        learned: states of the observer's low-pass for the memory's prediction, shape (4,) [m].
+        learner: low-pass of the learned disturbance.
+        memory: memory of the disturbance over the angle.
+        identifier, identifies: low-pass of the identification, and whether it is on.
+        fit: accumulated measurements for the fit of the model.
+        point: sums of the current grid point.
+        state: integer state, indexed by the constants of the module.
     """
 
     step: float
@@ -119,25 +119,25 @@ def disturbance(
     identify: bool,
     identification_forgetting: float,
 ) -> DisturbanceTable:
-    """Law before its first sample, without any knowledge.
+    """Create a disturbance model in its initial state, with an empty memory.
 
     Args:
         step: sampling step [s].
         nominal_speed: speed Ω0 [rad/s].
         model: natural frequency [rad/s], damping and delay [s] of the drive.
-        feedback_delay: samples until a position is seen.
-        observer_bandwidth: bandwidth of the observer [rad/s]; 0: there is none.
-        learning_bandwidth: bandwidth of what is learned [rad/s].
-        learning_gain: part of what is new that the memory takes up in the long run, below 1; 0: there is no memory.
-        follows_speed: whether how a value changes with the speed is learned.
-        learned_waves: per revolution that are learned, see `lathe_rc.control.disturbance_memory.smoothing`.
-        points_per_revolution: of the memory per revolution, a power of two.
+        feedback_delay: samples until a measured position is available.
+        observer_bandwidth: bandwidth of the observer [rad/s]; 0 for none.
+        learning_bandwidth: bandwidth of the learned disturbance [rad/s].
+        learning_gain: stationary gain of the memory's Kalman filters, below 1; 0 for no memory.
+        follows_speed: whether the slope of the disturbance over the speed is learned.
+        learned_waves: learned waves per revolution, see `lathe_rc.control.disturbance_memory.smoothing`.
+        points_per_revolution: memory points per revolution, a power of two.
         identification_bandwidth: bandwidth of the identification [rad/s].
         identify: whether the model is identified.
-        identification_forgetting: what a revolution leaves of the measurements before.
+        identification_forgetting: forgetting factor of the measurements per revolution.
 
     Raises:
-        InputError: S is wider than a revolution.
+        InputError: the filter S is wider than a revolution.
     """
     frequency, damping, delay = model
     whole = int(np.floor(delay / step + 1e-9))
@@ -166,7 +166,7 @@ def disturbance(
 
 
 def forget(m: DisturbanceTable) -> None:
-    """Forget what was learned over the angle; model and observer stay."""
+    """Clear the memory over the angle and the fit; model and observer are kept."""
     forget_all(m.memory)
     forget_measurements(m.fit)
     m.point[:] = 0.0
@@ -175,7 +175,7 @@ def forget(m: DisturbanceTable) -> None:
 
 @kernel
 def commanded(m: DisturbanceTable, sample: int, command: float) -> None:
-    """Remember the command of a sample [m]."""
+    """Store the command of a sample [m]."""
     m.commands[sample & (m.commands.size - 1)] = command
 
 
@@ -189,22 +189,22 @@ def observed(
     position: float,
     learning: bool,  # noqa: FBT001 - kernels take their arguments by position
 ) -> float:
-    """Take the measured position of ``late`` samples ago; return the disturbance beyond the memory [m].
+    """Process the position measured ``late`` samples ago; return the observed disturbance beyond the memory's [m].
 
     Args:
-        m: of the drive.
-        form: that is turned.
-        sample: index of the sample at hand.
-        angle: of the spindle ``late`` samples ago [rad].
-        speed: the same [rad/s].
-        position: the same [m].
-        learning: whether memory and model may change.
+        m: model of drive and disturbance.
+        form: desired form of the part.
+        sample: index of the current sample.
+        angle: spindle angle ``late`` samples ago [rad].
+        speed: spindle speed ``late`` samples ago [rad/s].
+        position: position of the drive ``late`` samples ago [m].
+        learning: whether memory and model are updated.
     """
     k = sample - m.late - m.whole
     mask = m.commands.size - 1
     command = (1.0 - m.part) * m.commands[k & mask] + m.part * m.commands[(k - 1) & mask] if k >= 1 else 0.0
     known = expected(m.memory, angle, speed)
-    if not m.state[_SEEN]:  # the drive has stood where it is
+    if not m.state[_SEEN]:  # the drive is assumed at rest at its first position
         m.state[_SEEN] = 1
         m.observer.position[:] = m.learner.position[:] = m.identifier.position[:] = position
         m.observer.command[:] = m.learner.command[:] = m.identifier.command[:] = position
@@ -233,7 +233,7 @@ def observed(
 
 @inlined
 def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -> None:
-    """Add a sample to its grid point; grid points that the spindle has left before are ended."""
+    """Add a sample to its grid point, and complete the grid points already passed."""
     low, point, state = m.learner, m.point, m.state
     first, second = derivatives(low.position, low.bandwidth)
     beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second - low.command[STAGES]
@@ -255,7 +255,7 @@ def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -
 
 @kernel
 def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """End a grid point: learn the points that S can smooth by now, and sum up for the model."""
+    """Complete a grid point: learn the point that S can now smooth, and add the measurements to the fit."""
     state, point, points = m.state, m.point, m.memory.value.size
     here = state[_POINT] & (points - 1)
     reach = m.memory.smoothing.size // 2
@@ -278,13 +278,13 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
 
 @inlined
 def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """Adopt the identified model; the part of w that it explains in place of the memory moves from one to the other."""
+    """Adopt the identified model, and correct filters and memory for the change of the model."""
     a1, a2 = fitted(m.fit)
     if not (a1 > 0.0 and a2 > 0.0):
         return
     more1, more2 = a1 - m.model[0], a2 - m.model[1]
     m.model[0], m.model[1] = a1, a2
-    # What has passed the low-passes belongs to the old model: unchanged, it would be a step of the disturbance.
+    # The states of the low-passes belong to the old model: unchanged, they would cause a step of the disturbance.
     for low, known in ((m.observer, m.learned), (m.learner, m.learner.command)):
         first, second = derivatives(low.position, low.bandwidth)
         for place in range(known.size):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A disturbance that repeats with the angle, learned from revolution to revolution (repetitive control).
+"""Memory of a disturbance that repeats with the angle, learned from revolution to revolution (repetitive control).
 
-For each grid point of the angle the memory holds a value and how that changes with the speed, F̂ = v + s·(Ω/Ω0 - 1), a
-Kalman filter for each point: what follows the cut with a lag lies at another angle when the spindle turns faster. What
-is learned passes a zero-phase filter S over the angle; what S does not pass leaks away, a tenth in a revolution.
+For each grid point of the angle a Kalman filter estimates a value and its slope over the speed,
+F̂ = v + s·(Ω/Ω0 - 1): an effect that lags the cut shifts to another angle at a higher speed. The learned values pass a
+zero-phase filter S over the angle; the components that S removes decay by 10 % per revolution.
 
 Source: spec/robust.md; learning over the position for non-circular cutting: Nakano, 1996.
 """
@@ -22,24 +22,25 @@ Array = npt.NDArray[np.float64]
 _TURN = 2.0 * np.pi
 _TAIL = 5.0  # standard deviations at which S is cut off
 _HALF = float(np.sqrt(-2.0 * np.log(1.0 - np.sqrt(0.5))))  # where the twiced Gaussian is 1/2, for a deviation of 1
-_UNKNOWN = 1e4  # variance of a value before anything was learned, over that of a measurement
-_SLOPE = 1e2  # the same of its change with the relative speed
-_SLOPE_DRIFT = 1e-2  # part of that by which it may have changed in a revolution
-LEAK = 0.1  #: part of what S does not pass that a revolution takes out of the memory
-_SETTLED = 8  # revolutions that are learned before the change with the speed is
+_UNKNOWN = 1e4  # initial variance of a value, over that of a measurement
+_SLOPE = 1e2  # initial variance of its slope over the relative speed
+_SLOPE_DRIFT = 1e-2  # drift of the slope's variance in a revolution, over its initial variance
+LEAK = 0.1  #: decay per revolution of the components that S does not pass
+_SETTLED = 8  # revolutions learned before the slope over the speed is learned
 
 
 class MemoryTable(NamedTuple):
-    """The model of the disturbance over the angle.
+    """Model of the disturbance over the angle, for kernels.
 
     Attributes:
-        nominal: speed Ω0 [rad/s].
-        learns, drift: whether the memory is used, and by how much a value drifts in a revolution, as variance.
-        follows_speed: whether how a value changes with the speed is learned.
-        value, slope: by grid point, shape (n,) [m].
-        spread: their covariance, shape (3, n).
-        fresh, speeds: what the newest revolution says beyond the memory [m], and at which relative speed, shape (n,).
-        smoothing: S by grid point, shape (odd,).
+        nominal: nominal speed Ω0 [rad/s].
+        learns, drift: whether the memory is used, and the variance by which a value drifts in a revolution.
+        follows_speed: whether the slope over the speed is learned.
+        value, slope: value and slope by grid point, shape (n,) [m].
+        spread: covariance of value and slope, shape (3, n).
+        fresh, speeds: measured deviation from the memory in the newest revolution [m], and its relative speed,
+            shape (n,).
+        smoothing: weights of S by grid point, shape (odd,).
     """
 
     nominal: float
@@ -55,14 +56,14 @@ class MemoryTable(NamedTuple):
 
 
 def smoothing(waves: float, points: int) -> Array:
-    """S over the angle: a Gaussian, twiced, so that 1 - S is the square of 1 minus the Gaussian; shape (odd,).
+    """Compute the weights of S over the angle: a twiced Gaussian, 1 - S = (1 - Gaussian)², shape (odd,).
 
     Args:
-        waves: per revolution at which S is 1/2.
-        points: of the grid per revolution.
+        waves: waves per revolution at which S is 1/2.
+        points: grid points per revolution.
 
     Raises:
-        InputError: it is wider than a revolution.
+        InputError: the filter is wider than a revolution.
     """
     deviation = _HALF * points / (_TURN * waves)
     reach = int(np.ceil(_TAIL * deviation))
@@ -80,7 +81,7 @@ def smoothing(waves: float, points: int) -> Array:
 
 
 def empty_memory(nominal: float, gain: float, waves: float, points: int, *, follows_speed: bool) -> MemoryTable:
-    """Memory without any knowledge; arguments as of `lathe_rc.control.disturbance.disturbance`."""
+    """Create an empty memory; arguments as for `lathe_rc.control.disturbance.disturbance`."""
     spread = np.zeros((3, points))
     spread[0] = _UNKNOWN
     return MemoryTable(
@@ -98,7 +99,7 @@ def empty_memory(nominal: float, gain: float, waves: float, points: int, *, foll
 
 
 def forget_all(m: MemoryTable) -> None:
-    """Forget all that was learned."""
+    """Reset a disturbance memory to its empty state."""
     for array in (m.value, m.slope, m.fresh, m.spread):
         array[:] = 0.0
     m.spread[0] = _UNKNOWN
@@ -106,7 +107,7 @@ def forget_all(m: MemoryTable) -> None:
 
 @kernel
 def expected(m: MemoryTable, angle: float, speed: float) -> float:
-    """The memory's prediction at an angle [rad] and a speed [rad/s], in metres of the command."""
+    """Predict the disturbance at an angle [rad] and a speed [rad/s], in metres of the command."""
     if not m.learns:
         return 0.0
     place = angle * (m.value.size / _TURN)
@@ -119,8 +120,8 @@ def expected(m: MemoryTable, angle: float, speed: float) -> float:
 
 @inlined
 def revolution_ended(m: MemoryTable, revolutions: int) -> None:
-    """End a revolution, after so many in all."""
-    # Before, the values themselves change from revolution to revolution, which would be taken for the speed's work.
+    """End a revolution; after the eighth, begin to learn the slope over the speed."""
+    # In earlier revolutions the values themselves still change, which would be attributed to the speed.
     if revolutions == _SETTLED and m.follows_speed:
         m.spread[2] = _SLOPE
 
@@ -137,7 +138,7 @@ def learn(m: MemoryTable, centre: int) -> None:
     j = centre & (points - 1)
     faster = m.speeds[j]
     p0, p1, p2 = m.spread[0, j] + m.drift, m.spread[1, j], m.spread[2, j]
-    if p2 > 0.0:  # 0: it is not learned, or not yet
+    if p2 > 0.0:  # 0: the slope is not learned, or not yet
         p2 = min(p2 + _SLOPE_DRIFT * _SLOPE, _SLOPE)
     g0, g1 = p0 + p1 * faster, p1 + p2 * faster
     total = g0 + g1 * faster + 1.0

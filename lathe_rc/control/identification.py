@@ -85,7 +85,7 @@ def add_products(sums: Array, place: int, velocity: float, acceleration: float, 
 def excited(vv: float, va: float, aa: float) -> bool:
     """Whether dx/dt and d²x/dt² are linearly independent, from the sums of their squares and of their product.
 
-    The determinant is compared with the one of orthogonal regressors, since the magnitudes of the two differ by orders.
+    The determinant is compared with that of orthogonal regressors: the two differ by orders of magnitude.
     """
     return bool(vv * aa - va * va > _LEAST_EXCITED * vv * aa > 0.0)
 
@@ -127,7 +127,7 @@ def command_sent(identifier: IdentifierTable, first: int, start: int, stop: int,
 
 @kernel
 def accumulate(identifier: IdentifierTable, first: int, start: int, stop: int, position: Array) -> None:
-    """Add the positions ``start`` to ``stop`` of a block that begins at sample ``first`` to the normal equations [m]."""
+    """Add positions ``start`` to ``stop`` [m] of a block that begins at sample ``first`` to the normal equations."""
     delay, part, low = identifier.delay, identifier.part, identifier.low
     commands, sums = identifier.commands, identifier.sums
     mask = commands.size - 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a grid or a table between its points: value and derivatives."""
+"""Interpolation of a grid or a table: value and derivatives."""
 
 from functools import lru_cache
 
@@ -14,7 +14,7 @@ Complex = npt.NDArray[np.complex128]
 
 @inlined
 def linear(places: Array, values: Array, place: float) -> float:
-    """Linear between the rising ``places``, the same beyond their ends; both of shape (n,)."""
+    """Interpolate linearly between the increasing ``places``, constant beyond their ends; both of shape (n,)."""
     last = places.size - 1
     if not place > places[0]:  # NaN has to end here: below it would index beyond the table
         return float(values[0])
@@ -26,7 +26,7 @@ def linear(places: Array, values: Array, place: float) -> float:
 
 @kernel
 def cubic(before: float, left: float, right: float, after: float, u: float) -> float:
-    """Lagrange cubic through four equidistant points at ``u`` in [0, 1] between the middle two."""
+    """Evaluate the Lagrange cubic through four equidistant points at ``u`` in [0, 1] between the middle two."""
     c1 = right - before / 3.0 - left / 2.0 - after / 6.0
     c2 = (before + right) / 2.0 - left
     c3 = (after - before) / 6.0 + (left - right) / 2.0
@@ -35,18 +35,18 @@ def cubic(before: float, left: float, right: float, after: float, u: float) -> f
 
 @kernel
 def read(ring: Array, i: int, u: float) -> float:
-    """Value at ``i`` + ``u`` of a ring whose length is a power of two; looks at the points i-1 to i+2."""
+    """Interpolate a ring, whose length is a power of two, at ``i`` + ``u`` by a cubic through the points i-1 to i+2."""
     mask = ring.size - 1
     return cubic(ring[(i - 1) & mask], ring[i & mask], ring[(i + 1) & mask], ring[(i + 2) & mask], u)
 
 
 @kernel
 def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Array, tile: Array, value: Array) -> None:
-    """Fill ``value`` with `read` at the place of ``angle`` + ``lead`` [rad], ``back`` points before it; shape (n,).
+    """Interpolate a ring ``back`` points before the angles ``angle`` + ``lead`` [rad] into ``value``, shape (n,).
 
-    ``tile``, shape (5 or more, m), is scratch: the points are fetched m at a time and then interpolated as vectors.
+    ``tile``, shape (5 or more, m), is scratch: points are fetched m at a time, so that the interpolation vectorises.
     """
-    mask = np.uint64(ring.size - 1)  # without a sign there is no look whether an index counts from the end
+    mask = np.uint64(ring.size - 1)  # unsigned, to avoid the check for negative indices
     one, two = np.uint64(1), np.uint64(2)
     for start in range(0, value.size, tile.shape[1]):
         size = min(tile.shape[1], value.size - start)
@@ -63,7 +63,7 @@ def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Ar
 
 @kernel
 def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float]:
-    """Value and first two derivatives [1/point, 1/point²] at ``i`` + ``u``; looks at the points i-3 to i+4.
+    """Interpolate value and first two derivatives [1/point, 1/point²] at ``i`` + ``u`` from the points i-3 to i+4.
 
     The derivatives are central differences of fourth order at the grid points, interpolated like the value.
     """
@@ -96,24 +96,24 @@ _DISTANCE = np.arange(-1, 3)[:, None] - _U
 
 
 def cubic_response(radians: Array) -> Array:
-    """Response of `read` at ``radians`` per point, mean over the place between points; shape (n,).
+    """Compute the frequency response of `read` at ``radians`` per point, averaged over the position between points.
 
-    The interpolator also makes images at multiples of the sampling rate less this frequency; the drive
-    attenuates those and they are left out here.
+    The interpolator also generates images at multiples of the sampling rate less this frequency; they are attenuated
+    by the drive and neglected here. The result has shape (n,).
     """
     return _cubic_response(np.asarray(radians, np.float64).tobytes())
 
 
 @lru_cache(maxsize=256)
 def _cubic_response(content: bytes) -> Array:
-    """Cached `cubic_response` of the bytes of ``radians``, which can be hashed: similar loops share frequencies."""
+    """Compute `cubic_response` from the bytes of ``radians``, with a cache: similar loops share frequencies."""
     radians = np.frombuffer(content)
     phase = np.cos(_DISTANCE[None] * radians[:, None, None])
     return np.asarray((phase * _TAPS * _WEIGHT).sum(axis=(1, 2)))
 
 
 def derivative_responses(radians: Array) -> tuple[Array, Complex, Array]:
-    """Responses of the three results of `read_derivatives`, per point; shape (n,) each."""
+    """Compute the frequency responses of the three results of `read_derivatives`, per point, shape (n,) each."""
     value = cubic_response(radians)
     first = 1j * (8.0 * np.sin(radians) - np.sin(2.0 * radians)) / 6.0
     second = (16.0 * np.cos(radians) - np.cos(2.0 * radians) - 15.0) / 6.0

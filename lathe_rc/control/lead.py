@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lead laws: how far ahead of the spindle the memory is read, so that a delay T0 is answered.
+"""Lead laws: angle by which the memory is read ahead of the spindle to compensate a delay T0.
 
     constant_angle          T0·Ω0                        right at the nominal speed only
     variable                T0·Ω(t)                      paper 000, eq. (20)
     variable_second_order   T0·Ω(t) + (T0²/2)·dΩ/dt      the next term of φ(t+T0) - φ(t)
-    exact_preview           φ(t+T0) - φ(t)               for a speed law that is known in advance
+    exact_preview           φ(t+T0) - φ(t)               for a speed law known in advance
 
-What is read at ψ = φ + lead acts T0 later. A correction that differentiates the memory with respect to time needs
+A value read at ψ = φ + lead acts T0 later. A correction that differentiates the memory with respect to time needs
 dψ/dt and d²ψ/dt² as well: to first order in T0 the speed and the acceleration at t + T0.
 """
 
@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 
 class LeadLaw(IntEnum):
-    """Law of the lead angle; the module describes them."""
+    """Law of the lead angle; the laws are described in the module `lathe_rc.control.lead`."""
 
     CONSTANT_ANGLE = 0
     VARIABLE = 1
@@ -32,15 +32,15 @@ class LeadLaw(IntEnum):
 
 
 class PreviewTable(NamedTuple):
-    """A `Preview` for kernels.
+    """Parameters and state of a `Preview` for kernels.
 
     Attributes:
         step: sampling step [s].
-        law: see `LeadLaw`.
+        law: number of a `LeadLaw`.
         lead_time: T0 [s].
-        constant: lead angle beside that of the law [rad].
-        nominal, lines, tachogram: of the speed law.
-        history: of the measured speed, NaN before it was written [rad/s].
+        constant: lead angle added to that of the law [rad].
+        nominal, lines, tachogram: parameters of the speed law.
+        history: ring of the measured speed, initially NaN [rad/s].
     """
 
     step: float
@@ -63,7 +63,7 @@ def look_ahead(
     rate: Array,
     bend: Array,
 ) -> None:
-    """Fill lead [rad], rate [rad/s] and bend [rad/s²] of a block, shape (n,), the latter two if they are wanted."""
+    """Fill lead [rad] and, if ``wanted``, its read rate [rad/s] and bend [rad/s²] for a block, shape (n,)."""
     step, law, lead_time, constant = preview.step, preview.law, preview.lead_time, preview.constant
     nominal, lines, tachogram, history = preview.nominal, preview.lines, preview.tachogram, preview.history
     if law < 2 and not wanted:
@@ -73,7 +73,7 @@ def look_ahead(
     window = history.size
     place = first % window
     for k in range(speed.size):
-        # The oldest speed of the ring stands where the new one goes; NaN before it was written.
+        # The new speed overwrites the oldest one of the ring, which is NaN until the ring is full.
         oldest = history[place]
         acceleration = 0.0 if np.isnan(oldest) else (speed[k] - oldest) / (window * step)
         history[place] = speed[k]
@@ -94,18 +94,18 @@ def look_ahead(
 
 
 class Preview:
-    """Look ahead of the spindle by a lead time.
+    """Lead angle and its rates for a lead time.
 
     Args:
         law: lead law.
         lead_time: T0 [s].
         speed_law: nominal speed Ω0; for ``EXACT_PREVIEW`` also its deviations.
         step: sampling step [s].
-        window: samples over which dΩ/dt is a difference of the measured speed; it lags by half of them.
-        constant: lead angle [rad] beside that of the law, whatever the speed.
+        window: samples over which dΩ/dt is the difference of the measured speed; it lags by half the window.
+        constant: lead angle [rad] added to that of the law, independent of the speed.
 
     Attributes:
-        table: for `look_ahead`.
+        table: parameters and state for `look_ahead`.
     """
 
     def __init__(
@@ -117,9 +117,9 @@ class Preview:
         )
 
     def block(self, first: int, speed: Array, *, rates: bool = True) -> tuple[Array, Array, Array]:
-        """Lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each.
+        """Compute lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each.
 
-        The latter two are left empty unless ``rates`` are wanted: in all blocks, or in none.
+        Without ``rates`` the latter two are empty; the choice has to be the same for all blocks.
         """
         lead = np.empty(speed.size)
         rate, bend = (np.empty(speed.size), np.empty(speed.size)) if rates else (np.empty(0), np.empty(0))

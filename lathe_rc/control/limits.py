@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of a command: stroke, velocity, acceleration, jerk.
 
-A command is a position or a velocity. One that keeps within all of them goes through as it is, to the bit. Stroke and
-velocity count before they are reached: the other limits must still be able to stop there. A command that does not is
-followed as fast as they allow. With e what is missing, the velocity relative to that of the command is at most
-min(√(A·e/2), (J·e²/9)^(1/3)), from which they can bring it to rest there; with Δv what is missing of that, the
-acceleration relative to that of the command is at most √(J·Δv/2), and towards a limit of the velocity at most √(J·Δv).
-What would come too near to a limit by its acceleration, taken back by the jerk, brakes. Samples that are not what was
-commanded are counted.
+A command is a position or a velocity. A command within all limits passes bit-identical. Stroke and velocity limits
+take effect early, so that the output can still stop at them within the limits of acceleration and jerk. A command
+beyond the limits is followed as fast as they allow. With e the remaining distance, the velocity relative to that of the
+command is at most min(√(A·e/2), (J·e²/9)^(1/3)), which permits a stop at the command; with Δv the remaining velocity
+difference, the acceleration relative to that of the command is at most √(J·Δv/2), and towards a limit of the velocity
+at most √(J·Δv). If the output would exceed a limit while the jerk reduces its acceleration to 0, it brakes. Clipped
+samples are reported.
 """
 
 from typing import NamedTuple
@@ -19,18 +19,18 @@ from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 
-_SHORT_OF = 0.98  # the limits of velocity and stroke, when they are approached
-_CLOSE = 1.0 + 1e-9  # of a limit: rounding is no violation
+_SHORT_OF = 0.98  # part of the velocity allowed by the limits that is used when they are approached
+_CLOSE = 1.0 + 1e-9  # tolerance factor of a limit, for rounding errors
 
 
 class CommandLimits(NamedTuple):
-    """Limits of a command; inf where there is none.
+    """Limits of a command's stroke, velocity, acceleration and jerk; inf for none.
 
     Attributes:
-        stroke: to each side [m].
-        velocity: [m/s].
-        acceleration: [m/s²].
-        jerk: [m/s³].
+        stroke: largest displacement to each side [m].
+        velocity: largest velocity [m/s].
+        acceleration: largest acceleration [m/s²].
+        jerk: largest jerk [m/s³].
     """
 
     stroke: float = np.inf
@@ -40,7 +40,7 @@ class CommandLimits(NamedTuple):
 
     @property
     def any(self) -> bool:
-        """Whether there is one."""
+        """Whether any limit is finite."""
         return min(self.stroke, self.velocity, self.acceleration, self.jerk) < np.inf
 
 
@@ -51,7 +51,7 @@ def _clip(value: float, limit: float) -> float:
 
 @kernel
 def _stopping(limits: CommandLimits, step: float, distance: float) -> float:
-    """Velocity from which a stop within a distance is possible."""
+    """Compute the largest velocity that permits a stop within ``distance``."""
     if distance <= 0.0:
         return 0.0  # not inf · 0
     curved = float(np.cbrt(limits.jerk * distance * distance / 9.0))
@@ -60,17 +60,17 @@ def _stopping(limits: CommandLimits, step: float, distance: float) -> float:
 
 @kernel
 def _reach(jerk: float, change: float) -> float:
-    """Acceleration that the jerk can take back within a change of the velocity."""
+    """Compute the largest acceleration that the jerk can reduce to 0 within a change of the velocity."""
     return float(np.sqrt(jerk * change)) if change > 0.0 else 0.0
 
 
 @kernel
 def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float) -> bool:
-    """Whether a velocity and an acceleration keep within the limits, now and when the jerk takes the acceleration back.
+    """Whether a velocity and an acceleration are within the limits, now and while the jerk reduces the latter to 0.
 
-    ``before`` is the acceleration of the sample before.
+    ``before`` is the acceleration of the previous sample.
     """
-    # Further velocity gained while the jerk takes the acceleration back; half a step of it is in v already.
+    # Velocity gained while the jerk reduces the acceleration to 0; half a step of it is already in v.
     rise = max(abs(a) * (0.5 * abs(a) / limits.jerk - 0.5 * step), 0.0) if v * a > 0.0 else 0.0
     return (
         abs(v) <= limits.velocity * _CLOSE
@@ -82,7 +82,7 @@ def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float
 
 @kernel
 def _can_stop(limits: CommandLimits, step: float, coming: float, v: float, a: float) -> bool:
-    """Whether a sample with this velocity and acceleration leaves room to stop, the acceleration taken back first."""
+    """Whether a stop within the stroke remains possible after a sample with velocity ``v`` and acceleration ``a``."""
     if limits.stroke == np.inf:
         return True
     needs = abs(a) / limits.jerk
@@ -93,7 +93,7 @@ def _can_stop(limits: CommandLimits, step: float, coming: float, v: float, a: fl
 
 @kernel
 def _towards(limits: CommandLimits, step: float, v_wanted: float, pulling: float, v: float, a: float) -> float:
-    """Acceleration of a sample that approaches a changing velocity as fast as the limits allow."""
+    """Compute the acceleration that approaches a changing velocity as fast as the limits allow."""
     change, jerk = v_wanted - v, limits.jerk
     a_wanted = pulling + np.sign(change) * min(_reach(0.5 * jerk, abs(change)), abs(change) / step)
     if v * a_wanted > 0.0:
@@ -113,17 +113,17 @@ def _next(
     v: float,
     a: float,
 ) -> tuple[bool, float]:
-    """Whether the next sample can be as wanted, and its acceleration.
+    """Compute whether the next sample can follow the command exactly, and its acceleration.
 
     Args:
-        limits: of the motion.
+        limits: limits of the command.
         step: sampling step [s].
-        v_goal: velocity of a sample that is as wanted.
-        v_wanted: velocity otherwise, before its limits.
-        pulling: acceleration of what is wanted.
-        coming: position at which a velocity of 0 comes to rest.
-        v: velocity of the sample before.
-        a: its acceleration.
+        v_goal: velocity of a sample that follows the command exactly.
+        v_wanted: unlimited velocity of any other sample.
+        pulling: acceleration of the command.
+        coming: rest position for a velocity of 0 from now on.
+        v: velocity of the previous sample.
+        a: acceleration of the previous sample.
     """
     a_goal = (v_goal - v) / step
     if _keeps(limits, step, v_goal, a_goal, a) and _can_stop(limits, step, coming, v_goal, a_goal):
@@ -133,7 +133,7 @@ def _next(
         room = limits.stroke - np.sign(v_wanted) * coming
         allowed = min(allowed, _stopping(limits, step, room), max(0.5 * room / step, 0.0))
     found = _towards(limits, step, _clip(v_wanted, _SHORT_OF * allowed), pulling, v, a)
-    # What would pass a limit later, with the acceleration taken back at once, brakes now.
+    # Brake now if a limit would be passed later even with the acceleration reduced to 0 at once.
     after = v + found * step
     too_fast = abs(after + 0.5 * found * abs(found) / limits.jerk) > limits.velocity
     if too_fast or not _can_stop(limits, step, coming, after, found):
@@ -143,17 +143,17 @@ def _next(
 
 @kernel
 def keep_position(limits: CommandLimits, step: float, state: Array, wanted: float) -> bool:
-    """Keep one more sample of a wanted position within limits; returns whether it is clipped.
+    """Limit the next sample of a position command; return whether it was clipped.
 
     Args:
-        limits: of the motion.
+        limits: limits of the command.
         step: sampling step [s].
-        state: position, velocity, acceleration of what was given; position and velocity of what was wanted; changed,
-            the first is what is given now.
-        wanted: the command.
+        state: position, velocity and acceleration of the output; position and velocity of the command. Updated in
+            place; the first element is the new output.
+        wanted: position command [m].
     """
     p, v, a, goal_before, moving_before = state[0], state[1], state[2], state[3], state[4]
-    # Velocity and acceleration of what is wanted are fed forward; only what is left of them has to be caught up.
+    # Velocity and acceleration of the command are fed forward; only the remaining difference is controlled.
     goal = _clip(wanted, limits.stroke)
     moving = _clip((goal - goal_before) / step, limits.velocity)
     pulling = _clip((moving - moving_before) / step, limits.acceleration)
@@ -162,7 +162,7 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
     v_goal = (goal - p) / step
     free, found = _next(limits, step, v_goal, v_wanted, pulling, p, v, a)
     if free:
-        p, v = goal, v_goal  # not p + v·step: it goes through to the bit
+        p, v = goal, v_goal  # not p + v·step: the command has to pass bit-identical
     else:
         v += found * step
         p += v * step
@@ -172,15 +172,15 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
 
 @kernel
 def keep_velocity(limits: CommandLimits, step: float, state: Array, coming: float, wanted: float) -> bool:
-    """Keep one more sample of a wanted velocity within limits; returns whether it is clipped.
+    """Limit the next sample of a velocity command; return whether it was clipped.
 
     Args:
-        limits: of the motion.
+        limits: limits of the command.
         step: sampling step [s].
-        state: velocity and acceleration of what was given, velocity that was wanted; changed, the first is what is
-            given now.
-        coming: position where what is driven comes to rest if 0 is given from now on.
-        wanted: the command.
+        state: velocity and acceleration of the output, velocity of the command. Updated in place; the first element
+            is the new output.
+        coming: position where the drive comes to rest with an output of 0 from now on [m].
+        wanted: velocity command [m/s].
     """
     v, a, moving_before = state[0], state[1], state[2]
     moving = _clip(wanted, limits.velocity)
@@ -191,13 +191,13 @@ def keep_velocity(limits: CommandLimits, step: float, state: Array, coming: floa
 
 
 class LimiterTable(NamedTuple):
-    """A `CommandLimiter` for kernels.
+    """Limits and state of a command limiter for kernels.
 
     Attributes:
-        limits: that it keeps within.
+        limits: limits of the command.
         step: sampling step [s].
-        state: for `keep_position`.
-        clipped: whether it was not given as it was commanded, of sample n at n modulo its length.
+        state: state for `keep_position`.
+        clipped: ring of flags for clipped samples; sample n is at index n modulo the length.
     """
 
     limits: CommandLimits
@@ -208,7 +208,7 @@ class LimiterTable(NamedTuple):
 
 @kernel
 def limit(limiter: LimiterTable, first: int, wanted: Array, given: Array) -> None:
-    """Fill ``given`` from ``wanted``, shape (n,) [m], of the samples ``first`` on."""
+    """Limit the position command ``wanted`` of a block starting at sample ``first`` into ``given``, shape (n,) [m]."""
     mask = limiter.clipped.size - 1
     for k in range(wanted.size):
         limiter.clipped[(first + k) & mask] = keep_position(limiter.limits, limiter.step, limiter.state, wanted[k])
@@ -216,16 +216,16 @@ def limit(limiter: LimiterTable, first: int, wanted: Array, given: Array) -> Non
 
 
 def rest() -> Array:
-    """The state for `keep_position` or `keep_velocity` of a command at rest at 0."""
+    """Initial state of a limited command at rest at 0, for `keep_position` or `keep_velocity`."""
     return np.zeros(5)
 
 
 def limiter(limits: CommandLimits, step: float, remembered: int) -> LimiterTable:
-    """The limiter of a command; it is at rest at 0 before the first sample.
+    """Create a limiter of a position command, initially at rest at 0.
 
     Args:
-        limits: that it keeps within.
+        limits: limits of the command.
         step: sampling step [s].
-        remembered: samples for which it is known whether they were clipped, a power of two.
+        remembered: number of samples for which the clipped flag is stored, a power of two.
     """
     return LimiterTable(limits, step, rest(), np.zeros(remembered, np.uint8))

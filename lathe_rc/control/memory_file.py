@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of a controller in a file that survives a crash."""
+"""Crash-safe file for the memory of a controller."""
 
 import errno
 import io
@@ -17,15 +17,15 @@ Array = npt.NDArray[np.float64]
 
 _FORMAT = 1
 _NAMES = {"format.npy", "grid.npy", "points.npy"}
-_ROOM = 1 << 16  # [B] beside the memory itself: headers, the other numbers, the archive's own
+_ROOM = 1 << 16  # [B] in addition to the memory: headers, the other numbers, archive overhead
 
 
 def save(path: Path, points: Array, grid: int) -> None:
-    """Write a memory: to the side, to the disk, then renamed over the old file.
+    """Write a memory to a file atomically: a temporary file is synced to disk and renamed.
 
     Args:
         path: NumPy archive (.npz) to write.
-        points: one value a grid point of the cycle [m], from angle 0 on, shape (cycle,).
+        points: one value per grid point of the cycle [m], starting at angle 0, shape (cycle,).
         grid: points per revolution.
 
     Raises:
@@ -39,15 +39,15 @@ def save(path: Path, points: Array, grid: int) -> None:
 
 
 def load(path: Path, cycle: int, grid: int) -> Array:
-    """Read a memory; nothing in the file is trusted.
+    """Read a memory from an untrusted file and validate it.
 
     Args:
-        path: what `save` wrote.
-        cycle: grid points in the cycle of the controller that will use it.
-        grid: its points per revolution.
+        path: file written by `save`.
+        cycle: grid points in the cycle of the controller.
+        grid: points per revolution of the controller.
 
     Raises:
-        InputError: there is no such file, it is something else, or it is of another grid or cycle.
+        InputError: the file is missing, is not a saved memory, or has another grid or cycle.
     """
     try:
         version, own_grid, points = _read(path, cycle, grid)
@@ -68,11 +68,11 @@ def load(path: Path, cycle: int, grid: int) -> Array:
 
 
 def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]]:
-    """Format, points per revolution and points in a file that is not larger than it may be.
+    """Read format, points per revolution and points from a file of limited size.
 
     Raises:
-        InputError: it is larger, or no file or archive of the kind.
-        ValueError: an array in it is none; zipfile and NumPy raise others.
+        InputError: the file is too large, or not an archive with the expected arrays.
+        ValueError: an array is malformed; zipfile and NumPy raise further exceptions.
     """
     largest = 8 * cycle + _ROOM
     try:
@@ -93,12 +93,12 @@ def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
-    """Array of an archive, whose header has to agree with the size of its data.
+    """Read an array of an archive and check its header against the size of its data.
 
     Raises:
-        ValueError: it is none; zipfile and NumPy raise others.
+        ValueError: the array is malformed; zipfile and NumPy raise further exceptions.
     """
-    # Not np.load: it would make room for as many numbers as the header says, before any is there.
+    # Not np.load: it would allocate the size given in the header before reading any data.
     with archive.open(name) as stream:
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("another format of arrays than `save` writes")
@@ -109,10 +109,10 @@ def _array(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
 
 
 def _number(array: npt.NDArray[Any]) -> int:
-    """Whole number that is the only element of an array.
+    """Return the integer that is the only element of an array.
 
     Raises:
-        ValueError: it holds something else.
+        ValueError: the array is not a single integer.
     """
     if array.size != 1 or array.dtype.kind not in "iu":
         raise ValueError("not a whole number")

@@ -83,7 +83,7 @@ PRESETS = {
 def _check(
     gains: PeriodicGains, *, limit: float, step_s: float, memory_filter: float, quantisation: tuple[float, float]
 ) -> None:
-    """Reject parameters out of their range with an `InputError`."""
+    """Check the parameters of the law; raise an `InputError` for one out of its range."""
     positive = {
         "h0": gains.h0, "h11": gains.h11, "lead": gains.lead, "lag": gains.lag, "switch_time": gains.switch_time,
         "limit": limit, "step": step_s,
@@ -113,7 +113,7 @@ class PeriodicLaw(NamedTuple):
     """Constants of the periodic control law for kernels.
 
     Attributes:
-        filter: W.
+        filter: filter W.
         samples: T̄ in samples.
         weights: Gaussian weights, starting at the middle, shape (reach + 1,).
         h0, h11, h12: gains.
@@ -260,7 +260,7 @@ def freeze(state: PeriodicState, on: bool) -> None:  # noqa: FBT001 - kernels ta
 
 @kernel
 def achieved(state: PeriodicState, row: Array) -> None:
-    """Fill ``row`` with largest demand, largest memory, saturated samples, Popov integral, its bound and clearance."""
+    """Fill in largest demand, largest memory, saturated samples, Popov integral, its bound and the clearance."""
     values = state.values
     row[0], row[1], row[2] = values[_DEMAND], values[_MEMORY], values[_SATURATED]
     row[3], row[4], row[5] = values[_POPOV], values[_BOUND], values[_CLEARANCE]
@@ -363,7 +363,7 @@ class PeriodicController:
         self.state.values[_CLEARANCE] = -self.state.values[_BOUND]
 
     def block(self, first: int, reference: Array, measurement: Array, command: Array) -> None:
-        """Compute the limited, quantised commands of a block starting at sample ``first``; arrays of shape (n,) [1]."""
+        """Compute the limited, quantised commands of a block starting at sample ``first``, shape (n,) [1]."""
         _block(self.law, self.state, first, reference, measurement, command)
 
     @property

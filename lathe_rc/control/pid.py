@@ -4,14 +4,14 @@
     u = P·e + I·∫e dt + D·N·p/(p + N)·e,   e = set point - measurement
 
 Integral and derivative are exact for an error that is linear between the samples at which the controller computes.
-Where the command is at a limit and the error drives it further out, the integral stands still (clamping). Converters
-round: the measurement to the step of the ADC, the command to that of the DAC. A set point that may change only so
-fast, and that is approached in the end as 1 - e^{-t/T}, enters the cut without overshoot of the force.
+While the command is at a limit and the error drives it further out, the integral is held (clamping). Converters
+round the measurement to the step of the ADC, and the command to that of the DAC. With a set point of limited rate,
+smoothed as 1 - e^{-t/T}, the tool enters the cut without overshoot of the force.
 
-The integral can be told to stand still. A controller that waits, since another gives the command, lets a set point with
-ramp or approach go with the measurement: when it goes on, the set point comes from there as it did at the start.
+The integral can be frozen. While another controller provides the command, a waiting controller with ramp or smoothing
+sets its set point equal to the measurement: when it resumes, the set point starts there, as at the start of a run.
 
-Source: paper 004, Figs 11 and 12. The paper has mm, N and % of the full command; here they are m, N and 1.
+Source: paper 004, Figs 11 and 12. The paper uses mm, N and % of the full command; here the units are m, N and 1.
 """
 
 from dataclasses import dataclass
@@ -27,19 +27,19 @@ from lathe_rc.transfer import TransferFunction
 
 Array = npt.NDArray[np.float64]
 
-# Places in the state of a controller.
+# Indices in the state of a controller.
 _INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _STANDS, _WAITS, _SIZE = range(11)
 
 
 @dataclass(frozen=True)
 class PidGains:
-    """Gains of a parallel PID, in units of the command over that of the error.
+    """Gains of a parallel PID, in the unit of the command over that of the error.
 
     Args:
         proportional: P.
         integral: I [1/s].
         derivative: D [s].
-        filter: N, where the derivative ends [rad/s].
+        filter: N, bandwidth of the derivative [rad/s].
 
     Raises:
         InputError: a gain is not finite, or N is not above 0.
@@ -60,7 +60,7 @@ class PidGains:
 
     @property
     def transfer(self) -> TransferFunction:
-        """Command over error; without the poles of parts that are off."""
+        """Transfer function from error to command, without the poles of terms with gain 0."""
         whole = TransferFunction((self.proportional,), (1.0,))
         if self.derivative:
             kick = self.proportional + self.derivative * self.filter
@@ -82,12 +82,12 @@ class PidTable(NamedTuple):
         proportional: P.
         integral: weight of the sum of two errors in the integral.
         derivative: weight of the difference of two errors in the derivative.
-        decay: what the derivative keeps of its last value.
+        decay: decay factor of the derivative per computation.
         low, high: limits of the command.
         adc, dac: steps of the converters; 0 for none.
-        ramp: largest change of the set point from one computation to the next; 0 for any.
-        approach: part of the way to the set point that is gone in a computation; 1 for all of it.
-        divisor: computes every so many samples.
+        ramp: largest change of the set point from one computation to the next; 0 for no limit.
+        approach: fraction of the remaining change of the set point made per computation; 1 for no smoothing.
+        divisor: samples between two computations.
     """
 
     proportional: float
@@ -105,14 +105,14 @@ class PidTable(NamedTuple):
 
 @inlined
 def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: float) -> float:
-    """Command of sample ``n``; ``state`` is changed, and counts samples at a limit."""
+    """Compute the command of sample ``n``, and update ``state`` with its counters of limited samples."""
     if n % pid.divisor:
         return float(state[_COMMAND])
     way = set_point - state[_SET_POINT]
     move = pid.approach * way
     if pid.ramp > 0.0:
         move = min(max(move, -pid.ramp), pid.ramp)
-    # Not by the sum: its rounding could keep the set point from ever being reached.
+    # Not by the sum: with its rounding error the set point might never be reached.
     wanted = set_point if move == way else state[_SET_POINT] + move
     read = quantise(measurement, pid.adc)
     if state[_WAITS] > 0.0 and (pid.ramp > 0.0 or pid.approach < 1.0):
@@ -131,7 +131,7 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
     command = float(min(max(demand, pid.low), pid.high))
     state[SATURATED] += command != demand
     if pid.dac > 0.0:
-        # A limit between two steps of the DAC stays a limit.
+        # Limited again, since rounding to the DAC step may exceed a limit.
         command = float(min(max(quantise(command, pid.dac), pid.low), pid.high))
     state[_SLOPE], state[_ERROR], state[_COMMAND] = slope, error, command
     return command
@@ -139,7 +139,7 @@ def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: 
 
 @kernel
 def enable_integrator(state: Array, on: bool, waits: bool) -> None:  # noqa: FBT001 - kernels take them by position
-    """Set whether a `Pid` integrates, and whether it waits for another that gives the command."""
+    """Set whether a `Pid` integrates, and whether it waits while another controller provides the command."""
     state[_STANDS], state[_WAITS] = 0.0 if on else 1.0, 1.0 if waits else 0.0
 
 
@@ -147,30 +147,31 @@ def enable_integrator(state: Array, on: bool, waits: bool) -> None:  # noqa: FBT
 def control_along(
     pid: PidTable, state: Array, first: int, set_point: Array, measurement: Array, command: Array
 ) -> None:
-    """`control` for a block that begins at sample ``first``, shape (n,)."""
+    """Compute the commands of a block that begins at sample ``first`` with `control`, shape (n,)."""
     for k in range(command.size):
         command[k] = control(pid, state, first + k, set_point[k], measurement[k])
 
 
 class Pid:
-    """The controller: set point and measurement in, command out; at rest at 0 before sample 0.
+    """PID controller with output limits and converter quantisation; at rest at 0 before sample 0.
 
     Args:
-        gains: of the parts.
+        gains: gains P, I, D and filter N.
         low, high: limits of the command, in its unit.
         step: sampling step [s].
         adc: step of the converter of the measurement, in its unit; 0 for none.
         dac: step of the converter of the command, in its unit; 0 for none.
-        ramp: fastest change of the set point, in its unit per s; 0 for any.
-        smoothing: time constant with which the set point is approached [s]; 0 for at once.
-        divisor: computes at samples that are multiples of it and holds the command between them.
+        ramp: largest rate of the set point, in its unit per s; 0 for no limit.
+        smoothing: time constant of the set point [s]; 0 for none.
+        divisor: the command is computed at samples that are multiples of it, and held between them.
 
     Attributes:
-        table: its constants for `control`.
-        state: its memory for `control`.
+        table: constants for `control`.
+        state: state for `control`.
 
     Raises:
-        InputError: limits that leave no room, a negative converter step, ramp or smoothing, or a divisor below 1.
+        InputError: a lower limit not below the upper one, a negative converter step, ramp or smoothing, or a divisor
+            below 1.
     """
 
     def __init__(
@@ -211,19 +212,19 @@ class Pid:
 
     @property
     def saturated(self) -> int:
-        """Number of computations whose command was cut off."""
+        """Number of computations with a limited command."""
         return int(self.state[SATURATED])
 
     @property
     def clamped(self) -> int:
-        """Number of computations in which the integral stood still."""
+        """Number of computations in which the integral was clamped."""
         return int(self.state[CLAMPED])
 
     @property
     def slowed(self) -> int:
-        """Number of computations whose set point was held back by ramp or smoothing."""
+        """Number of computations in which ramp or smoothing changed the set point."""
         return int(self.state[SLOWED])
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
-        """Step from sample ``first`` on; arrays of shape (n,), the last is filled."""
+        """Compute the commands of a block starting at sample ``first``; arrays of shape (n,), ``command`` is output."""
         control_along(self.table, self.state, first, set_point, measurement, command)

@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predistortion: the path of the cross feed that turns a shaft which gives way to the wanted form.
+"""Predistortion: path of the cross feed that turns a compliant shaft to the desired form.
 
     y(z) = x(z) + C(z)·F(ap(z)),  ap = D(z) - y(z)
 
-y is the radius that comes out and x the set point of the cross feed, both against the nominal radius; D is the depth of
-cut there; C the compliance along the shaft (`lathe_rc.analysis.shaft`) and F the force on it by the depth of cut. Both
-x and the deflection change the depth and so the force: y is the root of this equation. Of the path that cancels the
-deflection, y = w, the depth is known, D - w, and so is the path: x = w - C·F(D - w). Taking off the deflection that a
-part without predistortion shows falls short, because cutting deeper bends more.
+y is the resulting radius and x the set point of the cross feed, both relative to the nominal radius; D is the depth of
+cut at the nominal radius; C the compliance along the shaft (`lathe_rc.analysis.shaft`) and F the force as a function of
+the depth of cut. Both x and the deflection change the depth and so the force: y is the root of this equation. For the
+path that cancels the deflection, y = w, the depth is known, D - w, and so is the path: x = w - C·F(D - w). Subtracting
+the deflection measured on a part without predistortion is not sufficient, because a deeper cut deflects the shaft more.
 
-Where C, F or D are not known well enough the last part tells (iterative learning from part to part):
+If C, F or D are not known accurately, the error of the last part corrects the path (iterative learning control):
 
     x ← x - γ·(y - w)
 
-The error then shrinks by 1 - γ/(1 + C·F') a part, a contraction for any 0 < γ < 2 as long as a deeper cut takes no less
-force.
+The error then changes by the factor 1 - γ/(1 + C·F') per part, a contraction for any 0 < γ < 2 as long as the force does
+not decrease with the depth of cut.
 
-Source: paper 004, whose upper level gives the path by a model of the deformation and corrects it by the deviation of
-the profile; neither is printed there.
+Source: paper 004, whose upper level computes the path from a model of the deformation and corrects it by the deviation
+of the profile; neither is printed there.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,11 @@ _CLOSEST = 1e-9  # [m] between two heights
 
 
 def proportional(stiffness: float | Array) -> ForceLaw:
-    """F = K·ap where there is a chip; ``stiffness`` K [N/m], of any shape that fits the heights."""
+    """Create the force law F = K·ap for positive depths of cut, 0 otherwise.
+
+    Args:
+        stiffness: K [N/m], of any shape that broadcasts to the heights.
+    """
 
     def law(depth_of_cut: Array) -> Array:
         return np.asarray(stiffness * np.maximum(depth_of_cut, 0.0))
@@ -49,17 +53,17 @@ def proportional(stiffness: float | Array) -> ForceLaw:
 
 
 def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) -> Array:
-    """Radius y that a path leaves, by bisection [m], shape (m,).
+    """Compute the radius y that results from a path, by bisection [m], shape (m,).
 
     Args:
         compliance: C at each height [m/N], shape (m,).
-        law: force by depth of cut.
-        depth: D [m], one or at each height.
+        law: force as a function of the depth of cut.
+        depth: D [m], a scalar or one value per height.
         path: x [m], shape (m,).
     """
-    # F never falls with the depth: there is one root, and the deflection is at most that of a rigid shaft's cut.
+    # F never decreases with the depth: there is one root, and the deflection is at most that of a rigid shaft's cut.
     low, high = path, path + compliance * law(depth - path)
-    # To the last bit of the radius, which takes some fifty halvings.
+    # To the last bit of the radius, which takes about fifty bisections.
     least = np.spacing(np.maximum(np.abs(low), np.abs(high)))
     while np.any(high - low > least):
         middle = (low + high) / 2.0
@@ -69,22 +73,22 @@ def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) 
 
 
 def cancelling(compliance: Array, law: ForceLaw, depth: float | Array, wanted: float | Array = 0.0) -> Array:
-    """Path x [m] whose deflection leaves the ``wanted`` radius w [m], shape (m,); other arguments as of `turned`."""
+    """Compute the path x [m] that results in the ``wanted`` radius w [m], shape (m,); other arguments as for `turned`."""
     target = np.broadcast_to(wanted, compliance.shape)
     return np.asarray(target - compliance * law(depth - target))
 
 
 def contraction(compliance: Array, stiffness: float | Array, gain: float) -> float:
-    """Largest factor of the error from part to part; ``stiffness`` is dF/dap [N/m], ``gain`` γ."""
+    """Compute the largest error factor from part to part; ``stiffness`` is dF/dap [N/m], ``gain`` γ."""
     return float(np.abs(1.0 - gain / (1.0 + compliance * stiffness)).max())
 
 
 class PathTable(NamedTuple):
-    """A `Predistortion` for kernels.
+    """Path of a `Predistortion` for kernels.
 
     Attributes:
-        heights, offsets: see there.
-        beyond: samples so far beyond the ends, shape (1,).
+        heights, offsets: heights along the part and offsets of the cross feed [m], shape (m,).
+        beyond: number of samples so far beyond the ends, shape (1,).
     """
 
     heights: Array
@@ -94,25 +98,25 @@ class PathTable(NamedTuple):
 
 @kernel
 def offset_along(path: PathTable, height: Array, set_point: Array) -> None:
-    """Fill ``set_point`` [m] at each ``height`` [m], see `Predistortion.block`."""
+    """Fill ``set_point`` [m] with the offset of the path at each ``height`` [m] (implements `Predistortion.block`)."""
     for k in range(height.size):
         path.beyond[0] += height[k] < path.heights[0] or height[k] > path.heights[-1]
         set_point[k] = linear(path.heights, path.offsets, height[k])
 
 
 class Predistortion:
-    """A path of the cross feed along the part.
+    """Predistorted path of the cross feed along the part.
 
     Args:
-        heights: rising, at least 1 nm apart [m], shape (m,).
-        offsets: x, out of the part [m], shape (m,).
+        heights: increasing heights, at least 1 nm apart [m], shape (m,).
+        offsets: x, positive out of the part [m], shape (m,).
 
     Attributes:
         heights, offsets: as given.
-        table: for `offset_along`.
+        table: path for `offset_along`.
 
     Raises:
-        InputError: no path: no points, not as many of each, heights that do not rise, a number that is not finite.
+        InputError: no points, different numbers of heights and offsets, heights not increasing, or a value not finite.
     """
 
     def __init__(self, heights: Array, offsets: Array) -> None:
@@ -132,24 +136,24 @@ class Predistortion:
 
     @property
     def beyond(self) -> int:
-        """Samples so far beyond the ends, where the offset is that of the end."""
+        """Number of samples so far beyond the ends of the path, where the offset is that of the end."""
         return int(self.table.beyond[0])
 
     def block(self, height: Array, set_point: Array) -> None:
-        """Fill ``set_point`` [m] at each ``height`` [m], linear between those of the path; both of shape (n,)."""
+        """Fill ``set_point`` [m] with the linearly interpolated offset at each ``height`` [m]; both of shape (n,)."""
         offset_along(self.table, height, set_point)
 
     def corrected(self, heights: Array, error: Array, gain: float = 1.0) -> "Predistortion":
-        """Path for the next part.
+        """Compute the path for the next part from the measured error of the last one.
 
         Args:
-            heights: at which the last part was measured, rising [m], shape (k,); linear between them, and beyond
-                their ends the error of the end.
-            error: its radius less the wanted one, y - w [m], shape (k,): the mean of a revolution's profile.
-            gain: γ; below 1 it averages over parts.
+            heights: increasing heights of the measurements [m], shape (k,); the error is interpolated linearly between
+                them, and constant beyond their ends.
+            error: radius of the last part less the desired radius, y - w [m], shape (k,): the mean over a revolution.
+            gain: γ; values below 1 average over parts.
 
         Raises:
-            InputError: a gain with which the parts get worse, or a profile that is none.
+            InputError: the gain is not between 0 and 2, or the heights and errors are malformed.
         """
         if not 0.0 < gain < 2.0:
             raise InputError(f"predistortion: gain {gain:g} from part to part; allowed: above 0 and below 2")
@@ -159,23 +163,23 @@ class Predistortion:
         return Predistortion(self.heights, self.offsets - gain * at)
 
     def save(self, path: Path, comment: str = "") -> None:
-        """Write a CSV file with the columns ``height_mm,offset_um``, whole or not at all.
+        """Write the path to a CSV file with the columns ``height_mm,offset_um``, atomically.
 
         Args:
-            path: of the file; an existing one is replaced.
-            comment: a line at the top.
+            path: CSV file; an existing one is replaced.
+            comment: comment line at the top of the file.
 
         Raises:
-            InputError: a place that cannot be written to.
+            InputError: the file cannot be written.
         """
         write_table(path, ",".join(_COLUMNS), np.stack((self.heights * 1e3, self.offsets * 1e6), axis=1), comment)
 
     @classmethod
     def load(cls, path: Path) -> "Predistortion":
-        """Read what `save` wrote, or a file with the same columns.
+        """Read a path from a CSV file with the columns ``height_mm,offset_um``, as written by `save`.
 
         Raises:
-            InputError: the file is missing, malformed, or holds no path.
+            InputError: the file is missing or malformed, or its values are not a valid path.
         """
         _, rows = read_table(path, [_COLUMNS], "predistortion")
         try:

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zero-phase smoothing filters over the angle: the Q of repetitive control (paper 001: Q = 1 + Wф).
 
-All have Q(0) = 1 and a width fixed in angle. With the width κ in grid points they agree for long waves,
-Q(ν) ≈ 1 - (κν)² for ν radians per grid point, so that one `q_time` means the same for each:
+All have Q(0) = 1 and a width fixed in angle. With the width κ in grid points they agree at low frequencies,
+Q(ν) ≈ 1 - (κν)² for ν radians per grid point, so that `q_time` has the same meaning for each:
 
     exponential      1/(1 + 4κ²·sin²(ν/2))      kernel r^|j|: two first-order recursions
     Gaussian         exp(-(κν)²)                kernel of standard deviation √2·κ
     moving average   sin(aν)/(aν), a = √6·κ     running sum
     FIR              Kaiser-windowed low-pass, flat up to a pass frequency
 
-A filter is applied to a fixed number of grid points at a time (`chunk`), with `reach` more on each side. Where
-a chunk begins is fixed on the grid, so the lengths of blocks change no bit. The cost of a point does not
+A filter is applied to a fixed number of grid points at a time (`chunk`), with `reach` more on each side. The start
+of a chunk is fixed on the grid, so results are bit-identical for all block lengths. The cost of a point does not
 depend on the width for the exponential and the moving average, and grows with its logarithm for the others.
 """
 
@@ -32,19 +32,19 @@ _CHUNK = 256  # grid points filtered at a time, if the kernel is no longer
 
 
 class QFilter(ABC):
-    """A zero-phase filter over the grid.
+    """Base class of the zero-phase filters over the grid of the memory.
 
     Args:
-        reach: grid points that it looks at to each side.
+        reach: grid points used on each side of a point.
         cycle: grid points in a cycle of the memory.
 
     Attributes:
-        reach: see above.
-        chunk: grid points that `smooth` yields at a time.
-        ratio: of the recursions of `Exponential`, which kernels run themselves; below 0 for all others.
+        reach: as given.
+        chunk: grid points that `smooth` computes at a time.
+        ratio: ratio of the recursions of `Exponential`, which kernels compute themselves; below 0 for other filters.
 
     Raises:
-        InputError: it is wider than the memory can hold.
+        InputError: the filter is wider than the cycle allows.
     """
 
     ratio = -1.0
@@ -56,27 +56,27 @@ class QFilter(ABC):
                 "points"
             )
         self.reach = reach
-        # At least as long as it reaches: the margins then cost no more than the points, whatever the width.
+        # At least as long as the reach: the cost of the margins is then at most twice that of the points.
         self.chunk = min(max(_CHUNK, reach), cycle - reach)
 
     @abstractmethod
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """Filter ``points`` (shape (chunk + 2·reach,)) into ``smoothed`` (shape (chunk,))."""
+        """Filter ``points``, shape (chunk + 2·reach,), into ``smoothed``, shape (chunk,)."""
 
     @abstractmethod
     def response(self, radians: Array) -> Array:
-        """Real response at ``radians`` per grid point, shape (n,)."""
+        """Compute the real frequency response at ``radians`` per grid point, shape (n,)."""
 
 
 @kernel
 def two_sided(ratio: float, reach: int, points: Array, scratch: Array, smoothed: Array) -> None:
-    """Both recursions of `Exponential` at once; ``scratch`` is as long as ``points``."""
+    """Run the forward and backward recursion of `Exponential` in one loop; ``scratch`` is as long as ``points``."""
     gain = (1.0 - ratio) / (1.0 + ratio)
     last = points.size - 1
     forward = backward = 0.0
     for k in range(points.size - reach):
         forward = ratio * forward + points[k]
-        # What came from the right so far excludes the point itself, which the forward pass has.
+        # The backward sum excludes the point itself, which is in the forward sum.
         scratch[last - k] = backward
         backward = ratio * backward + points[last - k]
         if k >= reach:
@@ -86,10 +86,10 @@ def two_sided(ratio: float, reach: int, points: Array, scratch: Array, smoothed:
 
 
 class Exponential(QFilter):
-    """Two-sided exponential, the Q of papers 000 and 001: 1/(1 + (ω·width)²) in the limit of a fine grid.
+    """Two-sided exponential filter, the Q of papers 000 and 001: 1/(1 + (ω·width)²) in the limit of a fine grid.
 
     Args:
-        width: κ, its angle constant in grid points.
+        width: κ, angle constant in grid points.
         cycle: grid points in a cycle.
     """
 
@@ -99,11 +99,11 @@ class Exponential(QFilter):
         super().__init__(ceil(np.log(_TAIL) / np.log(self.ratio)) if self.ratio > 0.0 else 0, cycle)
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """Filter by both recursions."""
+        """Filter ``points`` by a forward and a backward recursion."""
         two_sided(self.ratio, self.reach, points, np.empty_like(points), smoothed)
 
     def response(self, radians: Array) -> Array:
-        """Real response at ``radians`` per grid point, shape (n,)."""
+        """Compute the real frequency response at ``radians`` per grid point, shape (n,)."""
         return np.asarray(1.0 / (1.0 + 4.0 * self._square * np.sin(radians / 2.0) ** 2))
 
 
@@ -120,10 +120,10 @@ def _running_mean(reach: int, end: float, points: Array, smoothed: Array) -> Non
 
 
 class MovingAverage(QFilter):
-    """Mean over the angle to both sides; the points at its ends count by the part of them that is inside.
+    """Moving average over the angle; the points at both ends are weighted by their fraction inside the window.
 
     Args:
-        width: κ in grid points; it averages over √6·κ grid angles to each side.
+        width: κ in grid points; the window extends √6·κ grid angles to each side.
         cycle: grid points in a cycle.
     """
 
@@ -133,14 +133,14 @@ class MovingAverage(QFilter):
         self._end = float(side - (self.reach - 1)) if self.reach else 0.0
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """Filter by a running sum."""
+        """Filter ``points`` by a running sum."""
         if self.reach:
             _running_mean(self.reach, self._end, points, smoothed)
         else:
             smoothed[:] = points
 
     def response(self, radians: Array) -> Array:
-        """Real response at ``radians`` per grid point, shape (n,)."""
+        """Compute the real frequency response at ``radians`` per grid point, shape (n,)."""
         if not self.reach:
             return np.ones_like(radians)
         inner = 2 * self.reach - 1
@@ -153,10 +153,10 @@ class MovingAverage(QFilter):
 
 
 class Weights(QFilter):
-    """Any symmetric kernel, by fast Fourier transforms of a fixed length.
+    """Filter with any symmetric kernel, computed by fast Fourier transforms of a fixed length.
 
     Args:
-        weights: q_0, q_±1, ...; scaled so that Q(0) = 1.
+        weights: q_0, q_±1, ...; normalised so that Q(0) = 1.
         cycle: grid points in a cycle.
     """
 
@@ -171,20 +171,20 @@ class Weights(QFilter):
         self._weights = weights
 
     def smooth(self, points: Array, smoothed: Array) -> None:
-        """Filter by transforms of a fixed length."""
+        """Filter ``points`` by Fourier transforms of a fixed length."""
         spectrum = scipy.fft.rfft(points, self._length)
         spectrum *= self._spectrum
         smoothed[:] = scipy.fft.irfft(spectrum, self._length)[self.reach : self.reach + self.chunk]
 
     def response(self, radians: Array) -> Array:
-        """Real response at ``radians`` per grid point, shape (n,)."""
+        """Compute the real frequency response at ``radians`` per grid point, shape (n,)."""
         # cos(jν) by Horner's rule for Chebyshev polynomials: memory does not grow with the kernel.
         series = np.concatenate((self._weights[:1], 2.0 * self._weights[1:]))
         return np.asarray(np.polynomial.chebyshev.chebval(np.cos(radians), series))
 
 
 class Gaussian(Weights):
-    """Gaussian Q = exp(-(κν)²).
+    """Gaussian filter Q = exp(-(κν)²).
 
     Args:
         width: κ in grid points.
@@ -192,7 +192,7 @@ class Gaussian(Weights):
     """
 
     def __init__(self, width: float, cycle: int) -> None:
-        # Longer than the cycle is refused below, and need not be computed first.
+        # Capped: a kernel longer than the cycle is rejected below, and need not be computed.
         reach = min(ceil(2.0 * width * np.sqrt(-np.log(_TAIL))), cycle)
         super().__init__(np.exp(-((np.arange(reach + 1) / max(2.0 * width, _TAIL)) ** 2)), cycle)
 
@@ -207,7 +207,7 @@ class LowPass(Weights):
         cycle: grid points in a cycle.
 
     Raises:
-        InputError: the bands do not lie in order between 0 and the Nyquist limit π.
+        InputError: the band limits are not in increasing order between 0 and the Nyquist limit π.
     """
 
     def __init__(self, passed: float, stopped: float, ripple: float, cycle: int) -> None:
@@ -219,7 +219,7 @@ class LowPass(Weights):
         taps, beta = scipy.signal.kaiserord(-20.0 * np.log10(ripple / 2.0), (stopped - passed) / np.pi)
         bands = np.concatenate((np.linspace(0.0, passed, _EDGES), np.linspace(stopped, np.pi, _EDGES)))
         wanted = np.repeat([1.0, 0.0], _EDGES)
-        taps = min(taps | 1, 2 * cycle + 1)  # odd, so that its middle is a point; far too long is refused below
+        taps = min(taps | 1, 2 * cycle + 1)  # odd, for a middle point; a kernel far too long is rejected below
         while True:
             taper = scipy.signal.firwin(taps, (passed + stopped) / 2.0, window=("kaiser", beta), fs=2.0 * np.pi)
             super().__init__(np.asarray(taper[taps // 2 :]), cycle)
@@ -228,15 +228,15 @@ class LowPass(Weights):
             taps += 2  # Kaiser's formula is short of a point or two where the transition is wide
 
 
-_EXACT, _CLOSE = 1e-9, 1e-6  # allowed at 0 radians, and between what is said and what is done
+_EXACT, _CLOSE = 1e-9, 1e-6  # tolerance of Q(0), and of the difference between response and smoothing
 _WAVES = 7
 
 
 def check(q: QFilter) -> None:
-    """Compare what a filter does with what it says.
+    """Check that the smoothing of a filter agrees with its frequency response.
 
     Raises:
-        InputError: response and smoothing do not belong together, or Q(0) is not 1.
+        InputError: response and smoothing disagree, or Q(0) is not 1.
     """
     if q.ratio >= 0.0 and type(q).smooth is not Exponential.smooth:
         raise InputError("it derives from Exponential, which is computed elsewhere; allowed: derive from QFilter")
@@ -251,7 +251,7 @@ def check(q: QFilter) -> None:
         )
     if abs(response[0] - 1.0) > _EXACT:
         raise InputError(f"Q(0) = {response[0]:.10g}; allowed: 1, or the memory forgets what does not change")
-    # Waves of all frequencies at once, each with a phase of its own: what adds up right is linear and without phase.
+    # Sum of waves of all frequencies, each with its own phase: the result is right only for a linear zero-phase filter.
     place = np.arange(-q.reach, q.chunk + q.reach)
     waves = np.cos(np.outer(radians, place) + np.arange(_WAVES)[:, None])
     smoothed = np.full(q.chunk, np.nan)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The P-integrator: repetitive control whose memory is indexed by an angle.
+"""P-integrator: repetitive control whose memory is indexed by an angle.
 
-    M(φ) = Q·M(φ - θ) + γ·δ(φ)          what is learned (paper 001, Fig. 2; γ = 1 in the papers)
-    A(φ) = (1/W0)·M(φ - θ + lead)       what the drive is told (paper 000, eq. 21 as reads of one memory)
+    M(φ) = Q·M(φ - θ) + γ·δ(φ)          learned memory (paper 001, Fig. 2; γ = 1 in the papers)
+    A(φ) = (1/W0)·M(φ - θ + lead)       set point of the drive (paper 000, eq. 21 as reads of one memory)
 
 θ is the cycle angle. With the spindle's angle for φ this is Fig. 1b of paper 000; with Ω0·t for φ the cycle is
 the fixed time θ/Ω0, its Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filter`) and 1/W0 (`correction`) have
@@ -27,12 +27,12 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _LONGEST = 8192  # samples of a block
-_ROOM = {"windows": (2, _LONGEST + 3), "ahead": (3, _LONGEST)}  # of the table, for a block
+_ROOM = {"windows": (2, _LONGEST + 3), "ahead": (3, _LONGEST)}  # shapes of the table's scratch arrays for a block
 LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
 
 
 class Cycle(NamedTuple):
-    """The result of one cycle, over the grid points of the memory."""
+    """Result of one cycle of the memory, over its grid points."""
 
     number: int  #: from 1
     sample_index: int  #: sample at which its last grid point was learned
@@ -44,10 +44,10 @@ class Cycle(NamedTuple):
 
 
 class AngleLostError(LatheError):
-    """The memory cannot be read at the angle that was measured.
+    """Error raised when the memory cannot be read at the measured angle.
 
     Attributes:
-        reached: samples of the block that were computed before.
+        reached: number of samples of the block computed before the error.
     """
 
     def __init__(self, message: str, reached: int) -> None:
@@ -63,18 +63,18 @@ class RepetitiveController:
         revolutions: revolutions in a cycle: θ = 2π·revolutions.
         q: zero-phase Q over a cycle.
         gain: learning gain γ.
-        soft_start: revolutions over which the gain rises from 0 when learning begins; 0: at once.
+        soft_start: revolutions over which the gain rises from 0 when learning begins; 0 for an immediate start.
         preview: lead law.
         correction: 1/W0.
         nominal: nominal spindle speed Ω0 [rad/s].
         delay: samples until a measured error is visible.
-        join_below: largest error of a cycle [m] with which the channel begins to learn; inf: at once.
+        join_below: largest error of a cycle [m] at which the channel begins to learn; inf for an immediate start.
         step: sampling step [s].
 
     Attributes:
-        table: for `lathe_rc.control.angle_memory.advance`.
+        table: memory and law for `lathe_rc.control.angle_memory.advance`.
         preview: lead law.
-        correction: may be replaced by one of the same law between two blocks or at the end of a cycle.
+        correction: 1/W0; may be replaced by one of the same law between two blocks or at the end of a cycle.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class RepetitiveController:
             law=int(correction.law),
             looks_ahead=correction.looks_ahead,
             settings=np.zeros(7),
-            # With what Q needs of the cycle before; a power of two, for indices by a mask.
+            # Includes the points of the previous cycle that Q needs; a power of two, for indices by a mask.
             memory=np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()),
             chunk=np.empty(q.chunk),
             scratch=np.empty((2, q.chunk + 2 * q.reach)),
@@ -124,24 +124,24 @@ class RepetitiveController:
         self._rms_before = np.nan
         self.correction = correction
         if q.ratio < 0.0:
-            self.smooth()  # compiles what the first chunk needs
+            self.smooth()  # compiles the filter for the first chunk
         whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state between two blocks, without scratch arrays."""
+        """Return the picklable state between two blocks, without scratch arrays."""
         nothing: dict[str, Any] = dict.fromkeys(_ROOM)
         table = self.table._replace(**nothing)
         return {**self.__dict__, "table": table}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state, with new scratch arrays."""
+        """Restore a pickled state, with new scratch arrays."""
         self.__dict__.update(state)
         room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
         self.table = self.table._replace(**room)
 
     @property
     def learning(self) -> bool:
-        """Whether the memory changes; otherwise it stays as it is."""
+        """Whether the memory is updated; if not, it stays unchanged."""
         return bool(self.table.whole[angle_memory.LEARNS])
 
     @learning.setter
@@ -150,7 +150,7 @@ class RepetitiveController:
 
     @property
     def joined(self) -> bool:
-        """False as long as the error before the channel is beyond ``join_below``."""
+        """Whether the channel has begun to learn, once the error of a cycle was at most ``join_below``."""
         return bool(self.table.whole[angle_memory.JOINED])
 
     @joined.setter
@@ -159,7 +159,7 @@ class RepetitiveController:
 
     @property
     def correction(self) -> Correction:
-        """The correction 1/W0."""
+        """Correction 1/W0 between the memory and the drive."""
         return self._correction
 
     @correction.setter
@@ -174,17 +174,17 @@ class RepetitiveController:
             settings[3:] = decay, rest - decay, 1.0 - rest, correction.lead / correction.lag
 
     def clear(self) -> None:
-        """Forget everything that was learned; learning begins anew, softly if so asked."""
+        """Clear the memory and restart learning, with the soft start if configured."""
         self.table.memory[:] = 0.0
         self._replaced()
 
     def _replaced(self) -> None:
-        """Note that smoothed points, and errors that are on their way, belong to another memory."""
+        """Invalidate smoothed points and delayed errors after the memory was replaced."""
         self.table.whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
         self.table.whole[angle_memory.REPLACED] = 1
 
     def memory(self) -> Array:
-        """The newest value at each grid point of the cycle [m], from angle 0 on, shape (cycle,)."""
+        """Return the newest value at each grid point of the cycle [m], starting at angle 0, shape (cycle,)."""
         memory, end = self.table.memory, self.table.whole[angle_memory.NEXT]
         newest = np.arange(end - self._cycle, end)
         points = np.empty(self._cycle)
@@ -192,7 +192,7 @@ class RepetitiveController:
         return points
 
     def remember(self, points: Array) -> None:
-        """Replace what was learned by ``points`` as `memory` gives them; the channel counts as joined."""
+        """Replace the learned memory by ``points`` in the order of `memory`; the channel counts as joined."""
         memory = self.table.memory
         places = np.arange(memory.size) + self.table.whole[angle_memory.NEXT] - memory.size
         memory[places & (memory.size - 1)] = points[places % self._cycle]
@@ -209,7 +209,7 @@ class RepetitiveController:
         error: Array,
         command: Array,
     ) -> Iterator[Cycle]:
-        """Step through a block; all arrays have the shape (n,).
+        """Advance learning and command by a block of samples; all arrays have the shape (n,).
 
         Args:
             first: index of the first sample.
@@ -217,14 +217,14 @@ class RepetitiveController:
             speed: measured spindle speed [rad/s].
             past_angle: the measured angle ``delay`` samples earlier [rad]; ignored before sample ``delay``.
             error: the measured error of that earlier sample [m]; ignored before sample ``delay``.
-            command: filled with the set point of the drive [m].
+            command: output, the set point of the drive [m].
 
         Yields:
-            The cycles that end in this block; the block goes on after each.
+            The cycles that end in this block; computation of the block continues after each.
 
         Raises:
-            AngleLostError: the spindle turned so fast that the memory would have been read where nothing is
-                learned yet, or so far back that it is no longer kept, or its angle jumped.
+            AngleLostError: the spindle turned so fast that the memory would have been read at points not learned
+                yet, or turned back to points already overwritten, or its angle jumped.
         """
         wanted = self._correction.law is not CorrectionLaw.NONE
         n = angle.size
@@ -246,7 +246,7 @@ class RepetitiveController:
 
     @staticmethod
     def lost(reason: int, first: int, reached: int, angle: Array, speed: Array, past_angle: Array) -> AngleLostError:
-        """Error that explains why the memory cannot be read at sample ``reached`` of a block, whose arrays it takes."""
+        """Create the error that explains why the memory cannot be read at sample ``reached`` of a block."""
         if reason == angle_memory.AHEAD:
             why = (
                 f"the memory is read at {angle[reached]:.6g} rad before it is learned; the spindle turns at "
@@ -262,7 +262,7 @@ class RepetitiveController:
         return AngleLostError(f"sample {first + reached}: {why}", reached)
 
     def smooth(self) -> None:
-        """Apply Q to the cycle before, for the chunk of grid points that is learned next."""
+        """Apply Q to the previous cycle, for the chunk of grid points learned next."""
         table, size, reach = self.table, self._q.chunk, self._q.reach
         base = int(table.whole[angle_memory.NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
@@ -270,7 +270,7 @@ class RepetitiveController:
         table.whole[angle_memory.CHUNK] = base
 
     def ended(self) -> list[Cycle]:
-        """Cycles that have ended since the last call."""
+        """Return the cycles completed since the last call."""
         if not self.table.whole[angle_memory.LOGGED]:
             return []
         logged = self.table.log[: self.table.whole[angle_memory.LOGGED]].tolist()
@@ -288,20 +288,20 @@ class RepetitiveController:
 def largest_feedback_delay(
     *, grid: int, revolutions: int, lead: float, speed: float, late: float, looks_ahead: int, step: float
 ) -> int:
-    """Longest feedback delay [sample] at which the memory is never read before it is learned.
+    """Compute the longest feedback delay [sample] at which every memory point is learned before it is read.
 
     The newest point in the memory when sample n is commanded was measured D + 3 samples before (the cubic
     interpolation of the error looks two samples ahead); the read reaches some grid points beyond
-    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - (looks_ahead + 1) grid angles. The Q filter needs no more: it
-    is applied when a point is learned, to points a cycle older.
+    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - (looks_ahead + 1) grid angles. The Q filter adds no delay: it
+    is applied when a point is learned, to points one cycle older.
 
     Args:
         grid: memory points per revolution.
         revolutions: revolutions in a cycle.
         lead: largest lead angle [rad].
         speed: largest spindle speed [rad/s].
-        late: what the measured angle may be late [rad], one count of the encoder.
-        looks_ahead: grid points after its place that a read looks at.
+        late: largest lag of the measured angle [rad], one count of the encoder.
+        looks_ahead: grid points after its place that a read uses.
         step: sampling step [s].
     """
     free = _TURN * revolutions - lead - late - (looks_ahead + 1) * _TURN / grid

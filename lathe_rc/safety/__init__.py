@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults, monitors and reactions. The modules in ``__all__`` are public, all others may change.
+"""Faults, monitors and reactions.
 
-`faults` and `injection`: what breaks, and at which ports. `monitors` with their `rules`, and the `state_machine` that
-their alarms lead through.
+The modules in ``__all__`` are public, all others may change. `faults` and `injection`: kinds of faults and their
+application at ports. `monitors` with their `rules`, and the `state_machine` driven by their alarms.
 """
 
 __all__ = ["monitors"]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults by name: what a broken device or a bad line makes of a signal.
+"""Kinds of faults, and their effect on signals: broken devices and bad lines.
 
 A fault is written ``TARGET KIND NAME=VALUE ...``, like ``coarse/state.measured_position wrong scale=1.1``. The target
-is ``TOPIC.FIELD`` of a port, ``TOPIC`` where the fault concerns several fields, or what is broken itself.
+is ``TOPIC.FIELD`` of a port, ``TOPIC`` if the fault concerns several fields, or the broken device itself.
 
-Each acts sample by sample from its first sample on and depends on nothing but the samples since then and the seed: the
-cutting into blocks leaves no trace. Times are in s, all else is in the unit of the signal.
+A fault changes its samples one by one, starting at its first sample, and depends only on the samples since then and
+the seed: results are bit-identical for all block lengths. Times are in s, all other values in the unit of the signal.
 """
 
 import math
@@ -24,22 +24,22 @@ from lathe_rc.messages import Signals
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
-_LARGEST = 1e100  # any unit's number is far smaller, and its products are finite
-_LONGEST = 200  # characters of a fault: an event holds it
+_LARGEST = 1e100  # far larger than any physical value, with finite products
+_LONGEST = 200  # characters of a fault, to fit into an event
 _VALUE = re.compile(r"(\w+)=(\S+)")
 
 
 @dataclass(frozen=True)
 class Value:
-    """A number that a kind of fault takes.
+    """Numeric parameter of a kind of fault.
 
     Attributes:
-        doc: what it is.
-        unit: of it; "" for that of the signal.
-        default: None: it has to be given.
-        low: smallest that is allowed.
-        above: whether ``low`` itself is not.
-        below: all that is allowed is.
+        doc: description of the parameter.
+        unit: unit; "" for the unit of the signal.
+        default: default value; None for a required parameter.
+        low: lower limit.
+        above: whether ``low`` itself is excluded.
+        below: upper limit, itself excluded.
     """
 
     doc: str
@@ -50,20 +50,20 @@ class Value:
     below: float = math.inf
 
     def takes(self, value: float) -> bool:
-        """Whether a number is allowed."""
+        """Whether ``value`` is within the allowed range."""
         return abs(value) <= _LARGEST and (value > self.low if self.above else value >= self.low) and value < self.below
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault.
+    """Kind of fault with its parameters and possible targets.
 
     Attributes:
-        doc: what happens to the signal.
-        values: numbers that it takes, by name.
-        what: it concerns: ``field``: any field of a port; ``encoder``: angle, speed and index pulse together;
+        doc: effect on the signal.
+        values: parameters by name.
+        what: kind of target: ``field``: any field of a port; ``encoder``: angle, speed and index pulse together;
             ``cut``: the cutting process itself.
-        whole: fields of whole numbers can have it too.
+        whole: whether integer fields can have the fault too.
     """
 
     doc: str
@@ -72,7 +72,7 @@ class Kind:
     whole: bool = False
 
 
-_LATEST = 10.0  # [s] that a signal can be late: all of it is kept meanwhile
+_LATEST = 10.0  # [s] limit of a delay, since the delayed samples are stored
 KINDS: Mapping[str, Kind] = {
     "off": Kind("0, as from a device without power", {}, whole=True),
     "stuck": Kind("the first sample stays", {}, whole=True),
@@ -118,12 +118,12 @@ KINDS: Mapping[str, Kind] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault as it is asked for.
+    """Fault requested for a target.
 
     Attributes:
-        target: what is broken.
-        kind: how, a key of `KINDS`.
-        values: numbers that belong to it, by name; complete.
+        target: ``TOPIC.FIELD``, ``TOPIC`` or device that is faulty.
+        kind: kind of fault, a key of `KINDS`.
+        values: all parameters of the kind, by name.
     """
 
     target: str
@@ -132,21 +132,21 @@ class Fault:
 
     @property
     def text(self) -> str:
-        """The fault as it is written."""
+        """Fault in the form ``TARGET KIND NAME=VALUE ...``."""
         given = [f"{name}={value!r}" for name, value in self.values.items()]
         return " ".join([self.target, self.kind, *given])
 
 
 def parse(text: str, whose: str, *, what: str = "fault") -> Fault:
-    """Read a fault.
+    """Parse a fault in the form ``TARGET KIND NAME=VALUE ...``.
 
     Args:
-        text: as it is written.
-        whose: names the node in messages.
-        what: names in messages what is asked for.
+        text: fault to parse.
+        whose: name of the node for error messages.
+        what: name of the request for error messages.
 
     Raises:
-        InputError: no such kind or value, one that is missing, twice there or out of its range.
+        InputError: unknown kind or parameter, or a parameter that is missing, duplicate or out of range.
     """
     if len(text) > _LONGEST:
         raise InputError(f"{whose}: a {what} of {len(text)} characters; allowed: up to {_LONGEST}")
@@ -170,13 +170,13 @@ def parse(text: str, whose: str, *, what: str = "fault") -> Fault:
     missing = [key for key, value in kind.values.items() if value.default is None and key not in given]
     if missing:
         raise InputError(f"{whose}: {what} {text!r}: no {missing[0]}; allowed: {_allowed(kind)}")
-    # In the order of the table, so that equal faults read equal.
+    # In the order of the table, so that equal faults have equal strings.
     values = {key: given.get(key, value.default or 0.0) for key, value in kind.values.items()}
     return Fault(target, name, values)
 
 
 def _allowed(kind: Kind) -> str:
-    """The values of a kind in words."""
+    """Describe the allowed parameters of a kind for error messages."""
     words = []
     for name, value in kind.values.items():
         low = "" if value.low == -math.inf else f" {'above' if value.above else 'from'} {value.low:g}"
@@ -193,32 +193,32 @@ def _allowed(kind: Kind) -> str:
 
 
 class Disturbance:
-    """The effect of a port's fault on the samples while it lasts, and the state after it.
+    """Effect of a fault on the samples of a port, during the fault and after its end.
 
     Args:
-        fault: see `Fault`.
-        seed: of the cell.
+        fault: fault with its parameters.
+        seed: seed of the cell.
         step: sampling step [s].
-        whose: makes the random numbers its own.
+        whose: name of the node, for an independent random sequence.
     """
 
     def __init__(self, fault: Fault, *, seed: int, step: float, whose: str) -> None:
         self._field, self._step = fault.target.rpartition(".")[2], step
         self._values = dict(fault.values)
-        # Not hash(), which differs from process to process.
+        # Not hash(), whose result differs between processes.
         entropy = [seed, zlib.crc32(f"{whose} {fault.text}".encode())]
         self._random = np.random.default_rng(np.random.SeedSequence(entropy))
 
     def during(self, signals: Signals) -> None:
-        """Change the samples in place; called in order, arrays of shape (n,), n above 0."""
+        """Change the samples during the fault in place; called in order, arrays of shape (n,), n above 0."""
         self.change(signals[self._field])
 
     def change(self, signal: Array) -> None:
-        """Change the samples of the faulty field; kinds with several fields override `during`."""
+        """Change the samples of the faulty field in place; kinds with several fields override `during` instead."""
         raise NotImplementedError
 
     def after(self, signals: Signals) -> None:
-        """Change the samples after the end of the fault."""
+        """Change the samples after the end of the fault in place; no change by default."""
 
 
 class _Off(Disturbance):
@@ -268,7 +268,7 @@ class _Delayed(Disturbance):
 
 
 class _Intermittent(Disturbance):
-    _dead, _left = True, 0  # the state of the contact, and for how many samples more
+    _dead, _left = True, 0  # state of the contact, and samples until it changes
 
     def change(self, signal: Array) -> None:
         place = 0
@@ -327,7 +327,7 @@ class _Reversed(Disturbance):
         signals["angle"] -= 2.0 * self._turned
 
 
-#: of the faults of ports, by kind; those of the cut are the cutting process' own
+#: effects of the faults at ports, by kind; faults of the cut are implemented by the cutting process
 DISTURBANCES: Mapping[str, type[Disturbance]] = {
     "off": _Off,
     "stuck": _Stuck,
@@ -344,5 +344,5 @@ DISTURBANCES: Mapping[str, type[Disturbance]] = {
 
 
 def prepare() -> None:
-    """Load the part of SciPy that faults use: its import at their first use would stall a run."""
+    """Import the SciPy module used by faults in advance: importing it at the first fault would stall a run."""
     scipy.signal.lfilter([1.0], [1.0], np.zeros(1))

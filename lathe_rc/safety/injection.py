@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults at the ports of a stage, applied to the blocks that go through."""
+"""Injection of faults into the input and output blocks of a stage."""
 
 import math
 from collections.abc import Sequence
@@ -10,19 +10,19 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind
 
-_TRUE = "_true"  # fields with this ending are what really happens
+_TRUE = "_true"  # suffix of fields with true values, which cannot be faulty
 
 
 @dataclass(frozen=True)
 class Port:
-    """An input or output as faults see it.
+    """Input or output of a stage, as a target of faults.
 
     Attributes:
-        topic: as the cell calls it.
+        topic: name of the topic in the cell.
         type: message type.
-        fields: those that go through.
-        delay: samples by which they come late.
-        out: the stage publishes it.
+        fields: fields of the message in use.
+        delay: delay of the samples [sample].
+        out: whether the stage publishes the topic.
     """
 
     topic: str
@@ -32,7 +32,7 @@ class Port:
     out: bool
 
     def targets(self, kind: Kind) -> set[str]:
-        """Targets at this port that a kind of fault can have."""
+        """Return the possible targets of a kind of fault at this port."""
         if kind.what == "encoder":
             return {self.topic} if self.out and self.type == messages.ENCODER else set()
         if kind.what != "field":
@@ -42,13 +42,13 @@ class Port:
         return {f"{self.topic}.{name}" for name in fields}
 
     def takes(self, fault: Fault) -> bool:
-        """Whether the fault is one of this port."""
+        """Whether the target of a fault is at this port."""
         return fault.target in self.targets(KINDS[fault.kind])
 
 
 @dataclass
 class _Injected:
-    """A fault at a port, from sample ``start`` of the topic on and before sample ``end``."""
+    """Fault injected at a port from sample ``start`` of the topic up to but not including sample ``end``."""
 
     fault: Fault
     port: Port
@@ -57,8 +57,8 @@ class _Injected:
     end: float = math.inf
 
     def apply(self, first: int, signals: Signals) -> None:
-        """Change samples ``first`` on of the node's time in place."""
-        first -= self.port.delay  # a fault is of the topic: a late reader meets it late
+        """Apply the fault in place to samples starting at ``first``, counted in the node's time."""
+        first -= self.port.delay  # the fault refers to the topic's samples, which a delayed reader receives later
         samples = next(iter(signals.values())).size
         begin = min(max(self.start - first, 0), samples)
         stop = int(min(max(self.end - first, begin), samples))
@@ -69,13 +69,13 @@ class _Injected:
 
 
 class Injection:
-    """Faults at the ports of a stage, and those that its devices can have.
+    """Injection of faults at the ports and devices of a stage.
 
     Args:
-        node: its name.
-        inputs, outputs: its ports, in order.
-        devices: what can break beside them.
-        seed: of the cell.
+        node: name of the node.
+        inputs, outputs: ports of the stage, in order.
+        devices: devices of the stage that can be faulty, in addition to the ports.
+        seed: seed of the cell.
         step: sampling step [s].
     """
 
@@ -98,16 +98,16 @@ class Injection:
         return [*self._inputs, *self._outputs]
 
     def _targets(self, kind: Kind) -> set[str]:
-        """The targets that a kind of fault can have."""
+        """Return the possible targets of a kind of fault at this stage."""
         if kind.what in self._devices:
             return {kind.what}
         return {target for port in self._ports for target in port.targets(kind)}
 
     def check(self, fault: Fault) -> None:
-        """Refuse a fault whose target cannot have it.
+        """Check that a fault is possible for its target.
 
         Raises:
-            InputError: names the targets that can.
+            InputError: the fault is not possible; the message names the allowed targets.
         """
         allowed = self._targets(KINDS[fault.kind])
         if fault.target in allowed:
@@ -120,10 +120,10 @@ class Injection:
         )
 
     def check_target(self, target: str) -> None:
-        """Refuse a target that no fault can have.
+        """Check that a target exists at this stage.
 
         Raises:
-            InputError: names the targets.
+            InputError: no fault is possible for the target; the message names the allowed targets.
         """
         allowed = {each for kind in KINDS.values() for each in self._targets(kind)}
         if target not in allowed:
@@ -132,16 +132,16 @@ class Injection:
             )
 
     def begin(self, fault: Fault, index: int) -> None:
-        """Let a fault begin at sample ``index``."""
+        """Start a fault at sample ``index``."""
         for port in (port for port in self._ports if port.takes(fault)):
             made = DISTURBANCES[fault.kind](fault, seed=self._seed, step=self._step, whose=self._node)
             self._injected.append(_Injected(fault, port, made, index))
 
     def end(self, target: str, index: int, fault: Fault | None = None) -> bool:
-        """Let a fault of a target, of equal ones the oldest, or all of them, end before sample ``index``.
+        """End the oldest instance of ``fault``, or without it all faults of a target, before sample ``index``.
 
         Returns:
-            Whether there was one.
+            Whether there was such a fault.
         """
         found = False
         for injected in self._injected:
@@ -153,11 +153,11 @@ class Injection:
 
     @property
     def any(self) -> bool:
-        """Whether there is a fault, or has been: lost counts stay lost after a repair."""
+        """Whether there is or was any fault; ended faults matter since lost counts stay lost after a repair."""
         return bool(self._injected)
 
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:
-        """Inputs of the stage with their faults; faulty signals are copies, since other stages read the originals."""
+        """Return the inputs with their faults; faulty signals are copies, since other stages read the originals."""
         changed = list(inputs)
         for place, port in enumerate(self._inputs):
             mine = [injected for injected in self._injected if injected.port is port]
@@ -168,7 +168,7 @@ class Injection:
         return changed
 
     def outputs(self, first: int, outputs: Sequence[Signals]) -> None:
-        """Change in place what the stage publishes."""
+        """Apply the faults to the outputs of the stage in place."""
         for injected in self._injected:
             if injected.port.out:
                 injected.apply(first, outputs[self._outputs.index(injected.port)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors: watch signals by a rule of `lathe_rc.safety.rules`, or in plain Python."""
+"""Monitors that check signals by a rule of `lathe_rc.safety.rules` or in plain Python."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -13,9 +13,9 @@ from lathe_rc.extensions import code_of_others
 from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Array, Watch, clear
 from lathe_rc.safety.state_machine import Reaction
 
-Place = tuple[int, str]  # of an input, and its field
+Place = tuple[int, str]  # index of an input, and name of its field
 
-_LONGEST_NAME = 64  # of a monitor [B], as SafetyStatus.msg says
+_LONGEST_NAME = 64  # length of a monitor's name [B], limit of SafetyStatus.msg
 _NOTHING = np.empty(0)
 
 
@@ -24,8 +24,8 @@ class Alarm:
     """Alarm of a monitor.
 
     Attributes:
-        place: sample in the block.
-        value: what it found, in the unit of the limit.
+        place: index of the sample in the block.
+        value: measured value, in the unit of the limit.
     """
 
     place: int
@@ -34,13 +34,13 @@ class Alarm:
 
 @dataclass(eq=False)
 class Watcher:
-    """Base of the monitors, which raise one alarm, and no other before a reset.
+    """Base class of the monitors; a monitor raises at most one alarm between two resets.
 
     Attributes:
-        name: of the monitor.
-        subject: what it watches.
+        name: name of the monitor.
+        subject: monitored signal or property.
         limit: threshold.
-        reaction: what it asks for.
+        reaction: reaction requested with an alarm.
     """
 
     name: str
@@ -49,17 +49,17 @@ class Watcher:
     reaction: Reaction
 
     def reset(self) -> None:
-        """Watch as from the first sample."""
+        """Reset the monitor to its initial state."""
 
 
 class Rule(NamedTuple):
-    """One of the `rules` with its limits; made by `threshold`, `below`, `rate`, `index_pulses` and `growth`.
+    """Monitoring rule with its limits, created by `threshold`, `below`, `rate`, `index_pulses` and `growth`.
 
     Attributes:
-        number: of the rule.
-        start: its memory before the first sample, the limits among it.
-        unit: what the rule finds is divided by it; the quotient has the unit of the limit.
-        restarts: False where the samples before a reset count after it as well.
+        number: number of the rule in `lathe_rc.safety.rules`.
+        start: initial memory of the rule, including its limits.
+        unit: divisor of the rule's value; the quotient has the unit of the limit.
+        restarts: False if the rule also uses samples from before a reset.
     """
 
     number: int
@@ -69,60 +69,60 @@ class Rule(NamedTuple):
 
 
 def threshold(limit: float, *, offset: float = 0.0, samples: int = 1, after: float = 0.0) -> Rule:
-    """Rule for |signal - other - offset| beyond the limit for some samples in a row.
+    """Create a rule for |signal - other - offset| above a limit for a number of consecutive samples.
 
     Args:
-        limit: to both sides.
-        offset: subtracted from the signal.
-        samples: how many; 1: at once.
-        after: revolutions of the encoder, the first input, until it watches.
+        limit: limit of the magnitude.
+        offset: offset subtracted from the signal.
+        samples: number of consecutive samples; 1 for an immediate alarm.
+        after: revolutions of the encoder, the first input, until monitoring begins.
     """
     return Rule(THRESHOLD, (offset, -limit, limit, samples, 0.0, after * TURN, np.nan))
 
 
 def below(limit: float, *, samples: int = 1, after: float = 0.0) -> Rule:
-    """Rule for a signal below the limit for some samples in a row; arguments as of `threshold`."""
+    """Create a rule for a signal below a limit for a number of consecutive samples; arguments as for `threshold`."""
     return Rule(THRESHOLD, (0.0, limit, np.inf, samples, 0.0, after * TURN, np.nan))
 
 
 def rate(limit: float, *, window: int, step: float, before: float) -> Rule:
-    """Rule for the change of a signal over a window of samples.
+    """Create a rule for the rate of change of a signal over a window of samples.
 
     Args:
-        limit: rate of change [unit of the signal/s].
-        window: over so many samples.
+        limit: limit of the rate [unit of the signal/s].
+        window: number of samples in the window.
         step: sampling step [s].
-        before: the signal before the first sample.
+        before: value of the signal before the first sample.
     """
     seconds = window * step
     return Rule(RATE, (limit * seconds, np.nan, *[before] * window), unit=seconds, restarts=False)
 
 
 def index_pulses(limit: float) -> Rule:
-    """Rule for one revolution of the measured angle from index pulse to index pulse, and never backwards."""
+    """Create a rule for an angle that turns backwards or not by one revolution from index pulse to index pulse."""
     return Rule(INDEX, (limit, np.nan, np.nan, 0.0))
 
 
 def growth(limit: float, *, cycles: int, floor: float) -> Rule:
-    """Rule for an RMS error that grows from revolution to revolution, which begin at index pulses.
+    """Create a rule for an RMS error that grows from revolution to revolution; revolutions begin at index pulses.
 
     Args:
-        limit: factor from one to the next.
-        cycles: so many times in a row.
-        floor: RMS error below which it does not count [m].
+        limit: limit of the growth factor per revolution.
+        cycles: number of consecutive revolutions with growth above the limit.
+        floor: RMS error below which growth is ignored [m].
     """
     return Rule(GROWTH, (limit, floor, cycles, -1.0, np.nan, 0.0, np.nan, *[0.0] * SUMS))
 
 
 @dataclass(eq=False, kw_only=True)
 class Monitor(Watcher):
-    """Watches by a rule.
+    """Monitor that checks signals by a rule.
 
     Attributes:
-        rule: with its limits.
-        signal: place of the input and its field.
-        other: the same of a second signal; None: there is none.
-        memory: what the rule knows now.
+        rule: rule with its limits.
+        signal: input and field of the signal.
+        other: input and field of a second signal; None for none.
+        memory: current memory of the rule.
     """
 
     rule: Rule
@@ -130,23 +130,23 @@ class Monitor(Watcher):
     other: Place | None = None
 
     def __post_init__(self) -> None:
-        # The `Lookout` puts a view in its place: the kernel has one array for the memories of all rules.
+        # The `Lookout` replaces it by a view: the kernel has one array for the memories of all rules.
         self.memory: Array = np.array(self.rule.start, np.float64)
 
     def reset(self) -> None:
-        """Watch as from the first sample, but for samples that still count."""
+        """Reset the memory of the rule, unless the rule also uses samples from before a reset."""
         if self.rule.restarts:
             self.memory[:] = self.rule.start
 
 
 class PlainMonitor(ABC):
-    """A monitor in plain Python, which looks at pieces of signals, one after the other.
+    """Base class of monitors in plain Python, which check signals chunk by chunk.
 
-    It is made anew at a reset. What it finds must not depend on where pieces begin: what it needs of the samples
-    before, it keeps.
+    A new instance is created at a reset. The result must not depend on the boundaries of the chunks; the monitor has to
+    store past samples that it needs.
 
     Args:
-        limit: threshold, told with its alarm.
+        limit: threshold, published with the alarm.
         step: sampling step [s].
 
     Attributes:
@@ -158,25 +158,25 @@ class PlainMonitor(ABC):
 
     @abstractmethod
     def find(self, first: int, signal: Array, other: Array) -> Alarm | None:
-        """The first alarm in a piece; after one there are no further pieces until a reset.
+        """Find the first alarm in a chunk; not called again after an alarm until a reset.
 
         Args:
-            first: index of the first sample of the piece in the run.
-            signal: what it watches, shape (n,); not to be changed.
-            other: a second signal, shape (n,); shape (0,) if there is none.
+            first: index of the chunk's first sample in the run.
+            signal: monitored signal, shape (n,); read-only.
+            other: second signal, shape (n,); shape (0,) if there is none.
         """
 
 
 class Plain(Watcher):
-    """A `PlainMonitor` with its place in the cell.
+    """Adapter of a `PlainMonitor` to the signals of a cell.
 
     Args:
-        name, subject, limit, reaction: see `Watcher`.
-        signals: places of one input and field, or of two.
-        make: of the monitor.
+        name, subject, limit, reaction: attributes of `Watcher`.
+        signals: input and field of one or two signals.
+        make: factory of the monitor.
 
     Raises:
-        InputError: it has too long a name, or cannot be made.
+        InputError: the name is too long, or the monitor cannot be created.
     """
 
     def __init__(
@@ -197,14 +197,14 @@ class Plain(Watcher):
         self.reset()
 
     def find(self, first: int, inputs: Sequence[Mapping[str, Array]]) -> Alarm | None:
-        """The alarm in the samples ``first`` on, if there is one.
+        """Find the first alarm in a chunk that begins at sample ``first``; None if there is none.
 
         Args:
-            first: index of the first one.
-            inputs: arrays of shape (n,) by field.
+            first: index of the chunk's first sample in the run.
+            inputs: arrays of shape (n,) by field, for each input.
 
         Raises:
-            InputError: the monitor goes wrong.
+            InputError: the monitor raises an exception or returns an invalid sample.
         """
         if self._monitor is None:
             return None
@@ -223,51 +223,51 @@ class Plain(Watcher):
         return alarm
 
     def reset(self) -> None:
-        """Make the monitor anew."""
+        """Replace the monitor by a new instance."""
         with code_of_others(f"monitor {self.name}"):
             self._monitor = self._make()
 
 
 def _read_only(signal: Array) -> Array:
-    """View of a signal that third-party code cannot write to."""
+    """Return a read-only view of a signal for third-party code."""
     view: Array = signal.view()
     view.flags.writeable = False
     return view
 
 
 class Clearance:
-    """Condition that the tool is out of the part.
+    """Detector of the tool being out of the part.
 
     Args:
-        beyond: measured position of the drive beyond which it is [m].
-        samples: for so many in a row.
+        beyond: measured position of the drive from which on the tool is out [m].
+        samples: number of consecutive samples required.
 
     Attributes:
-        memory: both, and how many in a row were up to the last sample, for `lathe_rc.safety.rules.clear`.
+        memory: both arguments and the current number of consecutive samples, for `lathe_rc.safety.rules.clear`.
     """
 
     def __init__(self, beyond: float, samples: int) -> None:
         self.memory = np.array([beyond, samples, 0.0])
 
     def begin(self) -> None:
-        """Look for it from the next sample on."""
+        """Restart the detection at the next sample."""
         self.memory[2] = 0.0
 
     def first(self, position: Array) -> int | None:
-        """First sample at which the tool is out; None: at none."""
+        """Find the first sample at which the tool is out of the part; None if there is none."""
         place, self.memory[2] = clear(position, self.memory)
         return place if place >= 0 else None
 
 
 class Lookout:
-    """All monitors of a cell; the first input is the encoder.
+    """Set of all monitors of a cell that check by rules; the first input is the encoder.
 
     Args:
-        monitors: in the order in which alarms at the same sample are told; their memory becomes part of the lookout's.
-        numbers: of the signals that they read, by input and field.
+        monitors: monitors in the order of alarms at the same sample; their memory is moved into the lookout's.
+        numbers: signal numbers for the kernel, by input and field.
 
     Attributes:
-        watch: for `lathe_rc.safety.rules.walk`.
+        watch: monitors for `lathe_rc.safety.rules.walk`.
     """
 
     def __init__(self, monitors: Sequence[Monitor], numbers: Mapping[Place, int]) -> None:
@@ -282,7 +282,7 @@ class Lookout:
         self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
 
     def found(self) -> list[tuple[Monitor, Alarm]]:
-        """Alarms of the samples through which `lathe_rc.safety.rules.walk` went last."""
+        """Return the alarms of the last call of `lathe_rc.safety.rules.walk`, in order of the samples."""
         found = []
         places, values = self.watch.places.tolist(), self.watch.values.tolist()
         for number, (monitor, place, value) in enumerate(zip(self._monitors, places, values, strict=True)):
@@ -292,7 +292,7 @@ class Lookout:
         return sorted(found, key=lambda one: one[1].place)
 
     def reset(self) -> None:
-        """Watch as from the first sample."""
+        """Reset all monitors, so that they can raise alarms again."""
         self.watch.raised[:] = 0
         for monitor in self._monitors:
             monitor.reset()

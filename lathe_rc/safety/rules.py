@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of the monitors, sample by sample, whatever the blocks.
+"""Rules of the monitors, with results that do not depend on the block length.
 
-One kernel goes through the samples for all monitors of a cell: a row of a table says which rule reads which signals and
-where its memory is. A rule first asks whether there is anything in a stretch of samples, which the compiler makes
-vectors of, and takes them one by one only where there is.
+One kernel processes the samples for all monitors of a cell: each row of a table gives a rule, its signals and the
+location of its memory. A rule first checks a stretch of samples in a vectorised loop, and processes the samples one by
+one only if the check finds any violation.
 """
 
 from typing import NamedTuple
@@ -25,17 +25,17 @@ _STRETCH = 256  # samples
 
 @inlined
 def _beyond(value: float, offset: float, low: float, high: float) -> bool:
-    """Whether a value is beyond its limits, or not a number; most limits are to both sides, which is one comparison."""
+    """Whether a value is beyond its limits or NaN; symmetric limits, the common case, need one comparison."""
     value -= offset
     return not abs(value) <= high if low == -high else not low <= value <= high
 
 
 @kernel
 def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
-    """0 if enough samples in a row may be beyond the limits here, or begin to be at the last one; otherwise -1.
+    """Return 0 if enough consecutive samples may be beyond the limits, or may begin at the last one; otherwise -1.
 
-    The memory: see `_lasting_beyond`. Where n are needed, every n-th one and the last tell: n in a
-    row cannot pass between them, if the sample before the first was not beyond.
+    The memory is that of `_lasting_beyond`. If n consecutive samples are needed, checking every n-th sample and the
+    last one suffices, provided that the sample before the first was not beyond the limits.
     """
     offset, low, high, needed = memory[0], memory[1], memory[2], int(memory[3])
     count = 0
@@ -55,30 +55,31 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 
 @inlined
 def _over(memory: Array) -> bool:
-    """Whether the time without alarms is over, see `_lasting_beyond`."""
+    """Whether the initial alarm-free angle has been passed (memory as in `_lasting_beyond`)."""
     return bool(memory[5] == 0.0 or memory[6] == -np.inf)
 
 
 @kernel
 def _forgiven(angle: Array, memory: Array) -> int:
-    """Number of samples of the block without alarms, see `_lasting_beyond`."""
+    """Count the samples of the block within the initial alarm-free angle (memory as in `_lasting_beyond`)."""
     if _over(memory) or not angle.size:
         return 0
     if np.isnan(memory[6]):
         memory[6] = angle[0] + memory[5]
     for k in range(angle.size):
         if angle[k] >= memory[6]:
-            memory[6] = -np.inf  # an angle that turns back changes nothing
+            memory[6] = -np.inf  # final, even if the angle turns back
             return k
     return angle.size
 
 
 @kernel
 def _lasting_beyond(signal: Array, other: Array, angle: Array, memory: Array) -> int:
-    """First sample at which enough in a row were beyond, or -1.
+    """Find the first sample at which enough consecutive samples were beyond the limits; -1 if there is none.
 
-    The memory: offset, lower and upper limit, how many, how many were up to the last sample; spindle angle in which
-    nothing is wrong yet from the first sample or a reset on, and the angle at which that ends, NaN before it begins.
+    The memory: offset, lower and upper limit, number of consecutive samples required, current number of consecutive
+    samples; alarm-free spindle angle after the first sample or a reset, and the angle at which it ends, NaN before it
+    begins.
     """
     if memory[4] == 0.0 and _over(memory) and _any_beyond(signal, other, memory) < 0:
         return -1
@@ -92,9 +93,13 @@ def _lasting_beyond(signal: Array, other: Array, angle: Array, memory: Array) ->
 
 @kernel
 def clear(position: Array, memory: Array) -> tuple[int, float]:
-    """First sample at which enough in a row were beyond a position, or -1, and how many were up to it or the last.
+    """Find the first sample at which enough consecutive samples were at or beyond a position.
 
-    The memory: the position, how many, and how many were up to the sample before; it stays as it is.
+    The memory: the position, the number of consecutive samples required, and their number before the block; it is not
+    changed.
+
+    Returns:
+        The sample, -1 if there is none; and the number of consecutive samples up to it or to the last one.
     """
     run = memory[2]
     for k in range(position.size):
@@ -111,7 +116,7 @@ def _differ(after: float, before: float, limit: float) -> bool:
 
 @inlined
 def _how_many_differ(after: Array, before: Array, limit: float) -> int:
-    count = 0  # without a branch, so that the compiler makes vectors of the loop
+    count = 0  # without a branch, so that the compiler vectorises the loop
     for k in range(after.size):
         count += _differ(after[k], before[k], limit)
     return count
@@ -119,9 +124,9 @@ def _how_many_differ(after: Array, before: Array, limit: float) -> int:
 
 @kernel
 def _changing(signal: Array, memory: Array) -> int:
-    """First sample that differs by more than the limit from the one a window before, or -1.
+    """Find the first sample that differs by more than the limit from the one a window earlier; -1 if there is none.
 
-    The memory: limit, by how much it differs, and the samples of a window up to now.
+    The memory: limit, difference at that sample, and the samples of the last window.
     """
     limit, past, size = memory[0], memory[2:], signal.size
     window = past.size
@@ -142,7 +147,7 @@ def _changing(signal: Array, memory: Array) -> int:
 
 @inlined
 def _next(pulse: Pulses, begin: int) -> int:
-    """First index pulse from a sample on; the end if there is none."""
+    """Find the first index pulse starting at a sample; the size of the block if there is none."""
     for start in range(begin, pulse.size, _STRETCH):
         piece, some = pulse[start : start + _STRETCH], np.uint8(0)
         for k in range(piece.size):
@@ -155,13 +160,13 @@ def _next(pulse: Pulses, begin: int) -> int:
 
 @inlined
 def _off(since: float, limit: float) -> bool:
-    """Whether an angle since an index pulse is impossible, to the limit."""
+    """Whether an angle since the last index pulse is negative or above one revolution, by more than the limit."""
     return since > TURN + limit or since < -limit
 
 
 @kernel
 def _first_off(angle: Array, last: float, limit: float) -> int:
-    """First sample with an impossible angle since the index pulse, or -1."""
+    """Find the first sample with an impossible angle since the index pulse; -1 if there is none."""
     count = 0
     for k in range(angle.size):
         count += _off(angle[k] - last, limit)
@@ -173,10 +178,10 @@ def _first_off(angle: Array, last: float, limit: float) -> int:
 
 @kernel
 def _index(angle: Array, pulse: Pulses, at: int, memory: Array) -> int:
-    """First sample whose angle does not fit the index pulses, the first of which is ``at``, or -1.
+    """Find the first sample whose angle is inconsistent with the index pulses, the first of which is at ``at``.
 
-    The memory: limit, angle of the last pulse, what was found, whether there was a pulse: before, the first angle
-    stands for one that may come early.
+    The memory: limit, angle of the last pulse, deviation found, whether there was a pulse. Before the first pulse, the
+    first angle is used in its place, and that pulse may come early. The result is -1 if there is no such sample.
     """
     limit, begin = memory[0], 0
     if angle.size and np.isnan(memory[1]):
@@ -197,13 +202,13 @@ def _index(angle: Array, pulse: Pulses, at: int, memory: Array) -> int:
     return -1
 
 
-SUMS = 128  # of squares, each of every 128th error: one would wait for itself, these are vectors
+SUMS = 128  # interleaved sums of squares, so that the loop vectorises; one sum would be a serial dependency
 
 
 @inlined
 def _add(error: Array, memory: Array) -> None:
-    """Add the squares of more errors of the same revolution, see `_growing`."""
-    # Sum k has every 128th error from the pulse on, wherever blocks begin: each is summed in the same order.
+    """Add the squares of further errors of the current revolution (memory as in `_growing`)."""
+    # Sum k takes every 128th error since the pulse, independent of block boundaries: the order of summation is fixed.
     sums = memory[7:]
     start = int(memory[3]) % sums.size
     head = min(sums.size - start, error.size)
@@ -218,7 +223,7 @@ def _add(error: Array, memory: Array) -> None:
 
 @inlined
 def _grown(memory: Array) -> bool:
-    """End a revolution, see `_growing`, and begin the next; whether its error has grown once too often."""
+    """End a revolution and begin the next; return whether the error has grown often enough (memory as in `_growing`)."""
     limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:7], memory[7:]
     rms = np.sqrt(np.sum(sums) / state[0])
     before = state[1]
@@ -233,10 +238,10 @@ def _grown(memory: Array) -> bool:
 
 @kernel
 def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
-    """First sample at which the RMS error has grown often enough, or -1; ``at``: the first pulse.
+    """Find the sample at which the RMS error has grown often enough, -1 if there is none; ``at``: the first pulse.
 
-    The memory: limit, floor, revolutions needed; samples of the revolution, below 0 before the first index pulse; RMS
-    of the one before, how many have grown, by how much; sums of squares.
+    The memory: limit, floor, revolutions required; samples of the current revolution, below 0 before the first index
+    pulse; RMS error of the previous revolution, number of consecutive growths, last growth factor; sums of squares.
     """
     begin = 0
     while True:
@@ -252,14 +257,14 @@ def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
 
 
 class Watch(NamedTuple):
-    """The monitors of a cell, for `walk`.
+    """Table of the monitors of a cell for `walk`.
 
     Attributes:
-        plan: of each its rule, the numbers of its two signals, the second or -1, begin and end of its memory.
-        memory: of all of them.
-        raised: which have raised their alarm and look no more, shape (rules,).
-        places: where each of them finds something, or -1, shape (rules,).
-        values: what it finds there, shape (rules,).
+        plan: rule, first signal, second signal or -1, begin and end of the memory of each monitor, shape (rules, 5).
+        memory: concatenated memories of the monitors.
+        raised: flags of the monitors that have raised their alarm and are inactive, shape (rules,).
+        places: sample of each monitor's finding, or -1, shape (rules,).
+        values: value at that sample, shape (rules,).
     """
 
     plan: Places
@@ -271,12 +276,12 @@ class Watch(NamedTuple):
 
 @kernel
 def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
-    """Fill in the place and value of each monitor's finding; return their number.
+    """Run all monitors over a block, fill in the sample and value of each finding, and return their number.
 
     Args:
-        watch: the monitors.
-        signals: that the plan numbers, shape (n,) each.
-        angle: of the encoder, shape (n,).
+        watch: table of the monitors, updated in place.
+        signals: signals in the numbering of the plan, shape (n,) each.
+        angle: angle of the encoder [rad], shape (n,).
         pulse: index pulses of the encoder, shape (n,).
     """
     plan, found, first_pulse = watch.plan, 0, _next(pulse, 0)
@@ -289,7 +294,7 @@ def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) 
                 place = _lasting_beyond(signal, other, angle, own)
                 if place >= 0:
                     value = signal[place] - (other[place] if other.size else 0.0)
-                    if own[1] == -own[2]:  # limits to both sides are told by the magnitude
+                    if own[1] == -own[2]:  # for symmetric limits the value is the magnitude
                         value = abs(value - own[0])
         elif rule == RATE:
             place, value = _changing(signal, own), own[1]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of the cell and what leads from one to another."""
+"""State machine of the cell: states, reactions and transitions."""
 
 from collections.abc import Iterator
 from enum import IntEnum
 
 
 class State(IntEnum):
-    """State of the cell."""
+    """Safety state of the cell."""
 
     NOMINAL = 0
     DEGRADED = 1
@@ -15,7 +15,7 @@ class State(IntEnum):
 
 
 class Reaction(IntEnum):
-    """The reaction to an alarm; the higher one prevails."""
+    """Reaction to an alarm; of several, the one with the highest number prevails."""
 
     NONE = 0
     WARN = 1
@@ -36,18 +36,18 @@ MEANING = {
     Reaction.STOP: "as retract; only a new run ends it",
 }
 
-RETRACTED, RESET = "retracted", "reset"  #: what else changes the state: the tool is out, somebody says so
+RETRACTED, RESET = "retracted", "reset"  #: further causes of transitions: end of the retraction, reset by the operator
 
 
 def after(state: State, cause: Reaction | str) -> State | None:
-    """State that a cause leads to.
+    """Return the next state of the cell after a cause.
 
     Args:
-        state: before.
-        cause: a reaction that a monitor asks for, `RETRACTED` or `RESET`.
+        state: current state.
+        cause: reaction requested by a monitor, `RETRACTED` or `RESET`.
 
     Returns:
-        None if the cause means nothing in this state.
+        The next state; None if the cause is not valid in the current state.
     """
     if cause == RETRACTED:
         return State.SAFE if state is State.RETRACTING else None
@@ -61,7 +61,7 @@ def after(state: State, cause: Reaction | str) -> State | None:
 
 
 def table() -> Iterator[tuple[str, ...]]:
-    """Rows for the documentation: the cause, then the state that it leads to from each state; "" for none."""
+    """Yield the rows of the transition table for the documentation: cause, then next state per state, "" for none."""
     for cause in (*Reaction, RETRACTED, RESET):
         if cause is not Reaction.NONE:
             found = [after(state, cause) for state in State]
