@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas. The modules in ``__all__`` are public, all others may change.
+"""Analysis of runs, loops and measurements.
 
-Form: `form_errors`, `metrology`, `profile_csv`, `tolerance`, `budget`. Loops: `learning`, `pid_tuning`. Models from
-measurements: `drive_fit`, `hysteresis_fit`, `reduced_order`. `shaft`: compliance of the part.
+The modules in ``__all__`` are public, all others may change. Form: `form_errors`, `metrology`, `profile_csv`,
+`tolerance`, `budget`. Loops: `learning`, `pid_tuning`. Models from measurements: `drive_fit`, `hysteresis_fit`,
+`reduced_order`. `shaft`: compliance of the part.
 """
 
 __all__ = [

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Budget of a form error by its causes, from runs in which some of them are switched off; the parts add up.
+"""Error budget: contributions of the causes to a form error, from runs with some causes switched off.
 
-f(S) is the form error over the angle of a run in which the causes S act and the others are switched off; N are all of
-them. The form error e = f(N) is the sum of
+f(S) is the form error over the angle of a run in which the causes S act and the others are switched off; N is the set
+of all causes. The form error e = f(N) is the sum of
 
-    e_i    = f({i}) - f({})                             what cause i does alone
-    e_ij   = f({i, j}) - f({i}) - f({j}) + f({})        what i and j do only together
-    e_0    = f({})                                      the rest, which is there without any of them
+    e_i    = f({i}) - f({})                             effect of cause i alone
+    e_ij   = f({i, j}) - f({i}) - f({j}) + f({})        interaction of i and j
+    e_0    = f({})                                      rest, without any of the causes
 
-and of what takes three causes or more. A cause that needs another one to act, as the lead needs a speed that varies, is
-seen on top of it. The share of a part x in the power of e is the mean of x·e over that of e². Shares add up to 1 since
-the parts add up to e; one is negative if its part makes the error smaller.
+and of the interactions of three causes or more. If a cause requires another one to have an effect, as the lead requires
+a varying speed, its effect is computed in addition to that one. The share of a contribution x in the power of e is the
+mean of x·e over that of e². The shares add up to 1, since the contributions add up to e; a share is negative if its
+contribution reduces the error.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,17 +24,17 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Causes = frozenset[str]
 
-TOLD = 0.01  #: least share of what causes do together that is told pair by pair
+TOLD = 0.01  #: least share of the interactions that is reported pair by pair
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the form error.
+    """Contribution of a cause, or of an interaction of causes, to the form error.
 
     Attributes:
-        name: the cause, or causes.
-        share: in the power of the whole [1].
-        rms, largest: of the part by itself [m].
+        name: cause or causes.
+        share: share in the power of the form error [1].
+        rms, largest: RMS and largest magnitude of the contribution itself [m].
     """
 
     name: str
@@ -42,26 +43,26 @@ class Part:
     largest: float
 
     def percent(self) -> str:
-        """The share in per cent, in words."""
+        """Format the share in per cent."""
         return f"{round(self.share * 100.0, 1) + 0.0:.1f}"  # + 0.0: no -0.0
 
     def summary(self) -> dict[str, object]:
-        """For JSON, lengths in µm."""
+        """Return the contribution for JSON, lengths in µm."""
         return {"cause": self.name, "share": self.share, "rms": self.rms * 1e6, "largest": self.largest * 1e6}
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The parts of a form error.
+    """Error budget of a run: form error and its contributions.
 
     Attributes:
-        revolutions: the last ones of the run that it speaks of.
-        rms, largest: form error in them [m].
-        causes: what each cause does alone.
-        rest: the error without any of them.
-        interactions: what causes do only together; with causes and rest it is the whole.
-        pairs: parts of the interactions, by two causes each; empty if those come to less than `TOLD` together.
-        left_out: causes that could not be switched off, and why.
+        revolutions: number of last revolutions of the run that were evaluated.
+        rms, largest: RMS and largest magnitude of the form error in them [m].
+        causes: contribution of each cause alone.
+        rest: form error without any of the causes.
+        interactions: sum of all interactions; causes, rest and interactions add up to the form error.
+        pairs: interactions of two causes each; empty if the interactions have a share below `TOLD`.
+        left_out: causes that could not be switched off, with the reason.
     """
 
     revolutions: int
@@ -75,16 +76,16 @@ class Budget:
 
     @property
     def rows(self) -> list[Part]:
-        """As tables show it: causes, rest, interactions, and the pairs of those that come to `TOLD` or more."""
+        """Return the rows of a table: causes, rest, interactions, and the pairs with a share of `TOLD` or more."""
         return [*self.causes, self.rest, self.interactions, *(pair for pair in self.pairs if abs(pair.share) >= TOLD)]
 
     @property
     def explained(self) -> float:
-        """Share of the causes and pairs of them, and of the rest; 1 if no three causes act together."""
+        """Return the share of causes, pairs and rest; 1 if there is no interaction of three or more causes."""
         return self.rest.share + sum(part.share for part in (*self.causes, *self.pairs))
 
     def summary(self) -> dict[str, object]:
-        """The output of ``lathe budget --json``, lengths in µm."""
+        """Return the budget for JSON, the output of ``lathe budget --json``, lengths in µm."""
         return {
             "revolutions": self.revolutions,
             "rms": self.rms * 1e6,
@@ -99,34 +100,34 @@ class Budget:
 
 
 class Decomposition:
-    """Runs that a budget takes, and the budget that they give.
+    """Plan of the runs required for an error budget, and the evaluation of these runs.
 
     Args:
-        needs: of each cause the one without which it does nothing, empty if it acts alone; such a cause comes first.
+        needs: required cause of each cause, empty for none; a required cause precedes the causes that need it.
     """
 
     def __init__(self, needs: Mapping[str, str]) -> None:
         self._needs = needs
 
     def acting(self, causes: Causes) -> Causes:
-        """Causes of these that act: the one that each needs is among them."""
+        """Return those of ``causes`` that have an effect, because their required cause is among them."""
         return frozenset(cause for cause in causes if self._needs[cause] in ("", *causes))
 
     def _context(self, *causes: str) -> Causes:
-        """Causes that others need, beside those themselves."""
+        """Return the causes required by ``causes``, without ``causes`` themselves."""
         return frozenset(self._needs[cause] for cause in causes if self._needs[cause]) - set(causes)
 
     def _couples(self) -> Iterator[tuple[str, str]]:
-        """Pairs of causes, but for a cause and the one it needs, which act together already."""
+        """Yield the pairs of causes, except a cause with its required cause, which act together already."""
         return (pair for pair in combinations(self._needs, 2) if self._needs[pair[1]] != pair[0])
 
     def alone(self) -> set[Causes]:
-        """Runs for all but the pairs."""
+        """Return the runs required for all contributions except the pairs."""
         singles = {self._context(cause) | extra for cause in self._needs for extra in (set[str](), {cause})}
         return {frozenset(), frozenset(self._needs), *singles}
 
     def together(self) -> set[Causes]:
-        """Further runs, for the pairs."""
+        """Return the additional runs required for the pairs."""
         runs = set[Causes]()
         for first, second in self._couples():
             context = self._context(first, second)
@@ -134,12 +135,12 @@ class Decomposition:
         return runs - self.alone()
 
     def split(self, runs: Mapping[Causes, Array], left_out: Mapping[str, str]) -> Budget:
-        """The budget.
+        """Compute the error budget from the form errors of the runs.
 
         Args:
-            runs: form error over even angles of the last revolutions [m], shape (revolutions, points), by the causes
-                that act: those of `alone`, or those of `together` as well.
-            left_out: causes that are not among them, and why.
+            runs: form error at equidistant angles of the last revolutions [m], shape (revolutions, points), by the
+                set of active causes: the runs of `alone`, optionally also those of `together`.
+            left_out: causes that could not be switched off, with the reason.
         """
         whole, rest = runs[frozenset(self._needs)], runs[frozenset()]
         power = float(np.mean(whole**2))

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The electrodynamic drive's model from a recorded command u and position x.
+"""Identification of the electrodynamic drive from a recorded command u and position x.
 
     Wi(p) = e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²)        (papers 000 and 001)
 
-Two steps. The start is linear least squares, for each of some delays τ, of u(t - τ) = x + a1·dx/dt + a2·d²x/dt²
-behind a low-pass (`lathe_rc.control.identification`). From there the mean square of the simulation error is made least:
-the recorded position less what the difference equation, with which the cell runs, makes of the recorded command. The
-sensor's noise is in the position alone, so this error is that noise when the model is right; in the equation error of
-the first step it stands in the regressors, and biases them.
+The fit has two steps. Initial values come from linear least squares, for a set of delays τ, of the low-pass filtered
+equation u(t - τ) = x + a1·dx/dt + a2·d²x/dt² (`lathe_rc.control.identification`). The second step minimises the mean
+square of the simulation error: the recorded position less the response of the cell's difference equation to the
+recorded command. The sensor noise affects only the position, so with the right model this error equals the noise; in
+the equation error of the first step the noise is part of the regressors, and biases the result.
 
-The motion before the record is not known: the state where the comparison begins is found along, and it is linear.
+The motion before the record is unknown: the initial state of the comparison is fitted too, as a linear parameter.
 """
 
 from collections.abc import Mapping
@@ -29,37 +29,37 @@ Array = npt.NDArray[np.float64]
 PARAMETERS = ("natural_frequency", "damping", "delay")  #: in this order wherever they are an array
 MOST = 2**19  #: samples that are used; a longer record is cut
 
-_LEAST = 512  # samples, for a fit
+_LEAST = 512  # samples required for a fit
 _LONGEST_DELAY = 0.1  # [s], as the drive's parameter allows
 _DAMPINGS = (0.01, 20.0)
-_STILL = 1e-9  # [m] RMS about its mean: what moves less does not move
+_STILL = 1e-9  # [m] RMS about the mean below which a command counts as constant
 _FAR = 10.0  # [m]
-_START = 2**17  # samples that the start looks at: where the command moves most
-_FORGOTTEN = 40.0  # time constants after which a state is no more to be seen
+_START = 2**17  # samples used for the initial values, where the command moves most
+_FORGOTTEN = 40.0  # time constants after which the initial state has decayed
 _PIECE = 8192
 _BANDWIDTHS = (500.0, 2000.0, 8000.0)  # [rad/s] of the low-pass
-_DELAYS = 40  # that are tried
+_DELAYS = 40  # trial delays
 _MOST_STEPS = 60  # of the search
 _STRETCHES = 32  # of the residual, between which its correlation is neglected
-_SINGULAR = 1e6  # condition number from which the command does not distinguish parameters at all
-_ILL = 1000.0  # and from which there is a warning
-_UNKNOWN, _VAGUE = 0.25, 0.05  # standard error over the parameter: refused, warned of
-_TOGETHER = 0.3  # part of a parameter in the direction that is known worst, to be named
+_SINGULAR = 1e6  # condition number above which the parameters cannot be distinguished
+_ILL = 1000.0  # condition number above which there is a warning
+_UNKNOWN, _VAGUE = 0.25, 0.05  # standard error over the parameter: error, warning
+_TOGETHER = 0.3  # component of a parameter in the worst-determined direction, from which it is named
 
 
 @dataclass(frozen=True)
 class DriveFit:
-    """A drive's model and how well it is known; parameters by name as in `PARAMETERS`, in rad/s, 1, s.
+    """Identified drive model with its uncertainty; parameters by name as in `PARAMETERS`, in rad/s, 1, s.
 
     Attributes:
-        values: of the model.
-        errors: their standard errors, of a residual whatever its correlation.
-        linear: what the linear start found.
-        residual_rms: of the simulation error [m].
-        nrmse: the same over the RMS of the position about its mean [1].
-        condition: condition number of the position's sensitivities to the parameters, each of length 1.
-        vague: parameters that the command hardly distinguishes, or that are known to 5 % and worse; should be none.
-        samples: that were compared.
+        values: parameters of the model.
+        errors: standard errors of the parameters, for white or correlated residuals.
+        linear: initial values from the linear fit.
+        residual_rms: RMS of the simulation error [m].
+        nrmse: RMS of the simulation error over the RMS of the position about its mean [1].
+        condition: condition number of the position's sensitivities to the parameters, each normalised to length 1.
+        vague: parameters hardly distinguished by the command, or with a standard error of 5 % or more; should be empty.
+        samples: number of samples compared.
     """
 
     values: Mapping[str, float]
@@ -73,7 +73,7 @@ class DriveFit:
 
     @property
     def r_squared(self) -> float:
-        """Part of the position's variance that the model explains."""
+        """Coefficient of determination: part of the position's variance explained by the model."""
         return 1.0 - self.nrmse**2
 
 
@@ -82,7 +82,7 @@ def _named(values: Array) -> dict[str, float]:
 
 
 class _Record:
-    """Recorded command and position, against which drives are compared."""
+    """Recorded command and position, for the comparison with simulated drives."""
 
     def __init__(self, command: Array, position: Array, step: float, method: Discretisation, stroke: float) -> None:
         self.command, self.position = command, position
@@ -90,11 +90,11 @@ class _Record:
         self._room = np.empty((3, command.size))
 
     def residual(self, values: Array, skip: int) -> Array:
-        """Simulation error with ωn, ζ, τ from sample ``skip`` on [m], shape (n - skip,).
+        """Compute the simulation error for ωn, ζ, τ starting at sample ``skip`` [m], shape (n - skip,).
 
         The drive is simulated from rest before the record. By superposition, another state at ``skip`` adds two
         solutions of the homogeneous difference equation, a pulse response of its poles and the same a sample later:
-        what they explain is left out.
+        their least-squares fit is subtracted.
         """
         drive = ElectrodynamicDrive(
             natural_frequency=float(values[0]),
@@ -114,14 +114,14 @@ class _Record:
         pulse = np.zeros((2, length))
         pulse[0, 0] = pulse[1, 1] = 1.0
         poles = [1.0, -np.trace(transition), np.linalg.det(transition)]
-        # Orthonormal columns, so that a product takes away what they explain.
+        # Orthonormal columns, so that the fit is a product.
         base, _ = np.linalg.qr(scipy.signal.lfilter([1.0], poles, pulse).T)
         error[:length] -= base @ (base.T @ error[:length])
         return error
 
 
 def _busiest(command: Array) -> slice:
-    """Part of the record in which the command moves most."""
+    """Return the slice of the record in which the command moves most."""
     if command.size <= _START:
         return slice(0, command.size)
     travel = np.append(0.0, np.cumsum(np.diff(command) ** 2))
@@ -130,9 +130,9 @@ def _busiest(command: Array) -> slice:
 
 
 def _linear(record: _Record, step: float) -> list[Array]:
-    """ωn, ζ, τ by linear least squares, the best of all delays for each low-pass, shape (3,) each."""
+    """Fit ωn, ζ, τ by linear least squares, with the best delay for each low-pass, shape (3,) each."""
     part = _busiest(record.command)
-    # The gain is 1, so a common level may go: the low-passes begin at 0.
+    # The gain is 1, so a common offset may be removed: the low-passes begin at 0.
     level = record.position[part][0]
     command, position = record.command[part] - level, record.position[part] - level
     longest = min(_LONGEST_DELAY, command.size * step / 4.0)
@@ -158,18 +158,18 @@ def _linear(record: _Record, step: float) -> list[Array]:
 def fit(
     command: Array, position: Array, step: float, *, method: Discretisation = "foh", stroke: float = np.inf
 ) -> DriveFit:
-    """Identify a drive.
+    """Identify a drive from its command and position.
 
     Args:
-        command: set points [m], shape (n,); of more than `MOST` the first are used.
-        position: as measured [m], shape (n,).
+        command: set points [m], shape (n,); only the first `MOST` are used.
+        position: measured position [m], shape (n,).
         step: sampling step [s].
         method: discretisation of the model.
         stroke: end stops at ± this displacement [m].
 
     Raises:
-        InputError: arrays that are too short or not finite, a command that does not move, or one that leaves a
-            parameter open, which is named.
+        InputError: an array is too short or not finite, or the command is constant or does not determine a parameter,
+            which is named.
     """
     if command.size != position.size or command.size < _LEAST:
         raise InputError(
@@ -193,7 +193,7 @@ def fit(
 
 
 def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
-    """The least simulation error, from the best start."""
+    """Minimise the simulation error, starting from the best initial values."""
     longest = max(float(start[2] + 2.0 * (start[2] + 2.0 * start[1] / start[0])) for start in starts)
     longest = min(longest, _LONGEST_DELAY, record.command.size * step / 4.0)
     skip = int(np.ceil(longest / step)) + 3
@@ -237,7 +237,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
     if condition > _SINGULAR:
         raise InputError(f"the command does not tell {' and '.join(worst)} apart (condition number {condition:.3g})")
     errors = _standard_errors(jacobian, found.fun, lengths, sizes, directions) * np.array([best[0], best[1], scale])
-    # What matters of a delay is its part of the whole lag.
+    # The error of a delay is relative to the total lag.
     relative = errors / np.array([best[0], best[1], best[2] + 2.0 * best[1] / best[0]])
     unknown = [name for name, error in zip(PARAMETERS, relative, strict=True) if not error < _UNKNOWN]
     if unknown:
@@ -246,7 +246,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
         )
         raise InputError(f"the command leaves {' and '.join(unknown)} open ({said}; condition number {condition:.3g})")
     vague = {name for name, error in zip(PARAMETERS, relative, strict=True) if error > _VAGUE}
-    # A search that has not ended creeps along what hardly changes the position.
+    # A search that has not converged moves along a direction that hardly changes the position.
     vague |= set(worst) if condition > _ILL or found.status == 0 else set()
     rms = float(np.sqrt(np.mean(found.fun**2)))
     return DriveFit(
@@ -262,10 +262,10 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
 
 
 def _standard_errors(jacobian: Array, residual: Array, lengths: Array, sizes: Array, directions: Array) -> Array:
-    """Standard errors, shape (3,): the larger of those of a white residual and of one that is correlated.
+    """Compute the standard errors, shape (3,): the larger for each of a white and of a correlated residual.
 
     White: σ²·(JᵀJ)⁻¹. Correlated within stretches of the record: (JᵀJ)⁻¹·(Σ g·gᵀ)·(JᵀJ)⁻¹ with g the sum of
-    J·residual over a stretch; that says too little where one stretch alone moves the drive, as after a step.
+    J·residual over a stretch; this is too low if the drive moves in a single stretch only, as after a step.
     """
     inverse = (directions.T / sizes**2) @ directions / np.outer(lengths, lengths)
     edges = np.arange(_STRETCHES) * residual.size // _STRETCHES

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form error of a run, revolution by revolution, from samples that come in pieces.
+"""Form error of a run per revolution, computed chunk by chunk.
 
-A revolution begins with the first sample at or behind its angle. Its mean square is taken over the angle, not over
-time: a place that the spindle passes slowly counts once. So each sample weighs as much as the spindle turns up to the
-next one. A revolution that the run ends within is left out, unless less than two samples are missing.
+A revolution begins with the first sample at or after its initial angle. The mean square is taken over the angle, not
+over time: each sample is weighted by the angle to the next one, so that slow parts of a revolution do not count more. An
+incomplete last revolution is left out, unless less than two samples are missing.
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from lathe_rc.jit import inlined, kernel
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
-# The state: samples so far; turns at the last sample and at the one before, error of the last; number of the revolution
-# under way and index of its first sample; its sums: square and weight; its largest and smallest error.
+# The state: samples so far; turns at the last sample and at the one before, error of the last; number of the current
+# revolution and index of its first sample; its sums of squares and weights; its largest and smallest error.
 _SAMPLES, _TURNS, _BEFORE, _ERROR, _NUMBER, _START, _SQUARE, _WEIGHT, _HIGH, _LOW = range(10)
-_ROWS = 64  # complete revolutions that there is room for at first
+_ROWS = 64  # initial capacity in complete revolutions
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ class FormErrors:
     starts: npt.NDArray[np.int64]
 
     def told(self) -> list[str]:
-        """In words: how many revolutions, and the error in the first and last of them, if there are any."""
+        """Describe the number of revolutions, and the form error in the first and last one, as text lines."""
         count = f"{self.rms.size} revolution{'' if self.rms.size == 1 else 's'}"
         ends = [f"{rms * 1e6:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
         return [count, f"form error {' to '.join(ends)} µm RMS"] if ends else [count]
 
 
 def turns_before(angle: Array) -> int:
-    """Revolutions before the first complete one: 0 of a run, which begins in its first; more of a snapshot.
+    """Return the number of revolutions before the first complete one: 0 for a run, more for a snapshot.
 
     Args:
         angle: true spindle angle [rad], shape (n,).
@@ -56,15 +56,15 @@ def turns_before(angle: Array) -> int:
 
 
 def turns_at_end(before: float, last: float) -> int:
-    """Revolutions that are complete at the end of a run, by the turns at the last sample and at the one before."""
+    """Compute the number of revolutions complete at the end of a run, from the turns at its last two samples."""
     return int(np.floor(last + min(2.0 * (last - before), 0.5)))
 
 
 def that_count(angle: Array, error: Array) -> npt.NDArray[np.intp] | slice:
-    """Samples of a piece of a run, shape (n,), that its form errors depend on.
+    """Select the samples of a chunk, shape (n,), that determine the form errors.
 
-    Where the spindle stands still all along, that are the first, the last and those of the extremes: a standstill of
-    minutes takes no memory.
+    For a chunk of pure standstill these are the first, the last and the extreme samples: a standstill of minutes
+    requires no memory.
     """
     if angle.size < 5 or angle[0] != angle[-1]:
         return slice(None)
@@ -73,20 +73,20 @@ def that_count(angle: Array, error: Array) -> npt.NDArray[np.intp] | slice:
 
 @inlined
 def _close(row: Array, start: float, square: float, weight: float, high: float, low: float) -> None:
-    """Fill the row of a revolution: first sample, RMS, largest and smallest error."""
+    """Fill in the row of a revolution: first sample, RMS, largest and smallest error."""
     row[0], row[1], row[2], row[3] = start, np.sqrt(square / weight), high, low
-    if not row[1] < np.inf:  # comparisons pass over what is no number
+    if not row[1] < np.inf:  # NaN, which comparisons ignore
         row[2] = row[3] = row[1]
 
 
 @kernel
 def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> tuple[int, int]:
-    """Take samples from ``start`` on, until all are taken or all rows are filled.
+    """Process samples starting at ``start``, until the end of the chunk or until all rows are filled.
 
     Returns:
-        Samples that have been taken; rows that have been filled, or -1 if a revolution has no sample.
+        Number of samples processed; number of rows filled, or -1 if a revolution has no sample.
     """
-    # In locals, which the compiler keeps in registers: of arrays it could not know that they do not overlap.
+    # Locals, which the compiler keeps in registers; arrays might overlap.
     samples, last, before, held = state[_SAMPLES], state[_TURNS], state[_BEFORE], state[_ERROR]
     number, begin = state[_NUMBER], state[_START]
     square, weight, high, low = state[_SQUARE], state[_WEIGHT], state[_HIGH], state[_LOW]
@@ -94,7 +94,7 @@ def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> t
     while k < angle.size and 0 <= found < rows.shape[0]:
         turns = angle[k] / _TURN
         if samples > 0.0:
-            # The last sample counts, now that it is known how far it goes.
+            # The last sample is added now, since its weight is known.
             square += held * held * (turns - last)
             weight += turns - last
             high, low = max(high, held), min(low, held)
@@ -117,23 +117,23 @@ def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> t
 
 @kernel
 def _end(state: Array, row: Array) -> None:
-    """Complete the revolution under way with the last sample, which goes as far as the one before."""
+    """Complete the current revolution with the last sample, weighted like the previous one."""
     held, step = state[_ERROR], state[_TURNS] - state[_BEFORE]
     square, weight = state[_SQUARE] + held * held * step, state[_WEIGHT] + step
     _close(row, state[_START], square, weight, max(state[_HIGH], held), min(state[_LOW], held))
 
 
 def _plain(samples: Array) -> Array:
-    """Samples as the kernel takes them, copied if need be; for others it would be compiled once more."""
+    """Convert samples to the array layout of the kernel, which would otherwise be compiled once more."""
     fits = samples.flags.carray and samples.dtype == np.float64
     return samples if fits else np.require(samples, np.float64, ["C", "W"])
 
 
 class RunningErrors:
-    """Form errors by revolution, of samples that come piece by piece.
+    """Accumulator of the form errors per revolution, fed chunk by chunk.
 
     Args:
-        first: revolutions before the first that counts, see `turns_before`.
+        first: revolutions before the first one evaluated, see `turns_before`.
     """
 
     def __init__(self, first: int = 0) -> None:
@@ -142,7 +142,7 @@ class RunningErrors:
         self._rows, self._filled = np.empty((_ROWS, 4)), 0
 
     def add(self, angle: Array, error: Array) -> None:
-        """Take the next samples.
+        """Process the next chunk of samples.
 
         Args:
             angle: true spindle angle [rad], increasing, shape (n,).
@@ -165,21 +165,21 @@ class RunningErrors:
                 self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
 
     def found(self) -> FormErrors:
-        """Form errors of all complete revolutions, if the run ends with the samples so far."""
+        """Return the form errors of all complete revolutions, if the run ends after the samples so far."""
         state, filled = self._state, self._filled
         if state[_SAMPLES] < 2.0:
             return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))
         end = state[_START] if state[_START] >= 0.0 else state[_SAMPLES]
         if end < state[_SAMPLES] and turns_at_end(state[_BEFORE], state[_TURNS]) > state[_NUMBER]:
             end = state[_SAMPLES]
-            _end(state, self._rows[filled])  # there is room; more samples would write over it
+            _end(state, self._rows[filled])  # in a free row, which further samples overwrite
             filled += 1
         start, rms, high, low = self._rows[:filled].T.copy()
         return FormErrors(rms, np.maximum(high, -low), high - low, np.append(start, end).astype(np.int64))
 
 
 def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:
-    """Form error by revolution of a run at once; see `RunningErrors`."""
+    """Compute the form errors per revolution of a complete run (implemented by `RunningErrors`)."""
     running = RunningErrors(first)
     running.add(angle, error)
     return running.found()

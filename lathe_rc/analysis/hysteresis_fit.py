@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of a Prandtl-Ishlinskii hysteresis from a measured loop.
 
-A play's output depends on its threshold and the input alone, so for given thresholds the displacement is linear in
+The output of a play depends only on its threshold and the input, so for given thresholds the displacement is linear in
 the weights,
 
     y = y0 + p0·u + Σ p_i·F_i(u),    p0, p_i >= 0,
 
-and least squares with bounds find them. What the plays remember of the time before the record is unknown; the fit
-begins where the input has passed through its range for the first time, for by then it has taken every play along.
+and the weights follow from least squares with bounds. The initial states of the plays are unknown; the fit begins where
+the input has passed through its full range for the first time, after which the state of every play is determined.
 
 The loop must be quasi-static: the lag of a fast drive would be taken for hysteresis.
 """
@@ -27,20 +27,20 @@ from lathe_rc.signals.table import read_table
 Array = npt.NDArray[np.float64]
 
 _HEADER = ("command_um", "displacement_um")
-_WHOLE = 0.95  # of the range counts as all of it
+_WHOLE = 0.95  # part of the range that counts as the full range
 _LEAST = 1e-9  # a slope below this cannot be inverted
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A measured loop.
+    """Measured hysteresis loop.
 
     Args:
-        command: displacement that the voltage stands for [m], shape (n,).
-        displacement: measured [m], shape (n,).
+        command: displacement commanded by the voltage [m], shape (n,).
+        displacement: measured displacement [m], shape (n,).
 
     Raises:
-        InputError: not as many of each, none at all, or a number that is not finite.
+        InputError: the arrays are empty, of different length, or not finite.
     """
 
     command: Array
@@ -59,12 +59,12 @@ class Loop:
 
 @dataclass(frozen=True)
 class Identified:
-    """The result of a fit, relative to the half-stroke.
+    """Result of a hysteresis fit, relative to the half-stroke.
 
     Attributes:
-        model: the hysteresis.
-        offset: of the displacement [m].
-        residual: RMS of what the model leaves, over that of the displacement about its mean.
+        model: hysteresis model.
+        offset: offset of the displacement [m].
+        residual: RMS of the residual, over that of the displacement about its mean.
     """
 
     model: PrandtlIshlinskii
@@ -73,15 +73,15 @@ class Identified:
 
 
 def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Identified:
-    """Fit the weights to a loop.
+    """Fit the weights of a Prandtl-Ishlinskii model to a measured loop.
 
     Args:
-        loop: the measurement; one and a half loops or more.
+        loop: measurement of one and a half loops or more.
         stroke: half-stroke of the drive [m].
-        thresholds: of the plays, relative to the half-stroke, increasing, shape (n,).
+        thresholds: thresholds of the plays, relative to the half-stroke, increasing, shape (n,).
 
     Raises:
-        InputError: thresholds out of order, or a loop that does not return, does not move a play, has too few
+        InputError: the thresholds are not increasing, or the loop does not return, does not move a play, has too few
             points or no slope.
     """
     check_thresholds(thresholds)
@@ -129,7 +129,7 @@ def read_csv(path: Path) -> Loop:
     """Read a loop from a CSV file with the columns ``command_um`` and ``displacement_um`` [µm], in order of time.
 
     Raises:
-        InputError: the file is missing or malformed, or holds a number that is not finite.
+        InputError: the file is missing or malformed, or contains a value that is not finite.
     """
     _, rows = read_table(path, [_HEADER], "hysteresis loop")
     if not rows.size:
@@ -140,15 +140,15 @@ def read_csv(path: Path) -> Loop:
 def from_signals(
     dense: Mapping[str, Mapping[str, Array]], command: str = "/fine/command", state: str = "/fine/state"
 ) -> Loop:
-    """A loop from the signals of a recorded run.
+    """Extract a hysteresis loop from the signals of a recorded run.
 
     Args:
-        dense: of a `lathe_rc.cell.recording.Recording`, as `lathe_rc.bag.reader.read_bag` gives it.
-        command: topic with the drive's command; its linearisation must be off.
-        state: topic with the drive's state.
+        dense: signals of a `lathe_rc.cell.recording.Recording`, as returned by `lathe_rc.bag.reader.read_bag`.
+        command: topic of the drive's command; the linearisation of the drive must be off.
+        state: topic of the drive's state.
 
     Raises:
-        InputError: a topic is not there.
+        InputError: a topic is missing.
     """
     for topic in (command, state):
         if topic not in dense:

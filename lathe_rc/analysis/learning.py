@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas of the learning loop: stability, contraction, steady error.
+"""Formulas of the learning loop: stability, contraction, steady-state error.
 
-The loop maps what the memory holds at ν waves per revolution to (Q(ν) - γ·Z(νΩ))·itself in a cycle
+In one cycle the loop multiplies the component of the memory at ν waves per revolution by Q(ν) - γ·Z(νΩ)
 (paper 001, eqs 1-5; Z = Wi/W0 is the drive with lead and correction). It converges when sup|Q - γZ| < 1 over all ν
-up to the grid's Nyquist limit. Q, Z and the interpolators are taken as they run, not as their continuous ideals.
+up to the grid's Nyquist limit. Q, Z and the interpolators are modelled as implemented, not as their continuous ideals.
 """
 
 from collections.abc import Callable
@@ -27,11 +27,11 @@ _COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each 
 
 
 def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[float, float]:
-    """Supremum of the magnitude of a factor of a cycle, and the waves per revolution where it is.
+    """Compute the supremum of a cycle factor's magnitude, and the waves per revolution at which it occurs.
 
     Args:
-        operator: the factor at waves per revolution, shape (n,).
-        highest: waves per revolution.
+        operator: factor of a cycle as a function of the waves per revolution, shape (n,).
+        highest: highest waves per revolution.
     """
     waves = _waves_up_to(highest)
     near = _near_peaks(waves, np.abs(operator(waves)))
@@ -43,7 +43,7 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
 
 @kernel
 def _near_peaks(waves: Array, size: Array) -> Array:
-    """Waves around the highest peaks of a size, ends included; the first wave where it is not finite, if any, alone."""
+    """Return waves around the highest peaks of ``size``, ends included; if it is not finite, only the first such wave."""
     last = waves.size - 1
     heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order, by insertion
     for k in range(last + 1):
@@ -65,7 +65,7 @@ def _near_peaks(waves: Array, size: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def _waves_up_to(highest: float) -> Array:
-    """The waves per revolution at which the peaks are looked for."""
+    """Return the waves per revolution of the coarse search for peaks."""
     waves = np.linspace(0.0, highest, _COARSE)
     waves.setflags(write=False)
     return waves
@@ -73,15 +73,15 @@ def _waves_up_to(highest: float) -> Array:
 
 @dataclass(frozen=True)
 class LearningLoop:
-    """One self-learning channel.
+    """Learning loop of one self-learning channel.
 
     Args:
-        drive: response of the drive's position to its command at a frequency [rad/s].
+        drive: frequency response from the drive's command to its position at a frequency [rad/s].
         q: zero-phase Q on the grid.
         grid: memory points per revolution.
         gain: learning gain γ.
-        lead_time: T0 [s] of the lead law; the lead angle is T0·Ω for all laws but the constant one.
-        constant_lead: lead angle whatever the speed [rad].
+        lead_time: T0 [s] of the lead law; the lead angle is T0·Ω for all laws except the constant one.
+        constant_lead: lead angle independent of the speed [rad].
         correction: 1/W0 after the lead.
         nominal: nominal speed Ω0 [rad/s].
         variable_lead: False for the constant lead angle T0·Ω0.
@@ -100,7 +100,7 @@ class LearningLoop:
     step: float
 
     def _correction(self, waves: Array, speed: float) -> Array | Complex:
-        """1/W0 with the interpolation of the memory, without the lead."""
+        """Compute the response of 1/W0 with the interpolation of the memory, without the lead."""
         correction, radians = self.correction, 2 * np.pi * waves / self.grid
         law = correction.law
         if law is CorrectionLaw.NONE:
@@ -119,38 +119,38 @@ class LearningLoop:
         return np.asarray(cubic_response(radians) * factor)
 
     def corrected_drive(self, waves: Array, speed: float) -> Complex:
-        """Z at ``waves`` per revolution and spindle ``speed`` [rad/s]: drive, lead, correction, interpolators."""
+        """Compute Z (drive, lead, correction, interpolators) at ``waves`` per revolution and a ``speed`` [rad/s]."""
         frequency = waves * speed
         lead = self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
         measured = cubic_response(frequency * self.step)
         return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * self._correction(waves, speed) * measured)
 
     def operator(self, waves: Array, speed: float) -> Complex:
-        """Q - γZ, the factor of a cycle, at ``waves`` per revolution, shape (n,)."""
+        """Compute the factor Q - γZ of a cycle at ``waves`` per revolution, shape (n,)."""
         q = self.q.response(2 * np.pi * waves / self.grid)
         return np.asarray(q - self.gain * self.corrected_drive(waves, speed))
 
     def worst(self, speed: float) -> tuple[float, float]:
-        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s] and the waves per revolution where it is.
+        """Compute the supremum of |Q - γZ| at ``speed`` [rad/s], and the waves per revolution at which it occurs.
 
-        Over all waves up to the Nyquist limits of grid and sampling. It is computed once for loops that are alike.
+        The range extends up to the Nyquist limits of grid and sampling. The result is cached for equal loops.
         """
-        # A bound method of constants never changes, so that the loop may be a key of the cache.
+        # A bound method of constants never changes, so the loop can be a key of the cache.
         is_constant = isinstance(getattr(self.drive, "__self__", None), Constant)
         return (_worst_of_alike if is_constant else _worst)(self, speed)
 
     def supremum(self, speed: float) -> float:
-        """Supremum of the magnitude of Q - γZ at ``speed`` [rad/s]."""
+        """Compute the supremum of |Q - γZ| at ``speed`` [rad/s]."""
         return self.worst(speed)[0]
 
     def steady_error(self, waves: Array, speed: float) -> Complex:
-        """δ/Xd = (1 - Q)/(γZ + 1 - Q), what is left after many cycles (paper 001, eq. 3), shape (n,)."""
+        """Compute the steady-state error ratio δ/Xd = (1 - Q)/(γZ + 1 - Q) (paper 001, eq. 3), shape (n,)."""
         q = self.q.response(2 * np.pi * waves / self.grid)
         return np.asarray((1.0 - q) / (self.gain * self.corrected_drive(waves, speed) + 1.0 - q))
 
 
 def _worst(loop: LearningLoop, speed: float) -> tuple[float, float]:
-    """Supremum of a loop at a speed, without a cache."""
+    """Compute the supremum of a loop at a speed, without a cache."""
     highest = min(loop.grid / 2, np.pi / (loop.step * speed))
     return supremum(lambda waves: loop.operator(waves, speed), highest)
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The form of the part, revolution by revolution, as the workshop reads it.
+"""Form metrology of the part per revolution: roundness, undulations, roughness and lay.
 
-`lathe_rc.analysis.form_errors` weighs the samples of a run by the angle that they stand for. All else starts from
-`evenly`, which interpolates them at even angles, so that it does not matter how fast the spindle passed a place; a
-profile is then an array of shape (revolutions, points) whose last axis goes once round from angle 0.
+`lathe_rc.analysis.form_errors` weights the samples of a run by their angle. All other figures start from `evenly`,
+which interpolates the samples at equidistant angles and thus removes the influence of the spindle speed; a profile is
+then an array of shape (revolutions, points) whose last axis is one revolution from angle 0.
 
-Undulations per revolution are UPR. Terms are those of ISO 12181-1 (roundness) and ISO 21920-2 (roughness), the filter
-is that of ISO 16610-21 for closed profiles.
+UPR stands for undulations per revolution. Terms follow ISO 12181-1 (roundness) and ISO 21920-2 (roughness), the filter
+ISO 16610-21 for closed profiles.
 """
 
 from dataclasses import dataclass
@@ -21,29 +21,29 @@ from lathe_rc.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
-POINTS = 4096  #: even angles in a revolution, about as many as the cell has samples at 1000 rpm
+POINTS = 4096  #: angles per revolution, about the number of the cell's samples at 1000 rpm
 _STANDSTILL = 1e-3  # of the largest step of the angle between samples
 _PER_MARK = 64  # places between revolutions
-_PER_UNDULATION = 7  # points that an undulation at the filter's cut-off needs
+_PER_UNDULATION = 7  # points required per undulation at the filter's cut-off
 
 
 def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
-    """Values of each complete revolution at the angles 0, 2π/points, …, by cubic splines.
+    """Interpolate each complete revolution at the angles 0, 2π/points, … by cubic splines.
 
-    Where the spindle stands still, the last sample counts: with that the tool leaves the place. With steps as
-    different as before and after a standstill a cubic spline overshoots; then one without overshoot takes its place.
+    At a standstill only the last sample is used, with which the tool leaves the position. Where the angle steps differ
+    as much as around a standstill, a cubic spline would overshoot; a spline without overshoot is used instead.
 
     Args:
-        angle: true spindle angle [rad], not falling, shape (n,).
-        values: of each sample, shape (n,).
-        points: in a revolution.
+        angle: true spindle angle [rad], not decreasing, shape (n,).
+        values: value of each sample, shape (n,).
+        points: points per revolution.
 
     Returns:
-        Shape (revolutions, points); revolutions as in `form_errors`. Where the run ends up to two samples before
-        the last revolution does, the last value is held.
+        Values of shape (revolutions, points); revolutions as in `form_errors`. If the run ends up to two samples
+        before the end of the last revolution, the last value is held.
 
     Raises:
-        InputError: the angle falls, or there are too few points.
+        InputError: the angle decreases, or there are too few points.
     """
     if points < 3:
         raise InputError(f"{points} points in a revolution; allowed: 3 or more")
@@ -70,11 +70,11 @@ def evenly(angle: Array, values: Array, points: int = POINTS) -> Array:
 
 @dataclass(frozen=True)
 class Undulations:
-    """Harmonics of each profile: r(φ) = Σ amplitude·sin(UPR·φ + phase), as profiles are given to the cell.
+    """Harmonics of each profile: r(φ) = Σ amplitude·sin(UPR·φ + phase), the convention of the cell's profiles.
 
     Attributes:
-        amplitude: [m], shape (revolutions, highest UPR + 1); UPR 0 is the magnitude of the mean.
-        phase: [rad], from -π to π, the same shape.
+        amplitude: amplitudes [m], shape (revolutions, highest UPR + 1); UPR 0 is the magnitude of the mean.
+        phase: phases [rad], from -π to π, the same shape.
     """
 
     amplitude: Array
@@ -82,10 +82,10 @@ class Undulations:
 
 
 def undulations(profile: Array, highest: int) -> Undulations:
-    """Harmonics up to ``highest`` UPR of profiles at even angles [m], shape (revolutions, points).
+    """Compute the harmonics up to ``highest`` UPR of profiles at equidistant angles [m], shape (revolutions, points).
 
     Raises:
-        InputError: the profile has too few points for so many undulations.
+        InputError: the profile has too few points for the highest UPR.
     """
     points = profile.shape[-1]
     if not 0 <= highest < points / 2:
@@ -98,16 +98,16 @@ def undulations(profile: Array, highest: int) -> Undulations:
 
 
 def gaussian(profile: Array, cutoff: float) -> Array:
-    """The long waves of profiles, by the Gaussian filter of ISO 16610-21 for closed profiles.
+    """Compute the long-wave component of profiles by the Gaussian filter of ISO 16610-21 for closed profiles.
 
-    An undulation of n UPR keeps exp(-π·(α·n/cutoff)²) of its amplitude, α = sqrt(ln 2/π): half of it at the cut-off.
+    The amplitude at n UPR is multiplied by exp(-π·(α·n/cutoff)²) with α = sqrt(ln 2/π), by 1/2 at the cut-off.
 
     Args:
-        profile: at even angles [m], shape (revolutions, points); so is the result.
-        cutoff: [UPR]; ISO 12181-2 has 15, 50, 150, 500 and 1500.
+        profile: profiles at equidistant angles [m], shape (revolutions, points), also the shape of the result.
+        cutoff: cut-off [UPR]; ISO 12181-2 specifies 15, 50, 150, 500 and 1500.
 
     Raises:
-        InputError: the cut-off leaves less than seven points in an undulation.
+        InputError: there are less than seven points per undulation at the cut-off.
     """
     points = profile.shape[-1]
     if not 0.0 < cutoff <= points / _PER_UNDULATION:
@@ -124,8 +124,8 @@ class Roundness:
     """Least-squares circle of each profile and the deviation from it, shape (revolutions,).
 
     Attributes:
-        radius: of the circle, as deviation from the radius that the profile is measured from [m].
-        x, y: its centre [m], x at angle 0 and y at π/2.
+        radius: radius of the circle, relative to the reference radius of the profile [m].
+        x, y: centre of the circle [m], x at angle 0 and y at π/2.
         peak_to_valley: RONt [m].
         rms: RONq [m].
     """
@@ -143,17 +143,17 @@ class Roundness:
 
 
 def roundness(profile: Array, cutoff: float | None = None) -> Roundness:
-    """Least-squares circle (LSCI of ISO 12181-1) and roundness deviations from it.
+    """Compute the least-squares circle (LSCI of ISO 12181-1) and the roundness deviations from it.
 
-    The circle is R + x·cos φ + y·sin φ, its form for a centre near the axis. An eccentric true circle of radius R
-    seems out of round by e²/2R.
+    The circle is approximated by R + x·cos φ + y·sin φ, for a centre near the axis. A true circle of radius R with the
+    eccentricity e then has an apparent roundness deviation of e²/2R.
 
     Args:
-        profile: radius deviations at even angles [m], shape (revolutions, points).
-        cutoff: the deviations are those of the long waves up to this [UPR], see `gaussian`; None: all.
+        profile: radius deviations at equidistant angles [m], shape (revolutions, points).
+        cutoff: cut-off of the Gaussian filter for the deviations [UPR]; None for no filter.
 
     Raises:
-        InputError: see `gaussian`.
+        InputError: there are less than seven points per undulation at the cut-off.
     """
     angle = 2.0 * np.pi * np.arange(profile.shape[-1]) / profile.shape[-1]
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -168,7 +168,7 @@ def roundness(profile: Array, cutoff: float | None = None) -> Roundness:
 
 @dataclass(frozen=True)
 class Roughness:
-    """Roughness around the part, shape (revolutions,).
+    """Roughness in circumferential direction, shape (revolutions,).
 
     Attributes:
         ra: arithmetic mean deviation [m].
@@ -180,34 +180,35 @@ class Roughness:
 
 
 def roughness(profile: Array, cutoff: float) -> Roughness:
-    """Ra and Rq of what the Gaussian filter takes away: undulations above ``cutoff`` UPR, half of those at it.
+    """Compute Ra and Rq of the short-wave component: the profile less its Gaussian filter with the given cut-off.
 
-    A revolution that does not end where it began has a step there, whose sharp part counts as roughness.
+    If the radii at the start and the end of a revolution differ, the short-wave component of this step counts as
+    roughness.
 
     Args:
-        profile: at even angles [m], shape (revolutions, points).
-        cutoff: [UPR].
+        profile: profiles at equidistant angles [m], shape (revolutions, points).
+        cutoff: cut-off of the Gaussian filter [UPR].
 
     Raises:
-        InputError: see `gaussian`.
+        InputError: there are less than seven points per undulation at the cut-off.
     """
     short = profile - gaussian(profile, cutoff)
     return Roughness(np.abs(short).mean(axis=-1), np.sqrt((short**2).mean(axis=-1)))
 
 
 def feed_mark(feed: float, nose_radius: float) -> float:
-    """Height of what a nose leaves standing between revolutions, r - √(r² - f²/4), nearly f²/(8r) [m].
+    """Compute the height of the feed marks of a round nose, r - √(r² - f²/4), about f²/(8r) [m].
 
-    Its mean deviation Ra is nearly f²/(18·√3·r).
+    The arithmetic mean deviation Ra of the marks is about f²/(18·√3·r).
 
     Args:
         feed: f [m/rev].
         nose_radius: r, in the plane of the feed [m].
 
     Raises:
-        InputError: a nose that would leave material between revolutions, or none.
+        InputError: the nose radius is not positive, or too small to remove the material between revolutions.
     """
-    # Where noses only just touch, rounding decides if a place between them is cut.
+    # Where cuts barely touch, the rounding error decides whether the place between them is cut.
     if not 0.0 < abs(feed) < 2.0 * nose_radius * (1.0 - 1e-9) < np.inf:
         raise InputError(
             f"feed of {feed:g} m/rev and a nose of {nose_radius:g} m; allowed: a feed other than 0 and below twice "
@@ -218,14 +219,14 @@ def feed_mark(feed: float, nose_radius: float) -> float:
 
 @dataclass(frozen=True)
 class Lay:
-    """The surface along the part: what the nose leaves of revolution beside revolution.
+    """Surface along the part that results from the feed marks of successive revolutions.
 
     Attributes:
-        height: places along the part [m], even, shape (places,).
-        surface: deviation of the radius from the desired form [m], shape (angles, places); angles are even, from 0 on.
-        revolutions: that it is made of.
-        feed: mean [m/rev].
-        errorless: height of the marks of an errorless path at this feed, see `feed_mark` [m].
+        height: equidistant heights along the part [m], shape (places,).
+        surface: deviation of the radius from the desired form [m], shape (angles, places); equidistant angles from 0.
+        revolutions: number of revolutions used.
+        feed: mean feed [m/rev].
+        errorless: height of the feed marks of an error-free path at this feed, see `feed_mark` [m].
     """
 
     height: Array
@@ -236,30 +237,31 @@ class Lay:
 
     @property
     def ra(self) -> Array:
-        """Ra of each trace, from its mean [m], shape (angles,)."""
+        """Arithmetic mean deviation Ra of each trace about its mean [m], shape (angles,)."""
         return np.asarray(np.abs(self.surface - self.surface.mean(axis=-1, keepdims=True)).mean(axis=-1))
 
     @property
     def rt(self) -> Array:
-        """Rt of each trace, its total height [m], shape (angles,)."""
+        """Total height Rt of each trace [m], shape (angles,)."""
         return np.asarray(np.ptp(self.surface, axis=-1))
 
 
 def lay(profile: Array, height: Array, nose_radius: float, *, revolutions: int = 8, angles: int = 64) -> Lay:
-    """The surface that a round nose leaves, along the part.
+    """Compute the surface along the part that is cut by a round nose.
 
-    A nose at the height h, whose foremost point deviates by e, cuts down to e + r - √(r² - (z - h)²) at the place z; of
-    all revolutions the deepest cut remains. Noses further than their radius from a place do not reach it.
+    A nose at the height h whose apex deviates by e cuts down to e + r - √(r² - (z - h)²) at the height z; the deepest
+    cut of all revolutions determines the surface. A nose does not reach heights further away than its radius.
 
     Args:
         profile: deviation of each revolution [m], shape (revolutions, points), see `Measurement`.
-        height: of the nose [m], the same shape.
+        height: height of the nose [m], the same shape.
         nose_radius: r, in the plane of the feed [m].
-        revolutions: the last so many are looked at, as far as the height moves one way.
-        angles: at which traces are taken; of the points every so many-th.
+        revolutions: number of last revolutions used, as far as the feed has one direction.
+        angles: number of traces, at equidistant points of the profile.
 
     Raises:
-        InputError: see `feed_mark`; or less than three revolutions that were fed one way.
+        InputError: the nose radius is invalid as in `feed_mark`, or less than three revolutions have the same feed
+            direction.
     """
     steps = np.diff(height, axis=0)
     onward = np.all(steps > 0.0, axis=1) if steps.size and steps[-1, 0] > 0.0 else np.all(steps < 0.0, axis=1)
@@ -286,12 +288,12 @@ def lay(profile: Array, height: Array, nose_radius: float, *, revolutions: int =
 
 @dataclass(frozen=True)
 class Measurement:
-    """The workshop's figures of each complete revolution.
+    """Metrology of each complete revolution: profile, form error, undulations, roundness and roughness.
 
     Attributes:
-        profile: deviation of the part's radius from the desired form at even angles [m], shape (revolutions, points).
-        form: its RMS and extremes, from the samples themselves.
-        undulations, roundness, roughness: of the profile.
+        profile: deviation of the radius from the desired form at equidistant angles [m], shape (revolutions, points).
+        form: RMS and extremes of the form error, from the samples themselves.
+        undulations, roundness, roughness: figures of the profile.
     """
 
     profile: Array
@@ -310,21 +312,21 @@ def measure(
     roundness_cutoff: float | None = None,
     roughness_cutoff: float = 50.0,
 ) -> Measurement:
-    """Measure the part that a run has turned.
+    """Compute the metrology of a turned part from the form error of a run.
 
-    The form error is desired less actual, so the part's radius deviates by its opposite: where the error is
-    positive, material is missing.
+    The form error is desired less actual, so the radius deviates by its negative: at a positive error material is
+    missing.
 
     Args:
-        angle: true spindle angle [rad], not falling, shape (n,).
+        angle: true spindle angle [rad], not decreasing, shape (n,).
         error: form error [m], shape (n,).
-        points: even angles in a revolution.
-        highest: of the undulations [UPR].
-        roundness_cutoff: see `roundness`.
-        roughness_cutoff: see `roughness` [UPR].
+        points: points per revolution.
+        highest: highest undulation [UPR].
+        roundness_cutoff: cut-off for `roundness` [UPR]; None for no filter.
+        roughness_cutoff: cut-off for `roughness` [UPR].
 
     Raises:
-        InputError: too few points for the undulations or for a cut-off, or an angle that falls.
+        InputError: too few points for the undulations or for a cut-off, or a decreasing angle.
     """
     profile = -evenly(angle, error, points)
     return Measurement(

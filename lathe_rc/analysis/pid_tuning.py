@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PID gains from wanted margins, and what a loop with a PID does.
+"""PID tuning for specified margins, and evaluation of loops with a PID.
 
-At the crossover ωc the loop's gain is 1 and its phase is the phase margin above -π. With a plant P that is
+At the crossover ωc the gain of the loop is 1, and its phase exceeds -π by the phase margin. For a plant P this gives
 
     C(jωc) = e^{j(margin - π)}/P(jωc),   C = P + I/p + D·N·p/(p + N)
 
@@ -9,8 +9,8 @@ two equations for the three gains; the third is I/ωc = |C(jωc)|/integral_ratio
 Paper 004 tuned with Matlab's PID Tuner.
 
 Systems are those of python-control. The companion form of paper 004's compensators has coefficients from 1 to 10¹², and
-the poles of a loop around it come out wrong by several rad/s: each system is balanced by itself before it is connected
-to others.
+the computed poles of a loop with it are wrong by several rad/s: therefore each system is balanced before it is
+connected to others.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ _PADE = 4  # order: up to ωτ = 2 its phase is right to 1e-4 rad
 
 
 def state_space(plant: Plant) -> Lti:
-    """A balanced realisation of a transfer function; any other system of python-control as it realises it."""
+    """Convert a plant to state space: balanced for a transfer function, by python-control for other systems."""
     if not isinstance(plant, TransferFunction):
         return control.ss(plant)
     a, b, c, d = realise(plant)
@@ -42,7 +42,7 @@ def state_space(plant: Plant) -> Lti:
 
 
 def delay(seconds: float) -> Lti:
-    """e^{-p·seconds} by Padé."""
+    """Create the Padé approximation of a delay e^{-p·seconds}."""
     if seconds == 0.0:
         return control.ss([], [], [], [[1.0]])
     return state_space(TransferFunction(*(tuple(part) for part in control.pade(seconds, _PADE))))
@@ -50,11 +50,11 @@ def delay(seconds: float) -> Lti:
 
 _FREQUENCIES = 600  # of a Bode plot, from which margins are read
 _SAMPLES = 4000  # of a step response
-_TRIES = 60  # crossovers that `fastest` looks at
+_TRIES = 60  # trial crossovers of `fastest`
 
 
 def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
-    """Response of any plant at ``frequency`` [rad/s]."""
+    """Compute the frequency response of a plant at ``frequency`` [rad/s]."""
     if isinstance(plant, TransferFunction):
         return plant.response(frequency)
     return np.asarray(plant(1j * np.asarray(frequency)), dtype=np.complex128)
@@ -62,17 +62,17 @@ def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
 
 @dataclass(frozen=True)
 class Loop:
-    """Margins of a loop, and its step response when closed.
+    """Margins and closed-loop step response of a loop.
 
     Attributes:
-        rise: from 10 to 90 % of a step [s].
-        settling: to within 2 % [s].
-        overshoot: relative to the step [1].
-        gain_margin: factor of the gain; infinite where no gain is too much.
-        gain_frequency: where the phase is -π [rad/s]; NaN where there is none.
-        phase_margin: [rad].
+        rise: rise time from 10 to 90 % of a step [s].
+        settling: settling time to within 2 % [s].
+        overshoot: overshoot relative to the step [1].
+        gain_margin: gain margin as a factor; infinite if no gain destabilises the loop.
+        gain_frequency: frequency at which the phase is -π [rad/s]; NaN if there is none.
+        phase_margin: phase margin [rad].
         phase_frequency: crossover [rad/s].
-        stable: whether the closed loop is; if not, the step is not measured (NaN).
+        stable: whether the closed loop is stable; if not, the figures of the step are NaN.
     """
 
     rise: float
@@ -86,7 +86,7 @@ class Loop:
 
 
 def _band(plant: Plant, gains: PidGains, wait: float) -> Array:
-    """Frequencies around everything that a Bode plot of the loop must show [rad/s], increasing."""
+    """Return increasing frequencies [rad/s] that cover all features of the loop in a Bode plot."""
     wide = np.geomspace(1e-5, 1e6, _FREQUENCIES)
     above = np.abs(response(plant, wide) * gains.transfer.response(wide)) > 1.0
     crossovers = wide[:-1][above[:-1] != above[1:]]
@@ -97,17 +97,17 @@ def _band(plant: Plant, gains: PidGains, wait: float) -> Array:
 
 
 def closed_loop(plant: Plant, gains: PidGains, wait: float = 0.0) -> Lti:
-    """Measurement over set point of a loop with a PID; ``wait`` [s] by Padé."""
+    """Create the closed loop from set point to measurement, with the delay ``wait`` [s] as a Padé approximation."""
     return control.feedback(state_space(plant) * state_space(gains.transfer) * delay(wait))
 
 
 def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> Loop:
-    """Measure a loop of a PID and a plant.
+    """Compute margins and step response of a loop with a PID.
 
     Args:
-        plant: of the loop.
-        gains: of the PID.
-        wait: pure delay in the loop [s]; exact in the margins, by Padé in the step.
+        plant: plant of the loop.
+        gains: gains of the PID.
+        wait: pure delay in the loop [s]; exact for the margins, a Padé approximation for the step.
     """
     frequency = _band(plant, gains, wait)
     loop = response(plant, frequency) * gains.transfer.response(frequency) * np.exp(-1j * frequency * wait)
@@ -122,10 +122,10 @@ def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> Loop:
 
 
 def _step(closed: Lti, poles: Complex) -> tuple[float, float, float]:
-    """Rise time and settling time [s] and relative overshoot of a stable system."""
+    """Compute rise time [s], settling time [s] and relative overshoot of a stable system."""
     final = float(np.real(closed.dcgain()))
     span = 10.0 / np.abs(poles.real).min()
-    for _ in range(2):  # a slow pole that hardly shows makes the first span far too long
+    for _ in range(2):  # a slow pole with a negligible residue makes the first span far too long
         time, y = control.step_response(closed, np.linspace(0.0, span, _SAMPLES))
         measured = control.step_info(y, T=time, yfinal=final)
         span = min(span, 4.0 * measured["SettlingTime"])
@@ -141,20 +141,20 @@ def tune(
     filter_ratio: float = 100.0,
     wait: float = 0.0,
 ) -> PidGains:
-    """Gains with which a loop crosses over where it shall, with the phase margin that it shall have.
+    """Compute PID gains for a specified crossover and phase margin.
 
-    Where the integral alone would leave more phase than wanted there is no derivative, and I is what the margin allows.
+    If the margin is exceeded without a derivative, D is 0, and I follows from the margin.
 
     Args:
-        plant: of the loop.
+        plant: plant of the loop.
         crossover: ωc [rad/s].
-        phase_margin: [rad].
+        phase_margin: phase margin [rad].
         integral_ratio: gain of the PID at the crossover over that of its integral there.
         filter_ratio: N over the crossover.
         wait: pure delay in the loop [s].
 
     Raises:
-        InputError: no PID has this phase at the crossover.
+        InputError: no PID has the required phase at the crossover.
     """
     if not (crossover > 0.0 and 0.0 < phase_margin < np.pi / 2.0 and integral_ratio > 0.0 and filter_ratio > 0.0):
         raise InputError(
@@ -181,17 +181,17 @@ def tune(
 def fastest(
     plant: Plant, *, band: tuple[float, float], phase_margin: float, gain_margin: float, wait: float = 0.0
 ) -> PidGains:
-    """Gains of the highest crossover in ``band`` [rad/s] at which both margins are kept and the loop is stable.
+    """Compute the gains of the highest crossover in a band with both margins met and a stable loop.
 
     Args:
-        plant: of the loop.
+        plant: plant of the loop.
         band: lowest and highest crossover [rad/s].
-        phase_margin: [rad].
-        gain_margin: factor.
+        phase_margin: least phase margin [rad].
+        gain_margin: least gain margin, as a factor.
         wait: pure delay in the loop [s].
 
     Raises:
-        InputError: there is none.
+        InputError: no crossover in the band meets the margins.
     """
     for crossover in np.geomspace(*band, _TRIES)[::-1]:
         try:

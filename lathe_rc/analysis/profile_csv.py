@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles as CSV files, in the columns that `lathe_rc.signals.measured_profile.read_csv` reads."""
+"""Profiles as CSV files, with the columns of `lathe_rc.signals.measured_profile.read_csv`."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from lathe_rc.signals.table import write_table
 
 Array = npt.NDArray[np.float64]
 
-_CLOSEST = 1e-9  # [m] between two heights, as the reader wants it
+_CLOSEST = 1e-9  # [m] between two heights, required by the reader
 
 
 def _columns(radius: Array, heights: Array | None) -> tuple[str, Array]:
-    """Header and rows."""
+    """Return the header and the rows of a profile table."""
     points = radius.shape[-1]
     angle = 360.0 * np.arange(points) / points
     if radius.ndim == 1:
@@ -36,20 +36,20 @@ def _columns(radius: Array, heights: Array | None) -> tuple[str, Array]:
 
 
 def write(path: Path, radius: Array, *, heights: Array | None = None, comment: str = "") -> None:
-    """Write profiles at even angles, whole or not at all; an existing file is replaced.
+    """Write profiles at equidistant angles to a CSV file atomically; an existing file is replaced.
 
     The columns are ``angle_deg,radius_um`` for one profile, ``angle_deg,height_mm,radius_um`` for several with
     heights (both can be read back as a profile), and ``angle_deg,revolution,radius_um`` for several without, the
     first being revolution 1.
 
     Args:
-        path: of the file.
+        path: CSV file.
         radius: radius deviations or form errors [m], shape (points,) or (revolutions, points).
         heights: position along the part of each revolution [m], shape (revolutions,).
-        comment: a line at the top of the file.
+        comment: comment line at the top of the file.
 
     Raises:
-        InputError: a number that is not finite, heights that coincide, or a place that cannot be written to.
+        InputError: a value is not finite, two heights coincide, or the file cannot be written.
     """
     if not np.all(np.isfinite(radius)):
         raise InputError(f"{path}: the profile holds numbers that are not finite; write revolutions without them")

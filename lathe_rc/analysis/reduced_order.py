@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reduced-order model of a channel from its step response, and the model's realisable inverse.
+"""Reduced-order model of a channel from its step response, and its realisable inverse.
 
 Both stages of paper 004 (Figs 6-9):
 
     model      (b_m·p^m + … + b0)/((a_n·p^n + … + 1)·p^k), k = 0 or 1, by least squares of the step response
-    inverse    (c_r·p^r + … )/Π(1 + p·τ_i), by nonlinear programming: the input of model and inverse in series is a
-               step, and their output shall be that step again, in the mean square
+    inverse    (c_r·p^r + … )/Π(1 + p·τ_i), by nonlinear programming: the step response of model and inverse in series
+               approximates a step in the mean square
 
 A model is linear in its numerator, so only the denominator is searched. The poles of the model are kept stable by
-factors of second and first order with positive coefficients. The lags τ_i of the inverse have a least value: without
-it the best inverse is the exact one, which cannot be built.
+factors of second and first order with positive coefficients. The lags τ_i of the inverse have a lower bound: without
+it the optimum is the exact inverse, which is not realisable.
 """
 
 from dataclasses import dataclass
@@ -26,23 +26,23 @@ from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 
 Array = npt.NDArray[np.float64]
 
-_SPREADS = (0.02, 0.1, 0.4)  # of the record, where searches for time constants start
+_SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, over the length of the record
 _DAMPINGS = (0.2, 1.2)
 _MOST = 60  # steps of a search; the best of several counts
 _LARGEST_LAG = 100.0  # of the inverse, over the least one
 
 
 def refuse_unusable(what: str, time: Array, response: Array, least: int) -> None:
-    """Refuse a measured response that is too short, or not finite.
+    """Check that a measured response is long enough and finite.
 
     Args:
-        what: it is, in words.
-        time: [s], shape (n,).
-        response: shape (n,).
-        least: smallest n.
+        what: description of the response for error messages.
+        time: time [s], shape (n,).
+        response: response, shape (n,).
+        least: smallest allowed n.
 
     Raises:
-        InputError: it is one of these.
+        InputError: the response is too short or not finite.
     """
     if time.size != response.size or time.size < least:
         raise InputError(f"{what}: {time.size} times, {response.size} values; allowed: {least} or more of each")
@@ -52,14 +52,14 @@ def refuse_unusable(what: str, time: Array, response: Array, least: int) -> None
 
 @dataclass(frozen=True)
 class ChannelStep:
-    """A measured response to a step of 1 at time 0.
+    """Measured response of a channel to a unit step at time 0.
 
     Args:
-        time: from 0 in even steps [s], shape (n,), n from 16.
-        response: in the unit of the channel, shape (n,).
+        time: time in equal steps from 0 [s], shape (n,), n at least 16.
+        response: response in the unit of the channel, shape (n,).
 
     Raises:
-        InputError: it is no such response.
+        InputError: the arrays are not such a response.
     """
 
     time: Array
@@ -79,15 +79,17 @@ class ChannelStep:
 
     @property
     def step(self) -> float:
-        """Time between samples [s]."""
+        """Sampling step of the response [s]."""
         return float(self.time[-1] / (self.time.size - 1))
 
 
 def read_csv(path: Path) -> ChannelStep:
-    """Read a step response: columns ``time_s`` [s], from the step on, and ``response``, over the height of the step.
+    """Read a step response from a CSV file.
+
+    The columns are ``time_s``, the time since the step [s], and ``response``, divided by the height of the step.
 
     Raises:
-        InputError: the file is missing or malformed, or holds no step response.
+        InputError: the file is missing or malformed, or does not contain a step response.
     """
     _, table = read_table(path, [("time_s", "response")], "step response")
     return ChannelStep(table[:, 0].copy(), table[:, 1].copy())
@@ -100,19 +102,19 @@ def _through(transfer: TransferFunction, step: float, signal: Array, hold: Hold)
 
 
 def step_of(transfer: TransferFunction, time: Array) -> Array:
-    """Step response at ``time`` [s], in even steps from 0, shape (n,)."""
+    """Compute the step response at ``time`` [s], in equal steps from 0, shape (n,)."""
     return _through(transfer, float(time[1] - time[0]), np.ones(time.size), "zoh")
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A model or an inverse, and how good it is.
+    """Fitted model or inverse, with its desired and actual output.
 
     Attributes:
-        transfer: what was found.
-        time: [s], shape (n,).
-        wanted: what its output shall be, shape (n,).
-        found: what its output is, shape (n,).
+        transfer: fitted transfer function.
+        time: time [s], shape (n,).
+        wanted: desired output, shape (n,).
+        found: actual output, shape (n,).
     """
 
     transfer: TransferFunction
@@ -122,12 +124,12 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """RMS of the difference."""
+        """RMS of the difference between desired and actual output."""
         return float(np.sqrt(np.mean((self.found - self.wanted) ** 2)))
 
 
 def _denominator(logarithms: Array, pairs: int) -> Array:
-    """Product of so many factors a·p² + b·p + 1 and of b·p + 1 for each number that is left; falling powers."""
+    """Compute the denominator, falling powers: ``pairs`` factors a·p² + b·p + 1, then b·p + 1 for the other numbers."""
     values = np.exp(logarithms)
     whole = np.ones(1)
     for a, b in values[: 2 * pairs].reshape(-1, 2):
@@ -138,7 +140,7 @@ def _denominator(logarithms: Array, pairs: int) -> Array:
 
 
 def _starts(poles: int, pairs: int, span: float) -> list[Array]:
-    """Logarithms of the denominator's coefficients from which it is searched."""
+    """Return the logarithms of the denominator's coefficients at which the searches start."""
     starts = []
     for part in _SPREADS:
         # Factors differ, or they would stay equal.
@@ -154,14 +156,14 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
     """Fit a model of chosen orders by least squares of the step response.
 
     Args:
-        measured: the channel.
+        measured: step response of the channel.
         zeros: m, degree of the numerator.
-        poles: n, poles besides the integrator.
-        integrator: whether there is one.
-        oscillating: whether poles may be complex; without it the model is a product of lags, as in paper 004.
+        poles: n, number of poles without the integrator.
+        integrator: whether the model has an integrator.
+        oscillating: whether poles may be complex; otherwise the model is a product of lags, as in paper 004.
 
     Raises:
-        InputError: orders that make no strictly proper model.
+        InputError: the orders do not give a strictly proper model.
     """
     if not (0 <= zeros < poles + integrator and 0 <= poles <= 8):
         raise InputError(
@@ -173,7 +175,7 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
     pairs = poles // 2 if oscillating else 0
 
     def numerator(logarithms: Array) -> tuple[Array, Array, Array]:
-        """Best numerator (falling powers), denominator, and step response."""
+        """Compute the best numerator for a denominator; return both in falling powers, and the step response."""
         bottom = np.append(_denominator(logarithms, pairs), np.zeros(int(integrator)))
         powers = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
         basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in powers], axis=1)
@@ -203,16 +205,16 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
 def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: float = LAG) -> Fit:
     """Fit the realisable inverse of a channel by nonlinear programming.
 
-    It starts from the inverse of the model with the least lags. Zeros and gain of the inverse and its lags are
-    searched so that the measured response becomes a step again.
+    The search starts from the inverse of the model with the smallest lags. Zeros, gain and lags of the inverse are
+    optimised so that its response to the measured step response approximates a step.
 
     Args:
-        model: of the channel.
-        measured: its step response.
-        least_lag: least value of the lags τ_i [s].
+        model: model of the channel.
+        measured: step response of the channel.
+        least_lag: lower bound of the lags τ_i [s].
 
     Raises:
-        InputError: the inverse of the model is not stable, or the record is coarser than the lags.
+        InputError: the inverse of the model is unstable, or the record is coarser than the lags.
     """
     if measured.step > least_lag:
         raise InputError(

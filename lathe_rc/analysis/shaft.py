@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compliance of a shaft in the lathe, along its length: what gives way under a force at height z.
+"""Compliance of a shaft in the lathe along its length: deflection per force at the height z.
 
-Between centres head stock and tail stock share the force by the lever and the shaft is a simply supported beam:
+Between centres, head stock and tail stock share the force by the lever arm, and the shaft is a simply supported beam:
 
     1/k(z) = (1 - z/L)²/k_head + (z/L)²/k_tail + z²·(L - z)²/(3·E·I·L) + 1/k_carriage
 
@@ -13,8 +13,8 @@ R of a unit force in the tail stock, A of it in the head stock and the moment M 
 
 where c is the rotation of the chuck under a moment; c → ∞ is the centre. Without a tail stock R = 0.
 
-Source: paper 004, which predistorts the path of the tool by head stock, tail stock and bend of the shaft and takes the
-models from elsewhere; the equations are those of elementary beam theory.
+Source: paper 004, which predistorts the path of the tool for head stock, tail stock and bending of the shaft, with
+models from other sources; the equations are those of elementary beam theory.
 """
 
 from dataclasses import dataclass
@@ -33,18 +33,18 @@ STEEL_MODULUS = 2.1e11  #: E [Pa]
 
 @dataclass(frozen=True)
 class Shaft:
-    """A round shaft and what holds it.
+    """Round shaft with its supports.
 
     Attributes:
         length: L, from the head stock to the tail stock, or to the free end [m].
-        diameter: [m].
-        support: between centres; in a chuck and against the centre of the tail stock; in a chuck alone.
-        head, tail, carriage: stiffnesses [N/m]; inf for rigid.
-        chuck_rotation: c [rad/(N·m)]; 0 for a clamped end. Not between centres.
+        diameter: diameter of the shaft [m].
+        support: between centres; in a chuck with the centre of the tail stock; in a chuck alone.
+        head, tail, carriage: stiffnesses of head stock, tail stock and carriage [N/m]; inf for rigid.
+        chuck_rotation: c [rad/(N·m)]; 0 for a clamped end; unused between centres.
         modulus: E [Pa].
 
     Raises:
-        InputError: a value that is out of its range.
+        InputError: a value is out of its range.
     """
 
     length: float
@@ -72,14 +72,14 @@ class Shaft:
 
     @property
     def bending_stiffness(self) -> float:
-        """E·I [N·m²]."""
+        """Bending stiffness E·I of the shaft [N·m²]."""
         return self.modulus * np.pi * self.diameter**4 / 64.0
 
     def compliance(self, height: npt.ArrayLike) -> Array:
-        """1/k(z) [m/N] at ``height`` z from the head stock [m], any shape.
+        """Compute the compliance 1/k(z) [m/N] at ``height`` z from the head stock [m], any shape.
 
         Raises:
-            InputError: a height beyond the shaft.
+            InputError: a height is beyond the shaft.
         """
         z = np.asarray(height, dtype=np.float64)
         if np.any((z < 0.0) | (z > self.length)):

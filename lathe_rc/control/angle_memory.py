@@ -99,7 +99,7 @@ class AngleMemory(NamedTuple):
 def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Array) -> None:
     """Begin a block: store its angles and errors after the newest three of the block before, shape (n + 3,).
 
-    Errors are available starting at sample ``delay``; up to it the stored angle is constant, so that nothing is learned.
+    Errors are available starting at sample ``delay``; up to it the stored angle is constant, so nothing is learned.
     """
     n, per_radian, delay = error.size, m.grid / _TURN, m.delay
     whole, real, angles, errors = m.whole, m.real, m.windows[0, : error.size + 3], m.windows[1, : error.size + 3]

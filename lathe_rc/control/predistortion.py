@@ -4,7 +4,7 @@
     y(z) = x(z) + C(z)·F(ap(z)),  ap = D(z) - y(z)
 
 y is the resulting radius and x the set point of the cross feed, both relative to the nominal radius; D is the depth of
-cut at the nominal radius; C the compliance along the shaft (`lathe_rc.analysis.shaft`) and F the force as a function of
+cut at that radius; C the compliance along the shaft (`lathe_rc.analysis.shaft`) and F the force as a function of
 the depth of cut. Both x and the deflection change the depth and so the force: y is the root of this equation. For the
 path that cancels the deflection, y = w, the depth is known, D - w, and so is the path: x = w - C·F(D - w). Subtracting
 the deflection measured on a part without predistortion is not sufficient, because a deeper cut deflects the shaft more.
@@ -13,8 +13,8 @@ If C, F or D are not known accurately, the error of the last part corrects the p
 
     x ← x - γ·(y - w)
 
-The error then changes by the factor 1 - γ/(1 + C·F') per part, a contraction for any 0 < γ < 2 as long as the force does
-not decrease with the depth of cut.
+The error then changes by the factor 1 - γ/(1 + C·F') per part, a contraction for any 0 < γ < 2 as long as the force
+does not decrease with the depth of cut.
 
 Source: paper 004, whose upper level computes the path from a model of the deformation and corrects it by the deviation
 of the profile; neither is printed there.
@@ -73,7 +73,7 @@ def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) 
 
 
 def cancelling(compliance: Array, law: ForceLaw, depth: float | Array, wanted: float | Array = 0.0) -> Array:
-    """Compute the path x [m] that results in the ``wanted`` radius w [m], shape (m,); other arguments as for `turned`."""
+    """Compute the path x [m] for the ``wanted`` radius w [m], shape (m,); other arguments as for `turned`."""
     target = np.broadcast_to(wanted, compliance.shape)
     return np.asarray(target - compliance * law(depth - target))
 

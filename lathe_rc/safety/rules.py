@@ -223,7 +223,7 @@ def _add(error: Array, memory: Array) -> None:
 
 @inlined
 def _grown(memory: Array) -> bool:
-    """End a revolution and begin the next; return whether the error has grown often enough (memory as in `_growing`)."""
+    """End a revolution, begin the next; return whether the error has grown often enough (memory as in `_growing`)."""
     limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:7], memory[7:]
     rms = np.sqrt(np.sum(sums) / state[0])
     before = state[1]
