@@ -2,8 +2,8 @@
 """Form error of a run per revolution, computed chunk by chunk.
 
 A revolution begins with the first sample at or after its initial angle. The mean square is taken over the angle, not
-over time: each sample is weighted by the angle to the next one, so that slow parts of a revolution do not count more. An
-incomplete last revolution is left out, unless less than two samples are missing.
+over time: each sample is weighted by the angle to the next one, so that slow parts of a revolution do not count more.
+An incomplete last revolution is left out, unless less than two samples are missing.
 """
 
 from dataclasses import dataclass

@@ -95,7 +95,7 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
             f"hysteresis loop: the command does not go through its range of {(high - low) * stroke * 1e6:.4g} µm and "
             "back again; record one and a half loops or more"
         )
-    # A play turns over when the input turns by twice its threshold.
+    # A play reverses after the input has reversed by twice its threshold.
     idle = thresholds[2.0 * thresholds >= whole]
     if idle.size:
         raise InputError(

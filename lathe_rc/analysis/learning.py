@@ -43,7 +43,7 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
 
 @kernel
 def _near_peaks(waves: Array, size: Array) -> Array:
-    """Return waves around the highest peaks of ``size``, ends included; if it is not finite, only the first such wave."""
+    """Return waves around the highest peaks of ``size``, ends included; or only the first wave where it is infinite."""
     last = waves.size - 1
     heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order, by insertion
     for k in range(last + 1):

@@ -2,9 +2,9 @@
 """Verdict on a run by its form error: whether the part is in tolerance, and whether the form error grows.
 
 The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t to each side of the desired form. A
-revolution is in tolerance if its form error nowhere exceeds t; a run is in tolerance starting at the first revolution
-after which all are in tolerance. The margin is computed from its last revolutions, since the first one in tolerance has
-hardly any margin.
+revolution is in tolerance if its form error nowhere exceeds t; a run is in tolerance from the first revolution of the
+final sequence of revolutions in tolerance. The margin is computed from the last revolutions, since the first one in
+tolerance has hardly any margin.
 
 The form error is settled from the first to the last revolution in which it is at most twice its minimum. It grows if
 its final value exceeds twice the largest settled value after a rise over several revolutions. It diverges if the rise
@@ -33,7 +33,7 @@ class Verdict:
     Attributes:
         tolerance: allowed form error to each side [m].
         revolutions: number of complete revolutions judged.
-        since: first revolution, counted from 1, after which all are in tolerance; 0 if the last one is not.
+        since: first revolution, counted from 1, of the final sequence in tolerance; 0 if the last one is not.
         over: first and last revolution used for `largest`: at most the last `LAST` in tolerance, or only the last
             revolution if it is out of tolerance; (0, 0) without a revolution.
         largest: largest magnitude of the form error in these revolutions; NaN without a revolution [m].
@@ -118,7 +118,7 @@ def judge(largest: Array, tolerance: float, before: int = 0) -> Verdict:
     if not count:
         return Verdict(tolerance, 0, 0, (0, 0), np.nan)
     outside = np.flatnonzero(~(largest <= tolerance))  # NaN is not in tolerance
-    inside = int(outside[-1]) + 1 if outside.size else 0  # first revolution after which all are in tolerance
+    inside = int(outside[-1]) + 1 if outside.size else 0  # first of the final sequence in tolerance
     start = max(inside, count - LAST) if inside < count else count - 1
     since = inside + 1 + before if inside < count else 0
     return Verdict(tolerance, count, since, (start + 1 + before, count + before), float(largest[start:].max()))
@@ -137,7 +137,7 @@ def growth(largest: Array, before: int = 0) -> Growth | None:
     sizes = np.fmax(np.where(np.isfinite(largest), largest, _FACTOR * finite.max()), _NOTHING)
     near = np.flatnonzero(sizes <= _FACTOR * sizes.min())
     settled = sizes[near[0] : near[-1] + 1]
-    start = int(near[0] + np.flatnonzero(settled <= np.median(settled))[-1])  # last settled revolution at or below the median
+    start = int(near[0] + np.flatnonzero(settled <= np.median(settled))[-1])  # last at or below the median
     while start > near[0] and sizes[start - 1] < sizes[start]:
         start -= 1
     rise = sizes[start + 1 :]

@@ -5,9 +5,9 @@
     v1 = u1 - K1·u2,   v2 = u2 - K2·u1
 
 The longitudinal feed causes force through W1, the cross feed moves the tool by W2. The depth of cut causes force
-through W4, the force deflects tool and part by W3. K1 = W2·W4/W1 cancels the effect of u2 on the force, K2 = W1·W3/W2 that of
-u1 on the position. An inverse has more zeros than poles: one lag is added for each missing order. An integrator in K1
-or K2 would accumulate the error of an inexact model without limit: 1/p is replaced by 1/(p + leak).
+through W4, the force deflects tool and part by W3. K1 = W2·W4/W1 cancels the effect of u2 on the force, K2 = W1·W3/W2
+that of u1 on the position. An inverse has more zeros than poles: one lag is added for each missing order. An integrator
+in K1 or K2 would accumulate the error of an inexact model without limit: 1/p is replaced by 1/(p + leak).
 
 The paper uses mm, N and % of the full command; the channels here are in m, N and 1, converted once below.
 """

@@ -229,7 +229,7 @@ def advance(law: PeriodicLaw, state: PeriodicState, n: int, reference: float, me
     winding = (applied - demand) * v < 0.0
     frozen = values[_FROZEN] > 0.0
     if frozen:
-        stored = state.ring[(n - law.samples) % state.ring.size]  # unfiltered: repeated filtering would flatten the memory
+        stored = state.ring[(n - law.samples) % state.ring.size]  # unfiltered, since the filter would flatten it
     elif winding and law.anti_windup:
         stored = min(max(read, -law.limit), law.limit)
     else:
