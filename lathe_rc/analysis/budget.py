@@ -110,7 +110,7 @@ class Decomposition:
         self._needs = needs
 
     def acting(self, causes: Causes) -> Causes:
-        """Return those of ``causes`` that have an effect, because their required cause is among them."""
+        """Return the causes with an effect: causes whose required cause is also in ``causes``, or that need none."""
         return frozenset(cause for cause in causes if self._needs[cause] in ("", *causes))
 
     def _context(self, *causes: str) -> Causes:

@@ -262,7 +262,7 @@ def _polished(record: _Record, starts: list[Array], step: float) -> DriveFit:
 
 
 def _standard_errors(jacobian: Array, residual: Array, lengths: Array, sizes: Array, directions: Array) -> Array:
-    """Compute the standard errors, shape (3,): the larger for each of a white and of a correlated residual.
+    """Compute the standard errors, shape (3,): the larger value for a white and a correlated residual.
 
     White: σ²·(JᵀJ)⁻¹. Correlated within stretches of the record: (JᵀJ)⁻¹·(Σ g·gᵀ)·(JᵀJ)⁻¹ with g the sum of
     J·residual over a stretch; this is too low if the drive moves in a single stretch only, as after a step.

@@ -129,7 +129,7 @@ def read_csv(path: Path) -> Loop:
     """Read a loop from a CSV file with the columns ``command_um`` and ``displacement_um`` [µm], in order of time.
 
     Raises:
-        InputError: the file is missing or malformed, or contains a value that is not finite.
+        InputError: the file is missing or malformed, or contains a non-finite value.
     """
     _, rows = read_table(path, [_HEADER], "hysteresis loop")
     if not rows.size:

@@ -43,7 +43,10 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
 
 @kernel
 def _near_peaks(waves: Array, size: Array) -> Array:
-    """Return waves around the highest peaks of ``size``, ends included; or only the first wave where it is infinite."""
+    """Return a fine grid of waves around the highest peaks of ``size``, including peaks at the ends.
+
+    If ``size`` is not finite somewhere, only the first such wave is returned.
+    """
     last = waves.size - 1
     heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order, by insertion
     for k in range(last + 1):

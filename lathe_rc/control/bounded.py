@@ -115,7 +115,7 @@ class TakeoverTable(NamedTuple):
 
 @inlined
 def follows(takeover: TakeoverTable) -> bool:
-    """Whether the controller's command passes unchanged."""
+    """Return whether the controller's command passes unchanged."""
     return bool(takeover.whole[_MODE] == Mode.FOLLOW.value and takeover.whole[_PLACE] >= takeover.path.size)
 
 

@@ -189,7 +189,7 @@ def observed(
     position: float,
     learning: bool,  # noqa: FBT001 - kernels take their arguments by position
 ) -> float:
-    """Process the position measured ``late`` samples ago; return the observed disturbance beyond the memory's [m].
+    """Process the position measured ``late`` samples ago; return the observed disturbance less the learned one [m].
 
     Args:
         m: model of drive and disturbance.

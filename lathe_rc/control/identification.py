@@ -83,7 +83,7 @@ def add_products(sums: Array, place: int, velocity: float, acceleration: float, 
 
 @inlined
 def excited(vv: float, va: float, aa: float) -> bool:
-    """Whether dx/dt and d²x/dt² are linearly independent, from the sums of their squares and of their product.
+    """Return whether dx/dt and d²x/dt² are linearly independent, from the sums of their squares and of their product.
 
     The determinant is compared with that of orthogonal regressors: the two differ by orders of magnitude.
     """

@@ -66,7 +66,7 @@ def _reach(jerk: float, change: float) -> float:
 
 @kernel
 def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float) -> bool:
-    """Whether a velocity and an acceleration are within the limits, now and while the jerk reduces the latter to 0.
+    """Return whether a velocity and an acceleration keep the limits, now and while the jerk reduces the latter to 0.
 
     ``before`` is the acceleration of the previous sample.
     """
@@ -82,7 +82,7 @@ def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float
 
 @kernel
 def _can_stop(limits: CommandLimits, step: float, coming: float, v: float, a: float) -> bool:
-    """Whether a stop within the stroke remains possible after a sample with velocity ``v`` and acceleration ``a``."""
+    """Return whether a stop within the stroke is possible after a sample with velocity ``v``, acceleration ``a``."""
     if limits.stroke == np.inf:
         return True
     needs = abs(a) / limits.jerk

@@ -150,7 +150,7 @@ class RepetitiveController:
 
     @property
     def joined(self) -> bool:
-        """Whether the channel has begun to learn, once the error of a cycle was at most ``join_below``."""
+        """Whether the channel has joined: the error of a cycle was at most ``join_below``, and learning may begin."""
         return bool(self.table.whole[angle_memory.JOINED])
 
     @joined.setter

@@ -149,7 +149,7 @@ def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
     if delay == 0.0:
         return _link([1.0 / whole, -drive.d / whole], [1.0, drive.b0 / whole])
     b = drive.late(delay)
-    # (B(1)·z³ - B)/(z - 1): each coefficient is the sum of those down to it.
+    # (B(1)·z³ - B)/(z - 1): each coefficient is the cumulative sum of the dividend's coefficients.
     return _link([1.0, -drive.d, 0.0], np.cumsum(np.append(whole, -b))[:3])
 
 
@@ -206,7 +206,7 @@ def rest(link: Link) -> Array:
 
 @kernel
 def correct(link: LinkTable, state: Array, error: float) -> tuple[float, bool]:
-    """Compute the command of the next period, and whether it was limited.
+    """Compute the command of the next period; return it, and whether it was limited.
 
     The state stores the limited command, not the unlimited one.
     """

@@ -50,7 +50,7 @@ class Value:
     below: float = math.inf
 
     def takes(self, value: float) -> bool:
-        """Whether ``value`` is within the allowed range."""
+        """Return whether ``value`` is within the allowed range."""
         return abs(value) <= _LARGEST and (value > self.low if self.above else value >= self.low) and value < self.below
 
 
@@ -189,7 +189,7 @@ def _allowed(kind: Kind) -> str:
     return "each once: " + ", ".join(words) if words else "no values"
 
 
-# ---- what they do to samples --------------------------------------------------------------------------------
+# ---- effects on samples -------------------------------------------------------------------------------------
 
 
 class Disturbance:

@@ -42,7 +42,7 @@ class Port:
         return {f"{self.topic}.{name}" for name in fields}
 
     def takes(self, fault: Fault) -> bool:
-        """Whether the target of a fault is at this port."""
+        """Return whether the target of a fault is at this port."""
         return fault.target in self.targets(KINDS[fault.kind])
 
 

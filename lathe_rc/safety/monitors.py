@@ -21,7 +21,7 @@ _NOTHING = np.empty(0)
 
 @dataclass(frozen=True)
 class Alarm:
-    """Alarm of a monitor.
+    """Alarm raised by a monitor, with its sample and value.
 
     Attributes:
         place: index of the sample in the block.
@@ -99,7 +99,7 @@ def rate(limit: float, *, window: int, step: float, before: float) -> Rule:
 
 
 def index_pulses(limit: float) -> Rule:
-    """Create a rule for an angle that turns backwards or not by one revolution from index pulse to index pulse."""
+    """Create a rule for an angle that reverses, or does not turn by one revolution between two index pulses."""
     return Rule(INDEX, (limit, np.nan, np.nan, 0.0))
 
 
@@ -236,10 +236,10 @@ def _read_only(signal: Array) -> Array:
 
 
 class Clearance:
-    """Detector of the tool being out of the part.
+    """Detector of a tool that has left the part.
 
     Args:
-        beyond: measured position of the drive from which on the tool is out [m].
+        beyond: least measured position of the drive at which the tool is out [m].
         samples: number of consecutive samples required.
 
     Attributes:

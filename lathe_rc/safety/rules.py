@@ -25,7 +25,7 @@ _STRETCH = 256  # samples
 
 @inlined
 def _beyond(value: float, offset: float, low: float, high: float) -> bool:
-    """Whether a value is beyond its limits or NaN; symmetric limits, the common case, need one comparison."""
+    """Return whether a value is beyond its limits or NaN; symmetric limits, the common case, need one comparison."""
     value -= offset
     return not abs(value) <= high if low == -high else not low <= value <= high
 
@@ -55,7 +55,7 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 
 @inlined
 def _over(memory: Array) -> bool:
-    """Whether the initial alarm-free angle has been passed (memory as in `_lasting_beyond`)."""
+    """Return whether the initial alarm-free angle has been passed (memory as in `_lasting_beyond`)."""
     return bool(memory[5] == 0.0 or memory[6] == -np.inf)
 
 
@@ -160,7 +160,7 @@ def _next(pulse: Pulses, begin: int) -> int:
 
 @inlined
 def _off(since: float, limit: float) -> bool:
-    """Whether an angle since the last index pulse is negative or above one revolution, by more than the limit."""
+    """Return whether an angle since the index pulse is negative or above one revolution, by more than the limit."""
     return since > TURN + limit or since < -limit
 
 
