@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many cells at once, all through the same compiled program, on all cores.
+"""Batches of cells that run through the same compiled program, on all cores.
 
     piston = lathe_rc.load("piston")
     cells = (piston.varied({"learning_controller.learning_gain": gain}) for gain in (0.25, 0.5, 1.0))
     for outcome in lathe_rc.run_many(cells):
         print(outcome.kept.rms[-1])
 
-A cell gets the bits that it gets alone, though it shares with the one before what does not differ: see `CellRunner`.
-Nothing is kept of its signals but what is asked for, and cells are made when their turn comes, so that the memory that
-a batch takes does not depend on how many they are.
+Results are bit-identical to those of single runs, although consecutive cells share unchanged parts (`CellRunner`).
+Only the requested signals are kept, and each cell is created just before its run, so that the memory that
+a batch takes does not depend on the number of cells.
 """
 
 import os
@@ -41,10 +41,10 @@ class Keeper(Sink, Protocol[K_co]):
 
     @property
     def heard(self) -> Collection[str]:
-        """Relative topics that it takes, or single fields, ``TOPIC.FIELD``; nothing else is kept."""
+        """Relative topics, or single fields ``TOPIC.FIELD``, that the sink receives; no others are kept."""
 
     def kept(self) -> K_co:
-        """The kept result, at the end of the run."""
+        """Return the kept result at the end of the run."""
 
 
 Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so many samples
@@ -52,12 +52,12 @@ Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so 
 
 @dataclass(frozen=True)
 class Outcome(Generic[K_co]):
-    """The outcome of a cell.
+    """Outcome of the run of a cell.
 
     Attributes:
-        scenario: of the cell.
-        kept: what its keeper kept; None if it failed.
-        error: why it was refused or failed; None if it was not.
+        scenario: scenario of the cell.
+        kept: result of the cell's keeper; None if the cell failed.
+        error: reason for rejection or failure; None after success.
     """
 
     scenario: Scenario
@@ -84,17 +84,17 @@ def run_many(
 def run_many(
     scenarios: Iterable[Scenario], keep: Make[Any] | Sequence[str] | None = None, *, threads: int | None = None
 ) -> Iterator[Outcome[Any]]:
-    """Run cells to their ends.
+    """Run cells to completion, in parallel.
 
     Args:
-        scenarios: of the cells; each needs a number of revolutions. They are asked for as their turn comes; variations
-            of a `Scenario.named` are made in half the time.
-        keep: the part of a run that is kept: None: its form error by revolution; relative topics: these, whole; or a
-            function that makes a `Keeper` for a cell and a number of samples.
-        threads: that compute; None: one for each core.
+scenarios: scenarios of the cells, read lazily; each needs a number of revolutions. Variations
+            of a `Scenario.named` are created in half the time.
+        keep: the part of a run that is kept: None: form error by revolution; relative topics: all their samples; or a
+            factory of the `Keeper` for a cell and a number of samples.
+        threads: number of computing threads; None: one per core.
 
     Yields:
-        The outcomes, in the order of the scenarios. A cell that is refused, or that fails on the way, is one of them.
+        The outcomes, in the order of the scenarios, including those of rejected and failed cells.
 
     Example:
         >>> import lathe_rc
@@ -129,14 +129,14 @@ def run_many(
 
 
 class CellRunner:
-    """Runs cells one after the other. Those that are alike share what does not differ: engine, and stages."""
+    """Sequential runner of cells; cells that are alike share the engine and the unchanged stages."""
 
     def __init__(self) -> None:
         self._stages = StageCache()
         self._engine: Engine | None = None
 
     def cell(self, scenario: Scenario) -> Cell:
-        """Return the cell of a scenario; it is good until the next one is asked for.
+        """Return the cell of a scenario; it is valid until the next call.
 
         Raises:
             InputError: see `Cell`.
@@ -144,10 +144,10 @@ class CellRunner:
         return Cell(scenario.nodes, stage=self._stages.take)
 
     def run(self, cell: Cell, keeper: Keeper[K_co]) -> K_co:
-        """Run a cell that has passed its check to its end.
+        """Run a checked cell to completion.
 
         Raises:
-            LatheError: it cannot go on.
+            LatheError: the cell cannot continue.
         """
         if self._engine is None or not self._engine.begin(cell, keeper.heard):
             self._engine = Engine(cell, keeper.heard)
@@ -168,7 +168,7 @@ def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> O
 
 
 class Errors:
-    """Keeps the form error by revolution."""
+    """Keeper of the form error by revolution."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
         named = {source.type: topic for topic, source in reversed(cell.dense.items())}
@@ -178,22 +178,22 @@ class Errors:
         self._errors = RunningErrors()
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a piece of the run, as a sink of the engine."""
+        """Process a chunk of the run, as a sink of the engine."""
         if self._encoder and self._tool:
             self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
 
     def kept(self) -> FormErrors:
-        """Return the form error of each complete revolution; of none if the scenario has no tool."""
+        """Return the form error of each complete revolution; empty if the scenario has no tool."""
         return self._errors.found()
 
 
 class Topics(Collector):
-    """Keeps some topics whole.
+    """Keeper of complete topics.
 
     Args:
-        cell: that runs.
-        samples: of the run.
-        topics: relative names.
+        cell: the running cell.
+        samples: length of the run [sample].
+        topics: relative topic names.
 
     Raises:
         InputError: the cell has no such topic.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter tables: each parameter once, with type, default, range, unit and description.
 
-ROS descriptors, validation, help and the documentation are made from these tables.
+ROS descriptors, validation, help and the documentation are generated from these tables.
 """
 
 import copy
@@ -36,7 +36,7 @@ _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", st
 
 
 def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, drive: str = "") -> Any:
-    """A field of a table, with its unit; ``path`` marks a file, taken relative to the scenario's folder.
+    """Define a field of a parameter table; ``path`` marks a file name relative to the scenario's folder.
 
     ``drive`` marks what a controller takes for a quantity of the drive that it commands, by the name of the quantity in
     `NodeParameters.drive_models`: where a scenario does not give it, it is the drive's (`lathe_rc.cell.models`).
@@ -56,18 +56,18 @@ def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, dr
 
 
 class Row:
-    """One parameter as people and ROS see it.
+    """Row of a parameter listing, as shown to users and in ROS.
 
     Attributes:
-        name: of the parameter.
-        type: of the value, or of its elements.
+        name: parameter name.
+        type: type of the value, or of its elements.
         is_list: whether it is an array.
-        choices: allowed texts; empty where any will do.
-        is_file: whether it names a file or folder, a scenario's own or any.
-        named: what else may be named, classes of other packages; None: nothing.
+        choices: allowed strings; empty if unrestricted.
+        is_file: whether the value is a path, relative to the scenario or not.
+        named: kind of third-party classes that may be named as well; None: none.
         low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
         limits: the range in words, empty where there is none.
-        drive: quantity of the commanded drive that it stands for, see `parameter`; empty: none.
+        drive: quantity of the commanded drive that the parameter models, see `parameter`; empty: none.
     """
 
     def __init__(self, name: str, info: FieldInfo) -> None:
@@ -108,13 +108,13 @@ class Row:
         self.limits = " ".join(words)
 
     def element(self) -> "Row":
-        """The row of one element of a list."""
+        """Return the row of one element of a list parameter."""
         found = copy.copy(self)
         found.is_list = False
         return found
 
     def allowed(self) -> str:
-        """The values that the parameter accepts, in words."""
+        """Return the permitted values of the parameter in words."""
         what = f"one of {', '.join(self.choices)}" if self.choices else _NAMES[self.type]
         what = self.named.allowed() if self.named else what
         text = " ".join(filter(None, (what, self.limits)))
@@ -124,10 +124,10 @@ class Row:
 
 
 class Table(BaseModel):
-    """A set of parameters; immutable, refuses unknown names, wrong types and values out of range.
+    """Immutable parameter set that rejects unknown names, wrong types and values out of range.
 
     Attributes:
-        listing: the command that lists the parameters of a kind of node or a study; empty if there is none.
+        listing: command that lists the parameters of a kind of node or a study; empty if there is none.
     """
 
     listing: ClassVar[str] = ""
@@ -136,11 +136,11 @@ class Table(BaseModel):
 
     @classmethod
     def rows(cls) -> Mapping[str, Row]:
-        """The parameters by name."""
+        """Return the parameter rows by name."""
         return _rows(cls)
 
     def other_than_default(self, names: Collection[str]) -> str:
-        """Return those of some parameters that are not at their defaults, in words."""
+        """Return the non-default parameters among ``names``, in words."""
         told = []
         for row in self.rows().values():
             value = getattr(self, row.name)
@@ -152,10 +152,10 @@ class Table(BaseModel):
 
     @classmethod
     def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:
-        """Make the table from values by parameter name; those that are missing take their defaults.
+        """Build the table from values by parameter name; missing ones get their defaults.
 
         Raises:
-            InputError: one line for the first value that is refused; ``node`` is who it is for.
+            InputError: a value is invalid; one line for the first, with the name ``node``.
         """
         try:
             return cls(**values)
@@ -175,7 +175,7 @@ class Table(BaseModel):
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
     def changed(self: T, node: str, values: Mapping[str, object]) -> T:
-        """The same table with other values; raises as `read`."""
+        """Return a copy of the table with other values; raises as `read`."""
         kind = type(self)
         checks = kind.__pydantic_decorators__  # those of others' tables may look at all values at once
         if not (checks.field_validators or checks.model_validators):
@@ -192,7 +192,7 @@ class Table(BaseModel):
 
 @cache
 def _check(table: type[Table], name: str) -> Callable[[object], Any]:
-    """The check of a parameter's values, which returns the table's value; it raises ValidationError."""
+    """Return the validator of a parameter, which returns the converted value or raises ValidationError."""
     field = table.model_fields[name]
     annotated: Any = Annotated
     parts: tuple[Any, ...] = (field.annotation, *field.metadata)
@@ -204,9 +204,9 @@ def _check(table: type[Table], name: str) -> Callable[[object], Any]:
 
 @contextmanager
 def about(node: str, *names: str) -> Iterator[None]:
-    """Let refusals name the parameters that they are about: ``node.a, b: ...``; one that does stays as it is.
+    """Prefix errors with the names of the parameters at fault, as ``node.a, b: ...``, unless already prefixed.
 
-    Physics and control know nothing of parameters; the stage that makes them of a table does.
+    Physics and control code is independent of parameters; the stage that builds it from a table knows them.
     """
     try:
         yield
@@ -217,7 +217,7 @@ def about(node: str, *names: str) -> Iterator[None]:
 
 
 def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
-    """Whether one of the values names a class of another package."""
+    """Return whether one of the values names a third-party class."""
     rows = ((row.named, values.get(name, row.default)) for name, row in table.rows().items())
     return any(named and named.others(value) for named, value in rows)
 
@@ -228,7 +228,7 @@ def _rows(table: type[Table]) -> Mapping[str, Row]:
 
 
 class SharedParameters(Table):
-    """Parameters that all nodes of a cell must agree on; may stand under ``/**`` in a parameter file."""
+    """Parameters shared by all nodes of a cell, which may stand under ``/**`` in a parameter file."""
 
     sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
         64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
@@ -244,7 +244,7 @@ class SharedParameters(Table):
     run_id: str = parameter("", "identity of the run; every block carries it")
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse a sampling rate whose step is not a whole number of nanoseconds."""
+        """Reject a sampling rate whose step is not a whole number of nanoseconds."""
         if 1_000_000_000 % self.sample_rate:
             low = next(r for r in range(self.sample_rate, 0, -1) if 1_000_000_000 % r == 0)
             high = next(r for r in range(self.sample_rate, 1_000_000_001) if 1_000_000_000 % r == 0)
@@ -272,10 +272,10 @@ class SharedParameters(Table):
 
 
 class NodeParameters(SharedParameters):
-    """Parameters that every node has.
+    """Parameters common to all nodes.
 
     Attributes:
-        judging: parameters that change no sample and no message of a run, but what is said of it.
+        judging: parameters that affect only the assessment of a run, not its samples or messages.
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
@@ -297,7 +297,7 @@ class NodeParameters(SharedParameters):
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse a rule that replaces nothing."""
+        """Reject a remapping rule that replaces nothing."""
         super().model_post_init(context)
         for rule in self.remap:
             if not all(rule.partition(":=")):
@@ -305,15 +305,15 @@ class NodeParameters(SharedParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """Topic, before remapping, on which it commands the drive that its model is of; empty: it has no model."""
+        """Command topic, before remapping, of the drive that the node's model describes; empty without a model."""
         return ""
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Of a drive: what controllers may know of it, by command topic before remapping and by quantity."""
+        """Drive quantities available to controllers, by command topic before remapping and by quantity."""
         return {}
 
     def known(self) -> Mapping[str, Value]:
-        """The node's values that other nodes may use, by their parameter."""
+        """Values of the node that other nodes may use, by their parameter name."""
         return {}
 
 
@@ -334,7 +334,7 @@ class RestartParameters(NodeParameters):
 
 
 def remapped(table: NodeParameters, topic: str) -> str:
-    """The relative name of a topic after the node's ``remap`` rules."""
+    """Return the relative name of a topic after the node's ``remap`` rules."""
     for rule in table.remap:
         old, _, new = rule.partition(":=")
         if old == topic:
@@ -344,10 +344,10 @@ def remapped(table: NodeParameters, topic: str) -> str:
 
 @contextmanager
 def explain_overflow(tables: Mapping[str, NodeParameters]) -> Iterator[None]:
-    """Turn a failure of floating point into a refusal of the parameters that are far from their defaults.
+    """Convert a floating-point failure into an error that names the parameters far from their defaults.
 
     Args:
-        tables: of the nodes that are made or checked, by name.
+        tables: parameter tables of the nodes that are built or checked, by name.
 
     Raises:
         InputError: numbers became too large or too small, and a parameter is the cause.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program of a cell: the steps of its stages, in order, block after block, as one compiled loop.
+"""Program of a cell: the steps of its stages, in order, block after block, as one compiled loop.
 
-It comes back where Python is needed: a stage asks for it, an event is due, or a stage has no compiled step. It goes on
+The loop returns where Python is needed: a stage asks for it, an event is due, or a stage has no compiled step. It continues
 at that stage and sample.
 """
 
@@ -22,17 +22,17 @@ _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages h
 
 
 class Tapes:
-    """The samples of some topics, one piece after the other; of what is read late, those before the piece as well.
+    """Tapes: sample buffers of topics, filled chunk by chunk, with the past samples needed by delayed readers.
 
-    Before sample 0 everything is zero. What is handed on inside a chunk alone has room for a chunk, and stays in the
+Before sample 0 everything is zero. Fields used only within a chunk are buffered for one chunk, which stays in the
     cache.
 
     Args:
         topics: message type and, by field, the longest delay [sample] at which it is read, by relative topic.
-        samples: length of a piece, at most.
-        passing: fields, with their topics, of which nobody needs a sample after the chunk in which it was computed,
-            unless it is read late.
-        chunk: length of a chunk, at most.
+        samples: largest length of the buffered interval.
+        passing: fields, with their topics, whose samples are not needed after the chunk in which they were computed,
+            unless a reader has a delay.
+        chunk: largest length of a chunk.
     """
 
     def __init__(
@@ -65,9 +65,9 @@ class Tapes:
         Args:
             topic: relative name.
             first: sample index.
-            samples: how many.
-            delay: of the reader [sample].
-            names: of the fields; None: all.
+            samples: number of samples.
+            delay: delay of the reader [sample].
+            names: names of the fields; None: all.
         """
         start = self.history + first - self.begin - delay
         whole, passing = slice(start, start + samples), slice(samples)
@@ -77,13 +77,13 @@ class Tapes:
         }
 
     def place(self, topic: str, name: str, delay: int) -> tuple[int, int]:
-        """Where a reader with this delay finds a field: its first address, and by how much it moves with a sample."""
+        """Return the base address of a field for a reader with a delay, and the address increment per sample."""
         array = self._arrays[topic, name]
         # The address counts from the begin of the history; a field that passes stays where it is.
         return address(array) - delay * array.itemsize, 0 if (topic, name) in self._passing else array.itemsize
 
     def advance(self, first: int) -> None:
-        """Begin the next piece with sample ``first``."""
+        """Begin the next buffered interval at sample ``first``."""
         shift = first - self.begin
         for key, delay in self._delays.items():
             if delay:
@@ -93,7 +93,7 @@ class Tapes:
         self.begin = first
 
     def rewind(self) -> None:
-        """Begin again before sample 0."""
+        """Reset to the state before sample 0."""
         for array in self._arrays.values():
             array.fill(0)
         self.begin = 0
@@ -111,21 +111,21 @@ _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 def _run(
     plan: Integers, turn: Samples, fields: Integers, where: Integers, base: int, end: int, chunk: int, told: Integers
 ) -> int:
-    """Compute from `where` (block, stage, sample in the block) up to sample ``end``; see `Program`.
+    """Compute from `where` (block, stage, sample in the block) to sample ``end`` (see `Program`).
 
     Args:
         plan: see above; one row more ends it.
-        turn: spindle angle from which on each stage needs Python [rad].
+        turn: spindle angle from which each stage needs Python [rad].
         fields: of each the address of its first sample on the tape less the delay, by how much it moves with a sample,
             and the address of the block at hand, shape (3, fields); those of a stage are its `AddressTable`.
-        where: changed; where it has come to.
-        base: place of sample 0 on the tape.
+        where: current position; updated.
+        base: position of sample 0 on the tape.
         end: see above.
-        chunk: samples that a stage computes in one go.
-        told: numbers of the fields that have to be finite.
+        chunk: number of samples that a stage computes per call.
+        told: numbers of the fields that must be finite.
 
     Returns:
-        Why it stopped: `DONE` at the end, `NOT_FINITE` after the chunk in which a number is not.
+        Reason for stopping: `DONE` at the end, `NOT_FINITE` after a chunk with a NaN or infinite sample.
     """
     first, stage, start = where[0], where[1], where[2]
     origin, size, at = fields[0], fields[1], fields[2]
@@ -163,7 +163,7 @@ def _run(
 
 @kernel
 def _finite(samples: Samples) -> bool:
-    """Whether no sample is NaN or infinite."""
+    """Return whether no sample is NaN or infinite."""
     count = 0
     for k in range(samples.size):
         # Counted to the end: the compiler vectorises a loop only if it has no early exit.
@@ -173,7 +173,7 @@ def _finite(samples: Samples) -> bool:
 
 @kernel
 def _passes(angle: Samples, turn: float) -> bool:
-    """Whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; the search is that of NumPy."""
+    """Return whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; same search as NumPy's."""
     low, high = 0, angle.size
     while low < high:
         middle = low + ((high - low) >> 1)
@@ -185,23 +185,23 @@ def _passes(angle: Samples, turn: float) -> bool:
 
 
 def compile_loop() -> None:
-    """Compile the loop, which is the same for all programs."""
+    """Compile the loop, which is common to all programs."""
     none, fields, where = np.zeros((1, 5), np.int64), np.zeros((3, 0), np.int64), np.zeros(3, np.int64)
     assert _run(none, np.empty(0), fields, where, 0, 0, 1, _NOBODY) == DONE, "it has no stage, and nothing to compute"
 
 
 def chunk_of(block: int, delays: Iterable[int]) -> int:
-    """Samples that a stage computes in one go: whole blocks, no more than the shortest feedback; 0 is no feedback."""
+    """Return the chunk size [sample]: whole blocks, not above the shortest feedback delay; 0 means no feedback."""
     most = min([_CHUNK, *(delay for delay in delays if delay)])
     return most // block * block or block
 
 
 class Wired(NamedTuple):
-    """A stage and the tapes that it reads and writes.
+    """Stage with the tapes that it reads and writes.
 
     Attributes:
         stage: see above.
-        inputs: tape of each input, and the delay at which it is read [sample].
+        inputs: tape of each input, and its delay [sample].
         outputs: tape of each output.
     """
 
@@ -211,22 +211,23 @@ class Wired(NamedTuple):
 
 
 def wired(stage: Stage) -> Wired:
-    """A stage whose tapes are its topics."""
+    """Return a stage with tapes named after its topics."""
     inputs = [(remapped(stage.shared, port.topic), port.delay) for port in stage.inputs]
     return Wired(stage, inputs, [remapped(stage.shared, port.topic) for port in stage.outputs])
 
 
 class Program:
-    """Some stages that compute in one go.
+    """Program that computes several stages in one compiled loop.
 
     Args:
-        stages: in the order in which they compute; none may read what a later one writes without a delay.
-        tapes: that they read and write.
-        chunk: samples that a stage computes in one go: at most the shortest feedback between them.
+        stages: stages in order of computation; none may read the output of a later one without a delay.
+        tapes: tapes that the stages read and write.
+        chunk: samples that a stage computes per call: at most the shortest feedback delay between the stages.
 
     Attributes:
-        number: of the stage that could not go on, when `run` raises.
-        ends: sample up to which each stage has computed: after that, those before it may be a chunk ahead.
+        number: index of the failed stage, when `run` raises.
+        ends: sample up to which each stage has computed; after an error, the stages before the failed one may be
+            a chunk ahead.
     """
 
     def __init__(self, stages: Sequence[Wired], tapes: Tapes, chunk: int) -> None:
@@ -263,7 +264,7 @@ class Program:
         self.begin([each.stage for each in stages])
 
     def begin(self, stages: Sequence[Stage]) -> None:
-        """Begin at sample 0 with stages whose ports are those of the stages that it was made of."""
+        """Restart at sample 0 with other stages that have equal ports."""
         self._stages = stages
         self.number, self.ends = 0, [0] * len(stages)
         self._where[:] = 0
@@ -276,7 +277,7 @@ class Program:
         return *self._tapes.place(tape, name, delay), 0
 
     def _load(self, number: int) -> None:
-        """Take what a stage has in its memory now, and when it wants Python next."""
+        """Load the current memory of a stage, and the point at which it next needs Python."""
         stage, row = self._stages[number], self._plan[number]
         row[_STEP] = row[_WORDS] = 0
         if stage.is_compiled:
@@ -285,17 +286,17 @@ class Program:
         row[_DUE], self._turn[number] = stage.due
 
     def run(self, end: int, *, finite: bool = False) -> bool:
-        """Compute up to sample ``end``, which must lie within the piece of the tapes.
+        """Compute up to sample ``end``, which must lie within the buffered interval of the tapes.
 
         Args:
-            end: see above.
-            finite: stop after the chunk in which something is computed that is not.
+            end: index after the last sample.
+            finite: whether to stop after a chunk with a NaN or infinite sample.
 
         Returns:
-            Whether it has stopped there.
+            Whether the run was stopped for a NaN or infinite sample.
 
         Raises:
-            LatheError: a stage cannot go on; names it. What was computed before is on the tapes, see `reached`.
+            LatheError: a stage cannot continue; the message names it. Earlier results are on the tapes (`reached`).
         """
         self.number = 0
         try:
@@ -332,7 +333,7 @@ class Program:
         return int(self._where[0])
 
     def _serve(self, reason: int, first: int, number: int, reached: int, samples: int) -> None:
-        """Do in Python what a stage needs."""
+        """Handle in Python the reason for which a stage has stopped the loop."""
         stage, tapes = self._stages[number], self._tapes
         inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._inputs[number]]
         outputs = [tapes.view(tape, first, samples) for tape in self._outputs[number]]
@@ -349,13 +350,13 @@ class Program:
                 self._sparse[number] += stage.serve(reason, first, reached, inputs, outputs)
 
     def _tell(self, number: int, end: int) -> None:
-        """Collect what a stage has to say of what it has computed."""
+        """Collect the messages of a stage about the samples that it has computed."""
         if self._told[number] < end:
             self._sparse[number] += self._stages[number].tell(self._told[number], end)
             self._told[number] = end
 
     def said(self, number: int, end: int) -> list[Sparse]:
-        """The stage's events since the last call, of the samples before ``end``."""
+        """Return the stage's events since the last call, for the samples before ``end``."""
         said = self._sparse[number]
         if not said:
             return []

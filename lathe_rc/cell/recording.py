@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The signals of a whole run, from whatever host, and their digests."""
+"""Recording of all signals of a run, independent of the host, and its digests."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -28,17 +28,17 @@ _PIECE = 2**15  # samples that are hashed in one go
 
 @dataclass(frozen=True)
 class SparseTopic:
-    """Messages at chosen samples: time stamps [ns] and, by field, one value a message."""
+    """Messages at chosen samples: time stamps [ns] and, by field, one value per message."""
 
     stamps: list[int] = field(default_factory=list)
     values: dict[str, list[Any]] = field(default_factory=dict)
 
     def add(self, stamp: int, message: Any) -> None:
-        """Append a message."""
+        """Append a message with its time stamp."""
         self.append(stamp, {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS})
 
     def append(self, stamp: int, values: Mapping[str, Any]) -> None:
-        """Append the values of a message."""
+        """Append the values of a message with its time stamp."""
         self.stamps.append(stamp)
         for name, value in values.items():
             self.values.setdefault(name, []).append(value)
@@ -46,7 +46,7 @@ class SparseTopic:
 
 @dataclass(frozen=True, repr=False)
 class Recording:
-    """All signal topics of a run.
+    """Recording of all signal topics of a run.
 
     Attributes:
         types: message type by fully qualified topic.
@@ -74,12 +74,12 @@ class Recording:
     first: int = 0
 
     def __repr__(self) -> str:
-        """Return the content in a line."""
+        """Return a one-line summary of the content."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
         return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
 
     def _repr_html_(self) -> str:
-        """Its topics as a table, with their fields and units, for notebooks."""
+        """Return an HTML table of the topics with their fields and units, for notebooks."""
         rows = []
         for topic, kind in self.types.items():
             dense = topic in self.dense
@@ -89,12 +89,12 @@ class Recording:
         return html.table(("topic", "", "fields"), rows) + self.errors_picture()
 
     def errors_picture(self) -> str:
-        """The form error by revolution as a picture in HTML; empty without a revolution."""
+        """Return an HTML image of the form error by revolution; empty without a revolution."""
         return html.errors_picture(self.errors, self.turns_before if self.errors.rms.size else 0)
 
     @property
     def turns_before(self) -> int:
-        """Revolutions before the first that is complete, as of a snapshot; the recording has an encoder."""
+        """Number of revolutions before the first complete one, as in a snapshot; needs a recorded encoder."""
         return turns_before(self.of_type(messages.ENCODER)["angle_true"])
 
     @property
@@ -104,14 +104,14 @@ class Recording:
 
     @cached_property
     def errors(self) -> FormErrors:
-        """Form error of each complete revolution; of none if there is no tool."""
+        """Return the form error of each complete revolution; empty if there is no tool."""
         if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
             return form_errors(np.empty(0), np.empty(0))
         angle = self.of_type(messages.ENCODER)["angle_true"]
         return form_errors(angle, self.of_type(messages.TOOL)["error"], turns_before(angle))
 
     def frame(self, topic: str) -> Any:
-        """A topic as a table: a row a sample, or a message; of a message with lists, a row an element.
+        """Return a topic as a table with one row per sample or message; one row per element of messages with lists.
 
         The columns are those of `lathe_rc.bag.exporting.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
         fields of the message. With an encoder in the recording two come before the fields: ``revolution``, counted
@@ -154,7 +154,7 @@ class Recording:
         return frames.frame(name, table, rows)
 
     def plot(self, title: str = "", beside: "tuple[str, Recording] | None" = None) -> "Figure":
-        """Desired form, form error over angle, form error by revolution; see `lathe_rc.drawing.form.draw`.
+        """Plot desired form, form error over angle, form error by revolution (see `lathe_rc.drawing.form.draw`).
 
         Args:
             title: of the figure.
@@ -169,7 +169,7 @@ class Recording:
         return form.draw(self.turned_form(), title, other)
 
     def turned_form(self) -> "TurnedForm":
-        """The form of the part, for a figure.
+        """Return the turned form of the part, for a figure.
 
         Raises:
             InputError: there is no tool, or not one complete revolution.
@@ -190,21 +190,21 @@ class Recording:
         return TurnedForm(angle, tool["reference"], tool["error"], self.errors, self.turns_before)
 
     def messages(self, topic: str) -> list[Sparse]:
-        """The messages of a sparse topic, by its fully qualified name."""
+        """Return the messages of a sparse topic, by its fully qualified name."""
         found, kind = self.sparse[topic], self.types[topic]
         rows = [dict(zip(found.values, row, strict=True)) for row in zip(*found.values.values(), strict=True)]
         places = [(stamp - START_NS) // self.step_ns for stamp in found.stamps]
         return [Sparse(topic, kind, index, values) for index, values in zip(places, rows, strict=True)]
 
     def of_type(self, msgtype: str) -> Signals:
-        """The signals of the first topic of a block type."""
+        """Return the signals of the first topic of a block type."""
         return next(signals for topic, signals in self.dense.items() if self.types[topic] == msgtype)
 
     def digests(self) -> dict[str, str]:
-        """One digest for each signal topic, by topic.
+        """Return one digest for each signal topic, by topic.
 
         It is the SHA-256 of the SHA-256 of each field's samples in the order of the fields, little-endian; of sparse
-        topics the time stamps come first. Blocks leave no trace in it.
+        topics the time stamps come first. The digest does not depend on the block size.
         """
         digester = Digester()
         for topic, signals in self.dense.items():
@@ -213,9 +213,9 @@ class Recording:
 
 
 class Digester:
-    """Digests of a run whose signals come in pieces; see `Recording.digests`.
+    """Digests of a run whose signals arrive in chunks (see `Recording.digests`).
 
-    A thread makes them: it needs no interpreter for it, so the caller computes on.
+    A thread computes them without holding the interpreter lock, in parallel with the caller.
     """
 
     def __init__(self) -> None:
@@ -223,14 +223,14 @@ class Digester:
         self._thread = ThreadPoolExecutor(1)
 
     def dense(self, topic: str, signals: Signals) -> None:
-        """Take the next samples of a dense topic, arrays of shape (n,) by field; they are copied."""
+        """Append the next samples of a dense topic, arrays of shape (n,) by field; they are copied."""
         found = self._topics.get(topic)
         if found is None:
             found = self._topics[topic] = _Topic(signals, self._thread)
         found.add(signals)
 
     def result(self, sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
-        """One digest for each topic, the sparse ones whole."""
+        """Return one digest for each topic; sparse topics are passed complete."""
         found = {topic: part.digests() for topic, part in self._topics.items()}
         for topic, part in sparse.items():
             arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
@@ -242,8 +242,8 @@ class _Topic:
     """Digests of the fields of a dense topic.
 
     Args:
-        signals: some of its samples.
-        thread: makes them.
+        signals: first samples of the topic.
+        thread: executor that computes the digests.
     """
 
     def __init__(self, signals: Signals, thread: ThreadPoolExecutor) -> None:
@@ -256,7 +256,7 @@ class _Topic:
         self._at_work: Future[None] | None = None
 
     def add(self, signals: Signals) -> None:
-        """Take the next samples."""
+        """Append the next samples."""
         arrays = list(signals.values())
         start, size = 0, arrays[0].size
         while start < size:
@@ -286,7 +286,7 @@ class _Topic:
             made.update(piece[:size].data)
 
     def digests(self) -> list[bytes]:
-        """Return the digest of each field, to the last sample."""
+        """Return the digest of each field, including the last sample."""
         self._hand_over()
         self._wait()
         return [made.digest() for made in self._hashes]
@@ -297,7 +297,7 @@ def _bytes(samples: Samples) -> memoryview:
 
 
 def _flat(values: Sequence[Any]) -> Samples:
-    """One array of a field's values: numbers end to end, texts as their bytes with an end mark."""
+    """Concatenate the values of a field into one array; strings become their bytes with an end mark."""
     parts = []
     for value in values:
         for item in value if isinstance(value, list) else [value]:

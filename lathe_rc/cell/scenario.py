@@ -28,19 +28,19 @@ from lathe_rc.names import instead
 
 
 class _Tables(Mapping[str, type[NodeParameters]]):
-    """The table of each kind of node, also of those that other packages offer; see `lathe_rc.extensions.Registry`."""
+    """Parameter tables by kind of node, including third-party kinds (see `lathe_rc.extensions.Registry`)."""
 
     @property
     def own(self) -> list[str]:
-        """The kinds that are ours."""
+        """Return the built-in kinds."""
         return [*STAGES.own, RECORDER]
 
     def allowed(self) -> str:
-        """The kinds, in words."""
+        """Return the list of kinds in words."""
         return in_words(self)
 
     def instead(self, kind: str) -> str:
-        """The kinds that look like one that there is not, or all of them, in words."""
+        """Return the kinds similar to an unknown one, or all of them, in words."""
         return f"{instead(kind, self)} (others: PACKAGE.MODULE:CLASS)"
 
     def __iter__(self) -> Iterator[str]:
@@ -66,7 +66,7 @@ _HOST_PARAMETERS = {
 
 
 def kind_of(node: str, stage: object) -> str:
-    """The kind of a node: its ``stage`` parameter, or its name.
+    """Return the kind of a node: its ``stage`` parameter, or its name.
 
     Raises:
         InputError: there is no such stage.
@@ -78,7 +78,7 @@ def kind_of(node: str, stage: object) -> str:
 
 
 class _Text(str):
-    """A text that is written in quotes: without them rcl takes 1e-3 for a number and y for true, PyYAML does not."""
+    """String written in quotes: without them rcl reads 1e-3 as a number and y as true, unlike PyYAML."""
 
     __slots__ = ()
 
@@ -87,7 +87,7 @@ _TEXT = "tag:yaml.org,2002:str"
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
-    """Writes what rcl reads back as the same value."""
+    """YAML dumper whose output rcl reads back as the same values."""
 
 
 _Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(_TEXT, str(text), style='"'))
@@ -101,12 +101,12 @@ def _quoted(value: Value) -> object:
 
 @dataclass(frozen=True, repr=False)
 class Scenario:
-    """A cell, described; `load` and `varied` have examples.
+    """Description of a cell; see `load` and `varied` for examples.
 
     Attributes:
         name: the file's name without its ending.
         nodes: the table of each node by its name, in the order of the file.
-        fingerprints: of the tables, as far as they are known; what the run id is made of.
+        fingerprints: hashes of the tables by node, as far as computed; the run id is derived from them.
     """
 
     name: str
@@ -114,11 +114,11 @@ class Scenario:
     fingerprints: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
-        """Its name and nodes, in a line."""
+        """Return the scenario name and its nodes in one line."""
         return f"<Scenario {self.name}: {', '.join(self.nodes)}>"
 
     def _repr_html_(self) -> str:
-        """Its nodes and what is set in them, as a table, for notebooks."""
+        """Return an HTML table of the nodes and their non-default parameters, for notebooks."""
         shared = SharedParameters.model_fields
         rows = [("all nodes", "", self.shared.other_than_default(shared))] if self.nodes else []
         for node, table in self.nodes.items():
@@ -128,25 +128,25 @@ class Scenario:
 
     @property
     def shared(self) -> SharedParameters:
-        """The parameters that all nodes agree on."""
+        """Parameters shared by all nodes."""
         return next(iter(self.nodes.values()))
 
     def kind(self, node: str) -> str:
-        """The kind of a node."""
+        """Return the kind of a node."""
         return kind_of(node, self.nodes[node].stage)
 
     def of_kind(self, kind: str) -> list[str]:
-        """Names of the nodes of a kind."""
+        """Return the names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
 
     @property
     def masters(self) -> list[str]:
-        """Names of the nodes that give the cell its time: one, in a cell that can work."""
+        """Names of the time masters; exactly one in a valid cell."""
         return [name for name in self.nodes if self.kind(name) in MASTERS]
 
     @property
     def recorder(self) -> tuple[str, RecorderParameters]:
-        """Name and table of its recorder; what a recorder is by itself if it has none."""
+        """Return the name and table of the recorder; default values if the scenario has none."""
         for name, table in self.nodes.items():
             if isinstance(table, RecorderParameters):
                 return name, table
@@ -154,14 +154,15 @@ class Scenario:
         return RECORDER, RecorderParameters(**shared)
 
     def processes(self, groups: Iterable[Iterable[str]] | None = None, what: str = "processes") -> list[list[str]]:
-        """Names of the nodes in each process.
+        """Return the names of the nodes in each process.
 
         Args:
-            groups: nodes that share one; None: those of the spindle's ``processes``. The others have one each.
-            what: names them, for messages.
+            groups: nodes that share a process; None: the groups in the time master's ``processes``. Every other
+                node has a process of its own.
+            what: name of the groups in error messages.
 
         Raises:
-            InputError: a node that there is not, or one that is named twice.
+            InputError: a node does not exist, or is listed twice.
         """
         if groups is None:
             named = [(node, text) for node, table in self.nodes.items() for text in getattr(table, "processes", [])]
@@ -179,23 +180,23 @@ class Scenario:
 
     @property
     def identity(self) -> str:
-        """A hash of all that changes a run: its nodes and their parameters, and what the files hold that they name."""
+        """Return a hash of everything that affects a run: nodes, parameters, and contents of referenced files."""
         missing = {node: table for node, table in self.nodes.items() if node not in self.fingerprints}
         return _hash({**self.fingerprints, **{node: _fingerprint(table) for node, table in missing.items()}})
 
     @cached_property
     def _has_own_run_id(self) -> bool:
-        """Whether its run id is made of its content; otherwise somebody has given it."""
+        """Return whether the run id is derived from the content instead of being set explicitly."""
         return self.shared.run_id == _identity(self.fingerprints)
 
     def parameter(self, target: str) -> Row:
-        """The row of a parameter in its node's table.
+        """Return the row of a parameter in the table of its node.
 
         Args:
             target: ``NODE.PARAM``, or ``PARAM`` for a shared parameter, with ``[K]`` for an element of a list.
 
         Raises:
-            InputError: there is none.
+            InputError: there is no such parameter.
         """
         kinds = {node: self.kind(node) for node in self.nodes}
         whole, element = _element(target)
@@ -210,14 +211,14 @@ class Scenario:
         return rows[name].element()
 
     def value(self, target: str) -> Value:
-        """The value of a parameter; see `parameter`."""
+        """Return the value of a parameter (``target`` as in `parameter`)."""
         whole, element = _element(target)
         node, _, name = whole.rpartition(".")
         found = getattr(self.nodes[node] if node else self.shared, name)
         return cast("Value", found if element is None else found[element])
 
     def named(self) -> "Scenario":
-        """The same cell, whose variations keep its run id."""
+        """Return the same cell with a fixed run id, which its variations keep."""
         return self.varied({"run_id": f"{self.shared.run_id} varied"})
 
     def with_models_given(self) -> "Scenario":
@@ -226,7 +227,7 @@ class Scenario:
         return Scenario(self.name, tables, self.fingerprints)
 
     def varied(self, values: Mapping[str, Value]) -> "Scenario":
-        """The same cell with other values, without reading its file again.
+        """Return the same cell with other parameter values, without reading its file again.
 
         Args:
             values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter; ``NODE.PARAM[K]`` is element K of a list.
@@ -274,10 +275,11 @@ class Scenario:
         return _agreed(self.name, tables, fingerprints, _identity(fingerprints))
 
     def to_yaml(self, *, given: bool = False) -> str:
-        """The complete parameter file; empty lists are left out, since rcl cannot read them.
+        """Return the complete parameter file; empty lists are left out, since rcl cannot read them.
 
         Args:
-            given: what was given alone; read again, the rest takes its defaults, and models follow their drives.
+            given: write only values set explicitly; on reading, the others get their defaults and models follow
+                their drives.
         """
         tree = {}
         # One that is made of the content would be wrong as soon as a reader changes a value.
@@ -290,16 +292,16 @@ class Scenario:
 
 
 def _element(target: str) -> tuple[str, int | None]:
-    """A target without ``[K]``, and K."""
+    """Split a target into the part before ``[K]``, and K."""
     match = _ELEMENT.fullmatch(target.strip())
     return (match[1], int(match[2])) if match else (target, None)
 
 
 def _with_element(target: str, values: object, element: int, value: Value) -> Value:
-    """A list with one element replaced.
+    """Return a list with one element replaced.
 
     Raises:
-        InputError: it has no such element.
+        InputError: the list has no such element.
     """
     if not isinstance(values, list) or element >= len(values):
         has = f"a list of {len(values)}" if isinstance(values, list) else "no list"
@@ -308,12 +310,12 @@ def _with_element(target: str, values: object, element: int, value: Value) -> Va
 
 
 def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
-    """Node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
+    """Return node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
 
     Args:
-        text: that names them.
-        kinds: of the nodes, by name.
-        what: is said in messages.
+        text: target to be split.
+        kinds: kinds of the nodes, by name.
+        what: name of the target in error messages.
 
     Raises:
         InputError: there is no such node, or the parameter is not shared.
@@ -332,7 +334,7 @@ def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
 
 
 def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
-    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``; returns node and parameter."""
+    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``; return node and parameter."""
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
@@ -350,7 +352,7 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
 
 
 def _of_user(kind: str, name: str, value: Value, folder: Path) -> Value:
-    """A value that the user gives: a path relative to ``folder`` made absolute, the code that it names allowed."""
+    """Convert a user-supplied value: make a path relative to ``folder`` absolute, allow the code that it names."""
     row = TABLES[kind].rows().get(name)
     if name == "stage" or (row is not None and row.named is not None):
         for each in value if isinstance(value, list) else [value]:
@@ -366,7 +368,7 @@ def read(
     copies: Mapping[str, Path] | None = None,
     stages: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, dict[str, Value]]:
-    """The values of a parameter file by node and name, with absolute paths. One that lies in a bag is data.
+    """Read the values of a parameter file by node and name, with absolute paths.
 
     Args:
         path: of the file.
@@ -408,7 +410,7 @@ WRITTEN = ("memory_file", "restart_file")  #: parameters whose files a run may m
 
 
 def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, Path] | None) -> Path:
-    """The file that stands for one that data names: its copy, a new one where a run makes it, or itself, resolved."""
+    """Return the file for a path named in untrusted data: its copy, a new one made by a run, or the file itself."""
     if copies is not None and parameter in copies:
         return copies[parameter].resolve()
     if copies is not None and parameter.rpartition(".")[2] in WRITTEN:
@@ -417,7 +419,7 @@ def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, P
 
 
 def content(path: Path) -> str:
-    """A hash of a file's content; its name if it is none, longer than any reader takes, or cannot be read."""
+    """Return a hash of a file's content, or of its name if missing, unreadable, or above the size limit."""
     try:
         return hashlib.sha256(files.contents(path)).hexdigest()
     except OSError:
@@ -425,7 +427,7 @@ def content(path: Path) -> str:
 
 
 def _fingerprint(table: NodeParameters) -> str:
-    """A hash of what a table says of a run; empty if that changes none."""
+    """Return a hash of the parameters of a table that affect a run; empty if there are none."""
     if isinstance(table, RecorderParameters):
         return ""
     values = table.model_dump(exclude=_HOST_PARAMETERS | table.judging)
@@ -436,7 +438,7 @@ def _fingerprint(table: NodeParameters) -> str:
 
 
 def _identity(fingerprints: Mapping[str, str]) -> str:
-    """A run id that names the scenario's content: two runs of it give the same messages."""
+    """Return a run id derived from the scenario's content, so that two runs of it produce the same messages."""
     return _hash(fingerprints)[:16]
 
 
@@ -446,10 +448,10 @@ def _hash(fingerprints: Mapping[str, str]) -> str:
 
 
 def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str], run_id: str) -> Scenario:
-    """The scenario of some tables, with a run id.
+    """Build the scenario from parameter tables and a run id.
 
     Raises:
-        InputError: the nodes do not agree on what they share.
+        InputError: the nodes have different values of a shared parameter.
     """
     agreed = next(iter(tables.values()))
     for node, table in tables.items():
@@ -473,7 +475,7 @@ def load(
     complete: bool = False,
     copies: Mapping[str, Path] | None = None,
 ) -> Scenario:
-    """Read a scenario.
+    """Read a scenario from a file, or by its name.
 
     Args:
         path: ROS 2 parameter file, or the name of a scenario that comes with lathe_rc, such as ``piston``.

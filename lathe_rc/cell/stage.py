@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages: what turns input blocks number k into output blocks number k.
+"""Stages: computation of output block k from input block k.
 
 A stage's output depends on its parameters, its state and its declared inputs alone; the length of the blocks
-changes no bit. Hosts (the offline engine, a ROS node) feed it in order and know nothing of what it does.
+does not change the results. Hosts (the offline engine, a ROS node) feed it in order, independently of its kind.
 
 Most stages compute by a step, which a program of many stages can call if it is compiled (`lathe_rc.cell.program`):
 
@@ -56,7 +56,7 @@ class Input:
 
 
 class Joint(NamedTuple):
-    """Which fields of an output make a decimated sensor_msgs/JointState."""
+    """Selection of the fields of an output that form a decimated sensor_msgs/JointState."""
 
     position: str
     velocity: str | None = None
@@ -65,7 +65,7 @@ class Joint(NamedTuple):
 
 @dataclass(frozen=True)
 class Output:
-    """A topic on which a stage publishes one block for each block."""
+    """Output port of a stage: a topic with one block per input block."""
 
     topic: str
     type: str
@@ -74,7 +74,7 @@ class Output:
 
 @dataclass(slots=True)
 class Sparse:
-    """A message that comes at a chosen sample, not one a block."""
+    """Message at a chosen sample, instead of one per block."""
 
     topic: str
     type: str
@@ -92,7 +92,7 @@ _NO_FLAGS = np.empty(0, np.uint8)  # stands for the flags of a step without any,
 
 
 class WiredCell(Protocol):
-    """The cell around a stage as its check sees it, see `lathe_rc.cell.wiring.Cell`."""
+    """Interface of a wired cell as seen by the checks of a stage (see `lathe_rc.cell.wiring.Cell`)."""
 
     stages: dict[str, "Stage"]
     unknown: Mapping[str, Any]
@@ -102,40 +102,40 @@ class WiredCell(Protocol):
 
     @property
     def master(self) -> Any:
-        """Time master, see `lathe_rc.cell.stages.time_master.TimeMaster`."""
+        """Time master of the cell (see `lathe_rc.cell.stages.time_master.TimeMaster`)."""
 
     @property
     def speed_range(self) -> tuple[float, float]:
-        """Lowest and highest speed of its spindle in the run [rad/s]."""
+        """Lowest and highest spindle speed in the run [rad/s]."""
 
     def node_of(self, topic: str) -> str | None:
-        """Name of the member that publishes a topic of blocks; None: there is none."""
+        """Return the name of the member that publishes a block topic; None if there is no such member."""
 
     def publisher(self, topic: str, question: str) -> "Stage | None":
-        """Stage that publishes a topic; None if it is not known here: then the question stays open."""
+        """Return the stage that publishes a topic; None for an unknown member, which leaves the question open."""
 
     def reader_names(self, topic: str) -> set[str]:
-        """Names of the members that read a topic."""
+        """Return the names of the members that read a topic."""
 
     def leave_open(self, question: str, name: str) -> None:
-        """Note a question that depends on the parameters of an unknown member."""
+        """Record a question that depends on the parameters of an unknown member."""
 
 
 class Stage(ABC):
-    """Base of all stages.
+    """Base class of all stages.
 
     Args:
-        name: of the node, without namespace.
-        parameters: its table.
+name: node name without namespace.
+
 
     Attributes:
         inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
-        unheard: those of them that nobody reads; their messages need not be made.
-        foreign: type of each topic that its node hears from outside the cell, by name before remapping.
-        tells: events come about by themselves that only `process` knows of.
-        own_inputs: number of inputs that `process` gets; one more may tell the spindle angle to the events.
-        step: compiled, or in Python; None: the stage has its own `process`.
+        unheard: sparse topics without a reader; their messages need not be made.
+        foreign: type of each topic that the node receives from outside the cell, by name before remapping.
+        tells: whether the stage generates events by itself, known only to `process`.
+        own_inputs: number of inputs of `process`; one more may provide the spindle angle for the events.
+        step: step function, compiled or in Python; None if the stage overrides `process`.
 
     Example:
         >>> import numpy as np
@@ -194,14 +194,14 @@ class Stage(ABC):
         self._remarks: list[str] = []  # events that came of the one that is carried out
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the doubts about its parameters, one line each, for a run of so many seconds; inf: without end."""
+        """Return the warnings about the parameters, one line each, for a run of ``seconds``; inf for an endless run."""
         return []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse what cannot work in a wired cell, before anything moves; stages with checks of their own call this.
+        """Check the stage in its wired cell before the start; overriding methods call this one.
 
         Args:
-            cell: its ``warnings``, ``unchecked`` and ``factors`` get what is found.
+            cell: wired cell; its ``warnings``, ``unchecked`` and ``factors`` receive the results.
             cures: see `lathe_rc.cell.wiring.Cell.check`.
 
         Raises:
@@ -215,15 +215,15 @@ class Stage(ABC):
                 )
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:
-        """Set the ports; to be called once, at the end of the constructor.
+        """Set the ports; call once, at the end of the constructor.
 
         Args:
-            inputs: in the order of `process`.
-            outputs: the same.
-            tells: events come about by themselves, even if none can be asked for.
+            inputs: input ports in the order of the arguments of `process`.
+            outputs: output ports in the same order.
+            tells: whether the stage generates events by itself, even if none can be requested.
 
         Raises:
-            InputError: an event or fault that cannot be.
+            InputError: an event or fault is invalid.
         """
         self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
         # An event by revolutions needs the angle, even where the step does not: one more input, which it never sees.
@@ -253,14 +253,14 @@ class Stage(ABC):
 
     @property
     def takes_events(self) -> bool:
-        """Whether there are events for it."""
+        """Return whether the stage can receive events."""
         return bool(self.actions) or self.shared.allow_faults
 
     def check_action(self, action: str) -> None:
-        """Refuse an event that cannot be carried out.
+        """Check that an event can be carried out.
 
         Raises:
-            InputError: the stage does not know it, or lacks what it needs.
+            InputError: the event is unknown to the stage, or a prerequisite is missing.
         """
         verb, _, rest = action.partition(" ")
         if verb == events.FAULT:
@@ -288,7 +288,7 @@ class Stage(ABC):
         self._injection.check(fault)
 
     def schedule(self, action: str, index: int) -> None:
-        """Let an event take effect at sample ``index``, which the host has not issued yet.
+        """Schedule an event at sample ``index``, which the host has not issued yet.
 
         Raises:
             InputError: the stage cannot carry it out.
@@ -297,27 +297,27 @@ class Stage(ABC):
         self._scheduled.append((index, action))
 
     def replay(self, action: str, index: int) -> None:
-        """Let an event of a recording take effect again, at its sample; what comes about by itself will do so."""
+        """Schedule a recorded event at its original sample; events that the stage generates itself are skipped."""
         if action.partition(":")[0] not in (*self.announces, events.NOTHING_TO_REPAIR):
             self.schedule(action, index)
 
     @property
     def waiting(self) -> list[str]:
-        """Events that have not taken effect; at the end of a run they never will. That a fault lasts is none."""
+        """Return the events that have not taken effect yet, without the ends of faults."""
         triggers = [trigger.text for trigger in self._triggers if not trigger.ends]
         return triggers + [f"sample {index}: {action}" for index, action in self._scheduled]
 
     def lose(self, index: int) -> None:
-        """Go to its safe state at sample ``index``, which the host has not issued yet: members of the cell are lost."""
+        """Schedule the transition to the safe state at sample ``index``, not issued yet, after a loss of members."""
         self._scheduled.append((index, events.SAFE))
 
     def _scheduled_actions(self, action: str) -> bool:
-        """Whether the scenario lists an event with this action."""
+        """Return whether the scenario lists an event with this action."""
         return any(trigger.action == action for trigger in self._triggers)
 
     @property
     def angle_input(self) -> int | None:
-        """Which input has the measured spindle angle, if the stage reads it."""
+        """Return the index of the input with the measured spindle angle, if the stage reads it."""
         for place, port in enumerate(self.inputs):
             if port.type == messages.ENCODER and port.delay == 0 and "angle" in port.fields:
                 return place
@@ -325,7 +325,7 @@ class Stage(ABC):
 
     @property
     def due(self) -> tuple[int, float]:
-        """Sample and spindle angle [rad] from which on a step alone does not do: `compute` takes the block."""
+        """Return the sample and spindle angle [rad] from which a block needs `compute` instead of the step alone."""
         if self._injection and self._injection.any:
             return 0, 0.0
         if not self._triggers and not self._scheduled:
@@ -338,7 +338,7 @@ class Stage(ABC):
         return min(samples, default=NEVER), min(turns, default=np.inf)
 
     def _due(self, first: int, samples: int, inputs: Sequence[Signals]) -> list[tuple[int, str]]:
-        """Take the events that fall into a block, by sample index; equal indices keep the order of scheduling."""
+        """Remove and return the events that fall into a block, ordered by sample, then by scheduling."""
         waiting = []
         for trigger in self._triggers:
             if trigger.kind != "revolution":
@@ -362,16 +362,16 @@ class Stage(ABC):
         """Compute one block.
 
         Args:
-            first: index of its first sample.
+
             inputs: arrays of shape (n,) by field, in the order of the ports.
-            outputs: the same, to be filled.
-            last: whether the run ends with it.
+            outputs: output arrays in the same layout, to be filled.
+            last: whether the run ends with this block.
 
         Returns:
             The sparse messages of the block, by sample index.
 
         Raises:
-            LatheError: it cannot go on; names it.
+            LatheError: the stage cannot continue; the message names it.
         """
         with self.named():
             sparse = self.compute(first, inputs, outputs)
@@ -379,11 +379,11 @@ class Stage(ABC):
         return self.conclude(first, end, sparse, outputs, last=last)
 
     def named(self) -> AbstractContextManager[None]:
-        """Let errors name the node."""
+        """Return a context manager that adds the node name to errors."""
         return _Named(self.name)
 
     def compute(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """Compute a block, with its events and faults; see `advance`."""
+        """Compute a block with its events and faults (see `advance`)."""
         if self._triggers or self._scheduled or (self._injection and self._injection.any):
             return self._compute_with_events(first, inputs, outputs)
         own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
@@ -392,14 +392,14 @@ class Stage(ABC):
     def conclude(
         self, first: int, end: int, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool = False
     ) -> list[Sparse]:
-        """The sparse messages of the samples from ``first`` on and before ``end``, by sample.
+        """Return the sparse messages of samples ``first`` to ``end`` (exclusive), ordered by sample.
 
         Args:
-            first: see above.
-            end: see above.
-            sparse: those of `compute`.
-            outputs: of these samples; a stage whose joint states nobody reads needs none.
-            last: whether the run ends with them.
+            first: index of the first sample.
+            end: index after the last sample.
+            sparse: messages returned by `compute`.
+            outputs: output arrays of these samples; not needed by a stage without readers of its joint states.
+            last: whether the run ends with these samples.
         """
         if last:
             # Not in place: the list is the caller's.
@@ -412,7 +412,7 @@ class Stage(ABC):
         return sparse
 
     def _compute_with_events(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """Compute a block in pieces, from event to event."""
+        """Compute a block in segments between events."""
         samples = next(iter(outputs[0].values())).size
         sparse: list[Sparse] = []
         start = 0
@@ -440,7 +440,7 @@ class Stage(ABC):
         return sparse
 
     def act(self, action: str, index: int) -> None:
-        """Carry out an event at sample ``index``, the next one."""
+        """Carry out an event at sample ``index``, which is the next one."""
         verb, _, rest = action.partition(" ")
         if verb == events.SAFE:
             self.go_safe()
@@ -461,22 +461,22 @@ class Stage(ABC):
             self.perform(action)
 
     def go_safe(self) -> None:  # noqa: B027 - most stages move nothing, and go on as they are
-        """Members of the cell are lost: do what can be done alone."""
+        """Go to the safe state after a loss of cell members."""
 
     def damage(self, fault: Fault) -> None:
-        """Suffer a fault of one of its ``devices``.
+        """Apply a fault to one of the ``devices`` of the stage.
 
-        Stages with ``devices`` have their own; a fault of another's device never gets here, see `_check_fault`.
+        Stages with ``devices`` override this; other faults are rejected earlier by `_check_fault`.
         """
         raise NotImplementedError(fault.text)
 
     def mend(self, fault: Fault | None) -> bool:
-        """Be as before a fault, or before all; whether there was one. Stages with ``devices`` have their own."""
+        """End a fault, or all faults; return whether there was one. Stages with ``devices`` override this."""
         raise NotImplementedError(fault)
 
     @property
     def tells_joints(self) -> bool:
-        """Whether it has joint states that somebody reads."""
+        """Return whether the stage publishes joint states that have a reader."""
         return bool(self._joints) and f"{self.name}/joint_states" not in self.unheard
 
     def _joint_states(self, first: int, joint: Joint, signals: Signals) -> list[Sparse]:
@@ -495,30 +495,30 @@ class Stage(ABC):
         return found
 
     def perform(self, action: str) -> None:
-        """Carry out an event; the samples from now on feel it.
+        """Carry out an event, effective from the next sample.
 
-        Stages with ``actions`` have their own; the others' events never get here, see `check_action`.
+        Stages with ``actions`` override this; other events are rejected earlier by `check_action`.
         """
         raise NotImplementedError(action)
 
     def finish(self, index: int) -> list[Sparse]:
-        """The remaining events when the run ends with sample ``index``."""
+        """Return the remaining events of a run that ends with sample ``index``."""
         return []
 
     # ---- the compiled step ----------------------------------------------------------------------------
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """The memory of the step, a NamedTuple of arrays and constants; another one may be given after each stop."""
+        """Memory of the step: a NamedTuple of arrays and constants, which may be replaced after each stop."""
         return ()
 
     @property
     def is_compiled(self) -> bool:
-        """Whether a program can call the step."""
+        """Return whether a program can call the step."""
         return is_compiled(self.step)
 
     def _advance(self, first: int, start: int, fields: Sequence[Any], samples: int) -> Reached:
-        """Call the step for the arrays of all fields, shape (samples,)."""
+        """Call the step with the arrays of all fields, each of shape (samples,)."""
         assert self.step is not None, "a stage without a step has its own `process`"
         if self.is_compiled:
             return self.native()(first, start, fields, samples)
@@ -529,12 +529,12 @@ class Stage(ABC):
 
     @property
     def field_types(self) -> tuple[list[np.dtype[Any]], list[np.dtype[Any]]]:
-        """Element types of the arrays that the step gets: of all fields of its own inputs, and of its outputs."""
+        """Return the element types of the step's arrays: all fields of its own inputs, and of its outputs."""
         read = [messages.sample_fields(p.type)[n] for p in self.inputs[: self.own_inputs] for n in p.fields]
         return read, [kind for port in self.outputs for kind in messages.sample_fields(port.type).values()]
 
     def native(self) -> CompiledStep:
-        """The step with the memory as it is now, as a function of addresses."""
+        """Return the step with its current memory as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
             # Numba's own refusal of a memory says nothing that the author of a stage could use.
@@ -548,31 +548,31 @@ class Stage(ABC):
 
     @property
     def room(self) -> Samples:
-        """For the step alone, shape (rooms, MAX_BLOCK): to make an array takes as long as some of its samples."""
+        """Scratch memory of the step, shape (rooms, MAX_BLOCK), allocated once because allocation is slow."""
         if self._room is None:
             self._room = np.empty((self.rooms, messages.MAX_BLOCK))
         return self._room
 
     def take_room(self, other: "Stage") -> None:
-        """Take the room of a stage that does not run any more, if it has as much."""
+        """Take over the scratch memory of a stage that no longer runs, if it is of the same size."""
         if other.rooms == self.rooms:
             self._room = other.room
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without addresses and scratch arrays."""
+        """Return the pickled state, without addresses and scratch arrays."""
         return {**self.__dict__, "_native": None, "_room": None}
 
     def prepare(self, first: int, samples: int) -> None:
-        """Have ready, in the arrays of the memory, what a step cannot make for the samples ``first`` on: the noise."""
+        """Prepare the noise of the samples from ``first`` in the memory, as the step cannot generate it."""
         for sensor in self._sensors:
             sensor.draw(samples)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Do what the step has stopped for at sample ``reached`` of the block; it goes on from there.
+        """Handle the reason for which the step has stopped at sample ``reached`` of the block.
 
-        Stages whose steps stop have their own.
+        The step continues from there. Stages whose steps stop override this.
 
         Raises:
             LatheError: the stage cannot go on.
@@ -580,11 +580,11 @@ class Stage(ABC):
         raise NotImplementedError(reason)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """The messages about the samples from ``first`` on and before ``end``, which the step has computed last."""
+        """Return the messages for samples ``first`` to ``end`` (exclusive), which the step has computed last."""
         return []
 
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
-        """Compute samples ``first`` on without events and faults, by the step; see `advance`."""
+        """Compute the samples from ``first`` by the step, without events and faults (see `advance`)."""
         samples = next(iter(outputs[0].values())).size
         # Tables of noise and clipped samples, and the room of a step, hold so many samples.
         if samples > messages.MAX_BLOCK:
@@ -606,7 +606,7 @@ class Stage(ABC):
 
 
 class _Named(AbstractContextManager[None]):
-    """Lets errors name the node; a generator takes three times as long, some 70 times a run."""
+    """Context manager that adds the node name to errors; 3 times as fast as a generator, used 70 times per run."""
 
     def __init__(self, node: str) -> None:
         self._node = node
@@ -617,12 +617,12 @@ class _Named(AbstractContextManager[None]):
 
 
 def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
-    """Samples from ``start`` on and before ``stop`` of a block, as views."""
+    """Return views of samples ``start`` to ``stop`` (exclusive) of a block."""
     return [{name: samples[start:stop] for name, samples in part.items()} for part in signals]
 
 
 def compile_kernels(stage: Stage) -> None:
-    """Compile what the stage runs: the first block then takes no longer than the next."""
+    """Compile the kernels of a stage in advance, so that the first block takes no longer than the next."""
     if stage.shared.allow_faults:
         faults.prepare()
     if stage.is_compiled:

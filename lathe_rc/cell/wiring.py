@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wired cell: stages in the order in which they compute, topics by name, and the checks before a start.
+"""Wired cell: stages in order of computation, topics by name, and the checks before a start.
 
-What only stages of one kind need is refused by their `lathe_rc.cell.stage.Stage.check_cell`.
+Requirements of a single kind of stage are checked by its `lathe_rc.cell.stage.Stage.check_cell`.
 """
 
 import math
@@ -21,7 +21,7 @@ from lathe_rc.errors import InputError, UnpublishedError
 
 @dataclass(frozen=True)
 class Source:
-    """The node that publishes a topic."""
+    """Node that publishes a topic."""
 
     node: str
     type: str
@@ -29,12 +29,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A member whose stage or parameters nobody here knows: of it counts what it announces of its topics.
+    """Member with unknown stage or parameters, described only by the topics that it announces.
 
     Attributes:
-        dense: message type by relative topic, of those that carry a block a block.
-        sparse: the same of those that carry messages at chosen samples.
-        reads: relative topics.
+        dense: message type by relative topic, of the topics with one block per block.
+        sparse: message type by relative topic, of the topics with messages at chosen samples.
+        reads: relative topics that the member reads.
     """
 
     dense: Mapping[str, str]
@@ -43,13 +43,13 @@ class Unknown:
 
 
 class Ports(NamedTuple):
-    """The ports of a stage; topics are relative names after remapping.
+    """Ports of a stage, with relative topic names after remapping.
 
     Attributes:
-        node: its name.
-        inputs: that it reads, with their topics.
-        own: how many of them its step gets.
-        outputs: that it publishes, the same way.
+        node: name of the stage's node.
+        inputs: input ports with their topics.
+        own: number of inputs passed to the step.
+        outputs: output ports with their topics.
         sparse: topics and types of messages at chosen samples.
     """
 
@@ -73,11 +73,11 @@ def _ports(stage: Stage) -> Ports:
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """Publishers and order of the stages; the same one for all cells whose ports are alike.
+    """Publishers and order of the stages, shared by all cells with equal ports.
 
     Attributes:
         dense, sparse: see `Cell`.
-        order: of the stages.
+        order: indices of the stages in order of computation.
     """
 
     dense: dict[str, Source]
@@ -86,7 +86,7 @@ class Wiring:
 
 
 def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
-    """Wire some stages and members; raises as `Cell` does."""
+    """Wire stages and unknown members; raise as `Cell` does."""
     dense, sparse = _sources(stages, unknown)
     # All nodes first, so that those that do not depend on one another keep the order of the scenario.
     order: TopologicalSorter[str] = TopologicalSorter({stage.node: () for stage in stages})
@@ -102,7 +102,7 @@ def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
 
 
 def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
-    """The publishers of dense and sparse topics."""
+    """Return the publishers of dense and sparse topics."""
     dense: dict[str, Source] = {}
     sparse: dict[str, Source] = {}
 
@@ -130,7 +130,7 @@ def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
 
 
 def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> Source:
-    """The publisher of a topic that a node reads."""
+    """Return the publisher of a topic that a node reads."""
     source = dense.get(topic)
     if source is None:
         raise UnpublishedError(
@@ -143,17 +143,17 @@ def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> 
 
 
 def new_stage(name: str, table: NodeParameters) -> Stage:
-    """The stage of a node."""
+    """Create the stage of a node."""
     return STAGES[kind_of(name, table.stage)](name, table)
 
 
 class Cell:
-    """All stages of a scenario, wired.
+    """Cell with all stages of a scenario, wired.
 
     Args:
-        nodes: table of each node by name; nodes that are no stages are left out.
-        unknown: members that nobody here knows more of than their topics, by name.
-        stage: gives the stage of a name and table.
+        nodes: table of each node by name; nodes other than stages are ignored.
+        unknown: members known only by their topics, by name.
+        stage: factory of the stage for a name and table.
 
     Attributes:
         unknown: see above.
@@ -190,32 +190,32 @@ class Cell:
         self.stages = {name: made[name] for name in self.wiring.order}
 
     def publisher(self, topic: str, question: str) -> Stage | None:
-        """The stage that publishes a topic; None if nobody here knows it: then the question stays open."""
+        """Return the stage that publishes a topic; None for an unknown member, which leaves the question open."""
         name = self.dense[topic].node
         if name in self.unknown:
             self.leave_open(question, name)
         return self.stages.get(name)
 
     def node_of(self, topic: str) -> str | None:
-        """Name of the member that publishes a topic of blocks; None: there is none."""
+        """Return the name of the member that publishes a block topic; None if there is no such member."""
         return self.dense[topic].node if topic in self.dense else None
 
     def leave_open(self, question: str, name: str) -> None:
-        """Note what a check cannot tell, since it depends on the parameters of an unknown member."""
+        """Record a check that is not possible because it depends on the parameters of an unknown member."""
         self.unchecked.append(f"the parameters of {name} are not known here: {question}")
 
     def replace(self, stage: Stage) -> None:
-        """Put a stage in the place of the one of its name, whose ports it has."""
+        """Replace the stage of the same name, which has equal ports."""
         self.stages[stage.name] = stage
         # The cached master may be the stage that was there before.
         self.__dict__.pop("master", None)
 
     @cached_property
     def master(self) -> TimeMaster:
-        """The time master.
+        """Return the time master.
 
         Raises:
-            InputError: there is none, or more than one.
+            InputError: there is no time master, or more than one.
         """
         found = [stage for stage in self.stages.values() if isinstance(stage, TimeMaster)]
         if len(found) != 1:
@@ -224,15 +224,15 @@ class Cell:
 
     @cached_property
     def speed_range(self) -> tuple[float, float]:
-        """Lowest and highest speed of the spindle in the run [rad/s]; looked for once, among many samples."""
+        """Lowest and highest speed of the spindle in the run [rad/s], computed once because it needs many samples."""
         return self.master.speed_range()
 
     @property
     def samples(self) -> int:
-        """Length of a run.
+        """Return the length of a run [sample].
 
         Raises:
-            InputError: it has no end, or nobody knows it before, or there is no time master.
+            InputError: the run is endless, its length is unknown in advance, or there is no time master.
         """
         expected = self.expected_samples
         if self.master.samples is None:
@@ -244,10 +244,10 @@ class Cell:
 
     @property
     def expected_samples(self) -> int:
-        """Length of a run, as far as it can be known before.
+        """Return the expected length of a run [sample].
 
         Raises:
-            InputError: it has no end, or there is no time master.
+            InputError: the run is endless, or there is no time master.
         """
         expected = self.master.expected_samples
         if expected is None:
@@ -255,7 +255,7 @@ class Cell:
         return expected
 
     def readers(self, topic: str) -> list[Stage]:
-        """Stages that read a relative topic."""
+        """Return the stages that read a relative topic."""
         return [
             stage
             for stage in self.stages.values()
@@ -263,12 +263,12 @@ class Cell:
         ]
 
     def reader_names(self, topic: str) -> set[str]:
-        """Names of the members that read a relative topic, unknown ones as well."""
+        """Return the names of the members that read a relative topic, including unknown members."""
         known = {stage.name for stage in self.readers(topic)}
         return known | {name for name, member in self.unknown.items() if topic in member.reads}
 
     def inputs(self, topic: str) -> list[Input]:
-        """Ports that read a relative topic."""
+        """Return the ports that read a relative topic."""
         return [
             port
             for stage in self.stages.values()
@@ -283,7 +283,7 @@ class Cell:
         return min(delays, default=None)
 
     def check(self, *, cures: bool = True) -> None:
-        """Refuse what cannot work, with the figures, before anything moves; `unchecked` says what was left out.
+        """Check the cell before a start and report violations with figures; `unchecked` lists the omitted checks.
 
         Args:
             cures: look for parameters with which learning would converge, which takes half a second at most.
@@ -303,6 +303,6 @@ class Cell:
 
     @property
     def margins(self) -> dict[str, float | None]:
-        """Stability margin of each learning controller, 1 less its factor of a cycle; None if that is not known."""
+        """Return the stability margin of each learning controller, 1 less its factor of a cycle; None if unknown."""
         learners = (name for name, stage in self.stages.items() if stage.learns)
         return {name: 1.0 - self.factors[name] if name in self.factors else None for name in learners}
