@@ -37,7 +37,7 @@ _AHEAD = 2  # cells that are made for each thread before the first of them has b
 
 
 class Keeper(Sink, Protocol[K_co]):
-    """A sink that keeps of a run what is asked for; the cell's stages run again in the next one."""
+    """Sink that keeps the requested part of a run; the cell's stages run again in the next one."""
 
     @property
     def heard(self) -> Collection[str]:
@@ -87,7 +87,7 @@ def run_many(
     """Run cells to completion, in parallel.
 
     Args:
-scenarios: scenarios of the cells, read lazily; each needs a number of revolutions. Variations
+        scenarios: scenarios of the cells, read lazily; each needs a number of revolutions. Variations
             of a `Scenario.named` are created in half the time.
         keep: the part of a run that is kept: None: form error by revolution; relative topics: all their samples; or a
             factory of the `Keeper` for a cell and a number of samples.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a scenario's form error: its runs with causes switched off, offline and as a batch."""
+"""Error budget of a scenario: contributions to its form error, from runs with causes switched off."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -63,11 +63,11 @@ _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodePa
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause that may be switched off.
+    """Cause of form error that can be switched off.
 
     Attributes:
-        off: the values that do it, by NODE.PARAM.
-        needs: cause without which it does nothing; empty: none.
+        off: parameter values that switch it off, by NODE.PARAM.
+        needs: cause without which it has no effect; empty: none.
     """
 
     off: Mapping[str, Value]
@@ -76,12 +76,12 @@ class Cause:
 
 @dataclass(frozen=True)
 class _Tail:
-    """The last revolutions of a run.
+    """Last revolutions of a run.
 
     Attributes:
-        whole: complete revolutions of the run.
+        whole: number of complete revolutions of the run.
         error: form error over even angles [m], shape (revolutions, points).
-        height: of the tool along the part [m], shape (samples,).
+        height: height of the tool along the part [m], shape (samples,).
     """
 
     whole: int
@@ -90,7 +90,7 @@ class _Tail:
 
 
 class _Keep:
-    """Keeps the last revolutions of a run; see `lathe_rc.cell.batch.Keeper`."""
+    """Keeper of the last revolutions of a run (see `lathe_rc.cell.batch.Keeper`)."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
         named = {source.type: topic for topic, source in reversed(cell.dense.items())}
@@ -102,7 +102,7 @@ class _Keep:
         self._kept = {name: np.empty(samples) for name in self._fields}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a piece of the run, as a sink of the engine."""
+        """Process a chunk of the run, as a sink of the engine."""
         for name, (topic, of) in self._fields.items():
             self._kept[name][first : first + samples] = dense[topic][of]
 
@@ -125,7 +125,7 @@ def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value
 
 
 def _simple(scenario: Scenario) -> dict[str, Cause]:
-    """Return the causes that values of parameters switch off."""
+    """Return the causes that parameter values switch off."""
     return {
         name: Cause(
             {
@@ -163,7 +163,7 @@ def _speed(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
-    """A form that changes along the part: off, the tool stays at the middle of the heights that are reported."""
+    """Return the cause of a form that changes along the part; off, the tool stays at the middle reported height."""
     forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
     off: dict[str, Value] = {}
     for node, table in forms.items():
@@ -184,7 +184,7 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
-    """The part that Q forgets: off, each Q is 1 as far as its channel converges with it."""
+    """Return the cause of a Q below 1; off, each Q is 1 as far as its channel converges with it."""
     off: dict[str, Value] = {}
     low, high = cell.speed_range
     for stage in cell.stages.values():
@@ -200,10 +200,10 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
 
 
 def changing(nodes: Mapping[str, Mapping[str, Value]]) -> list[str]:
-    """Name the causes in a scenario's values that make one revolution differ from the next, but for speed and cut.
+    """Return the names of the causes that make revolutions differ from each other, except for speed and cut.
 
     Args:
-        nodes: all values by node and parameter, none of them checked; empty lists may be left out.
+        nodes: all values by node and parameter, unchecked; empty lists may be omitted.
     """
     found = [
         name
@@ -224,11 +224,11 @@ def changing(nodes: Mapping[str, Mapping[str, Value]]) -> list[str]:
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
-    """The causes that may be switched off in a scenario.
+    """Return the causes that can be switched off in a scenario.
 
     Args:
-        scenario: that can work.
-        height: of the tool along the part in the revolutions that are reported [m].
+        scenario: a valid scenario.
+        height: height of the tool along the part in the reported revolutions [m].
 
     Returns:
         The causes, each after the one that it needs; and those that cannot be switched off, with the reason.
@@ -256,7 +256,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
 
 
 def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Scenario:
-    """The scenario with some causes alone; what needs one that is off need not be switched off."""
+    """Return the scenario with only some causes active; causes that need an inactive one stay unchanged."""
     off: dict[str, Value] = {}
     for name, cause in found.items():
         if name not in acting and (not cause.needs or cause.needs in acting):
@@ -265,7 +265,7 @@ def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Sce
 
 
 def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, Samples]:
-    """Return the form errors of the runs, if all are of the same revolutions."""
+    """Return the form errors of the runs, provided that all cover the same revolutions."""
     if len({tail.whole for tail in runs.values()}) > 1:
         (master,) = scenario.masters
         raise InputError(
@@ -278,18 +278,18 @@ def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, 
 def budget(
     scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
 ) -> Budget:
-    """Return the parts of a scenario's form error, in its last ten revolutions; see `lathe_rc.analysis.budget`.
+    """Return the error budget of a scenario in its last ten revolutions (see `lathe_rc.analysis.budget`).
 
-    It runs offline, as a batch, with one cause after the other switched off: some ten runs, or some thirty if causes
+    The scenario runs offline, as a batch, with one cause after the other switched off: about 10 runs, or 30 if causes
     act together.
 
     Args:
-        scenario: of the whole; its spindle must have a number of revolutions.
-        threads: that compute; None: one for each core.
-        watch: called after each run with how many there have been and how many there will be, as far as is known.
+        scenario: scenario with all causes; its spindle must have a number of revolutions.
+        threads: number of computing threads; None: one per core.
+        watch: called after each run with the number of completed runs and the known total.
 
     Raises:
-        InputError: the scenario cannot work, has no tool, or turns no complete revolution.
+        InputError: the scenario is invalid, has no tool, or no complete revolution.
         LatheError: a run failed.
 
     Example:

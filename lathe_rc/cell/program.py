@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Program of a cell: the steps of its stages, in order, block after block, as one compiled loop.
 
-The loop returns where Python is needed: a stage asks for it, an event is due, or a stage has no compiled step. It continues
+The loop returns where Python is needed (request of a stage, event due, no compiled step), and later continues
 at that stage and sample.
 """
 
@@ -24,7 +24,7 @@ _CHUNK = 1024  # samples that a stage computes in one go, at most: what stages h
 class Tapes:
     """Tapes: sample buffers of topics, filled chunk by chunk, with the past samples needed by delayed readers.
 
-Before sample 0 everything is zero. Fields used only within a chunk are buffered for one chunk, which stays in the
+    Before sample 0 everything is zero. Fields used only within a chunk are buffered for one chunk, which stays in the
     cache.
 
     Args:
@@ -60,7 +60,7 @@ Before sample 0 everything is zero. Fields used only within a chunk are buffered
     def view(
         self, topic: str, first: int, samples: int, delay: int = 0, names: Collection[str] | None = None
     ) -> Signals:
-        """Views of what a reader with this delay sees at the samples ``first`` on; what passes is seen of one chunk.
+        """Return views of samples starting at ``first`` for a delayed reader; ``passing`` fields for one chunk only.
 
         Args:
             topic: relative name.

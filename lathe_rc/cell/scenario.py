@@ -222,7 +222,7 @@ class Scenario:
         return self.varied({"run_id": f"{self.shared.run_id} varied"})
 
     def with_models_given(self) -> "Scenario":
-        """The same cell, whose controllers keep their models of the drives when the drives are varied."""
+        """Return the same cell with fixed drive models in the controllers, kept when the drives are varied."""
         tables = {node: models.given(table) for node, table in self.nodes.items()}
         return Scenario(self.name, tables, self.fingerprints)
 

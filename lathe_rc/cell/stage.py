@@ -125,7 +125,7 @@ class Stage(ABC):
     """Base class of all stages.
 
     Args:
-name: node name without namespace.
+        name: node name without namespace.
 
 
     Attributes:

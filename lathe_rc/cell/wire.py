@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks as CDR bytes, at the rate that a cell needs.
+"""CDR encoding and decoding of blocks, at the rate that a cell needs.
 
 rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, are the same bytes but for a
 few numbers and the samples. So for each length of block one message is encoded by rosbags, the places of the
 numbers are found by changing them, and from then on only those places are written or read. Whatever
-does not match the layout is decoded by rosbags and learned anew: CDR itself is nowhere written by hand. CDR leaves open
-what stands in the padding, in which byte order, and how the encapsulation is padded, and whoever publishes may name a
-frame: such a block is encoded anew by rosbags, 10 to 50 µs, and read like ours.
+does not match the layout is decoded by rosbags and analysed again; no CDR code is hand-written. CDR leaves open
+padding content, byte order, and padding of the encapsulation, and a publisher may set a
+frame: such a block is re-encoded by rosbags, 10 to 50 µs, and then read like our own.
 """
 
 import struct
@@ -32,7 +32,7 @@ _Numbers = tuple[int, int, int, int, bool, int]
 
 
 def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: _Numbers, fill: int = 0) -> bytes:
-    """A block encoded by rosbags."""
+    """Return a block encoded by rosbags."""
     types = messages.store().types
     stamp = types["builtin_interfaces/msg/Time"](*numbers[:2])
     info = types[f"{messages.PACKAGE}/msg/BlockInfo"](run_id, source, *numbers[2:])
@@ -44,14 +44,14 @@ def _message(msgtype: str, run_id: str, source: str, samples: int, numbers: _Num
 
 
 class Layout:
-    """Where everything stands in the blocks of one type, length and source.
+    """Byte layout of the blocks of one type, length and source.
 
     Attributes:
         run_id, source, samples: see `Block`.
-        template: a message with all its numbers and samples 0.
-        stamp, info: places of the stamp and of the numbers of a BlockInfo.
-        fields: element type and place of the samples by name.
-        constant: begin, end and content of what is the same in every block.
+        template: a message with all numbers and samples 0.
+        stamp, info: offsets of the stamp and of the numbers of a BlockInfo.
+        fields: element type and offset of the samples by name.
+        constant: start, end and content of the constant bytes.
     """
 
     def __init__(self, msgtype: str, run_id: str, source: str, samples: int) -> None:
@@ -81,12 +81,12 @@ class Layout:
 
     @cached_property
     def same(self) -> Samples:
-        """Places of the bytes that are the same in every block."""
+        """Positions of the bytes that are constant across blocks."""
         return np.concatenate([np.arange(begin, end) for begin, end, _ in self.constant])
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """The message as a numpy type, not aligned: `NUMBERS`, and by name the fields with all their samples."""
+        """Unaligned numpy type of the message: `NUMBERS`, and by name the fields with all their samples."""
         info = [self.info + place for place in (0, 8, 12, 16)]
         fields = [(dtype, (self.samples,)) for dtype, _ in self.fields.values()]
         return np.dtype(
@@ -99,7 +99,7 @@ class Layout:
         )
 
     def fits(self, data: bytes) -> bool:
-        """Whether a message has this layout."""
+        """Return whether a message has this layout."""
         if len(data) != len(self.template):
             return False
         for a, b, text in self.constant:  # noqa: SIM110 - a generator costs more than the comparisons
@@ -109,7 +109,7 @@ class Layout:
 
 
 class _Scratch:
-    """A message of one length in memory, to be changed from block to block."""
+    """Reusable buffer for messages of one length."""
 
     def __init__(self, layout: Layout) -> None:
         memory = np.empty(len(layout.template) + _SHIFT, np.uint8)
@@ -121,7 +121,7 @@ class _Scratch:
         }
 
     def message(self, log_ns: int, first: int, step_ns: int, *, last: bool, companions: int) -> bytes:
-        """The whole, once the samples have been set."""
+        """Return the complete message, after the samples have been set."""
         data = self._message.data
         _STAMP.pack_into(data, self._layout.stamp, *divmod(log_ns, _BILLION))
         _INFO.pack_into(data, self._layout.info, first, step_ns, last, companions)
@@ -129,7 +129,7 @@ class _Scratch:
 
 
 class Encoder:
-    """Makes the blocks of one topic.
+    """Encoder of the blocks of one topic.
 
     Args:
         msgtype: message type.
@@ -143,7 +143,7 @@ class Encoder:
         self._scratches: dict[int, _Scratch] = {}
 
     def prepare(self, samples: int) -> None:
-        """Learn the layout for a length ahead of its first block."""
+        """Determine the layout for a length ahead of its first block."""
         self._scratch(samples)
 
     def _scratch(self, samples: int) -> _Scratch:
@@ -153,19 +153,19 @@ class Encoder:
         return scratch
 
     def block(self, first: int, signals: Signals, whole: Samples | None, *, last: bool, companions: int) -> Block:
-        """A block as readers find it who need no bytes; it holds the arrays themselves, see `Pool`."""
+        """Return a block for readers in the same process, without encoding; it holds the arrays themselves (`Pool`)."""
         samples = next(iter(signals.values())).size
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         run_id, source, step_ns = self._run_id, self._source, self._step_ns
         return Block(run_id, source, first, step_ns, last, companions, samples, log_ns, signals, whole)
 
     def encode(self, first: int, signals: Signals, *, last: bool, companions: int) -> tuple[int, bytes]:
-        """The message of a block.
+        """Encode a block as a message.
 
         Args:
             first: index of its first sample.
             signals: its samples, arrays of shape (n,) by field.
-            last: the run ends with it.
+            last: whether the run ends with this block.
             companions: see BlockInfo.msg.
 
         Returns:
@@ -180,19 +180,19 @@ class Encoder:
 
 
 class NoBlockError(ValueError):
-    """Bytes that are no block: nobody can say from whom."""
+    """Error for bytes that are not a block, so that the sender is unknown."""
 
 
 class Decoder:
-    """Reads the blocks of one topic.
+    """Decoder of the blocks of one topic.
 
     Args:
         msgtype: message type.
-        fields: those whose samples are wanted; default: all.
-        admit: called with run and source of a block unlike the one before, ahead of all else; may raise.
+        fields: requested fields; default: all.
+        admit: called first with run and source of a block unlike the previous one; may raise.
 
     Attributes:
-        message: the block that was decoded last, as `Encoder` encodes it; what came, unless that was encoded otherwise.
+        message: last decoded block, as `Encoder` encodes it; the received bytes unless these were encoded differently.
     """
 
     def __init__(
@@ -208,11 +208,11 @@ class Decoder:
         messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
 
     def decode(self, data: bytes) -> Block:
-        """A block from its bytes.
+        """Decode a block.
 
         Raises:
-            NoBlockError: it is none.
-            ValueError: the arrays of the block have different lengths, or it has none.
+            NoBlockError: the bytes are not a block.
+            ValueError: the arrays of the block are empty or differ in length.
         """
         layout = self._layout
         if layout is None or not layout.fits(data):
@@ -235,11 +235,11 @@ class Decoder:
         )
 
     def decode_all(self, whole: bytes, places: Samples) -> Iterator[Block]:
-        """Blocks from their bytes, those that follow one another joined to one: a fraction of the time that each takes.
+        """Decode several blocks, joining consecutive ones, in a fraction of the time of single calls.
 
         Args:
-            whole: the bytes of all, and maybe others.
-            places: begin and end of each block, shape (blocks, 2).
+            whole: bytes that contain all blocks, possibly among others.
+            places: start and end of each block, shape (blocks, 2).
 
         Raises:
             ValueError: see `decode`.
@@ -264,7 +264,7 @@ class Decoder:
             start += count
 
     def _following(self, records: Samples, first: Block) -> int:
-        """How many of the records, from the first on, are blocks that follow one another."""
+        """Return how many records, starting at the first, are consecutive blocks."""
         assert self._layout is not None, "that has been learned"
         constant = records.view(np.uint8).reshape(records.size, -1)[:, self._layout.same]
         fits = (constant == constant[0]).all(axis=1)
@@ -286,7 +286,7 @@ class Decoder:
         )
 
     def _learn(self, data: bytes) -> tuple[Layout, bytes]:
-        """The layout of a block that is not laid out like the one before, and the block in it."""
+        """Return the layout of a block that differs from the previous layout, and the block itself."""
         try:
             message = messages.decode(self._type, data)
         except ValueError as error:

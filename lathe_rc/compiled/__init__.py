@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled steps: where their memory lies, and how one compiled loop calls them.
+"""Compiled steps: layout of their memory, and the way one compiled loop calls them.
 
 A cell computes in one loop that Numba has compiled once for all cells (`lathe_rc.cell.program`). The loop cannot know
 the types of the steps that it calls, so a step is called by its address, with addresses:

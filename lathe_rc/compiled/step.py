@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps as functions of addresses: a program calls them without Python, and a stage alone with little of it.
+"""Steps as functions of addresses, called by a program without Python, and by a single stage with little overhead.
 
-The function for a kind of step stands in a module of its own, which is written here and whose compiled code is kept:
+The function for a kind of step is in a separate generated module, whose compiled code is cached:
 it depends on the types of the memory and the ports, not on their values.
 """
 
@@ -60,7 +60,7 @@ BROKEN = -2  #: where a step has come to that has raised an exception: Numba pri
 
 
 def broken() -> LatheError:
-    """The error of a step that has raised an exception."""
+    """Return the error of a step that has raised an exception."""
     return LatheError(
         "the step has raised an exception, which Numba has printed on the error stream of its process; "
         "without @kernel Python says where"
@@ -68,7 +68,7 @@ def broken() -> LatheError:
 
 
 class AddressTable:
-    """Where the addresses of the arrays of a step stand in its table.
+    """Layout of the address table of a step: positions of the addresses of its arrays.
 
     First the number of inputs of float64; then the inputs of uint8, of which one without an address stands for none;
     then the outputs; and last those inputs of float64, so that all else has the same places however many there are.
@@ -77,11 +77,11 @@ class AddressTable:
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
-        places: of the arrays, in order.
-        size: of the table.
-        flags: number of places of inputs of uint8.
+        places: positions of the arrays, in order.
+        size: size of the table.
+        flags: number of positions of inputs of uint8.
         floats: number of inputs of float64.
-        first: place of the first of them.
+        first: position of the first input of float64.
     """
 
     def __init__(self, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> None:
@@ -95,17 +95,17 @@ class AddressTable:
 
 
 class CompiledStep:
-    """A step with its memory as a function of addresses.
+    """Step with its memory, as a function of addresses.
 
     Args:
-        step: see `lathe_rc.cell.stage`.
-        memory: that it works on.
+        step: step function, see `lathe_rc.cell.stage`.
+        memory: memory of the step.
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
-        name: of the module that it stands in.
-        words: of the memory, see `lathe_rc.compiled.struct_view.Struct`.
-        update: lays the memory out anew, see there.
+        name: name of the generated module.
+        words: words of the memory, see `lathe_rc.compiled.struct_view.Struct`.
+        update: updates the layout of the memory, see `lathe_rc.compiled.struct_view.Struct.update`.
     """
 
     def __init__(
@@ -124,15 +124,15 @@ class CompiledStep:
 
     @property
     def address(self) -> int:
-        """Of the function, which is compiled if it never was.
+        """Address of the function, which is compiled on first use.
 
         Raises:
-            InputError: it cannot be compiled.
+            InputError: the function cannot be compiled.
         """
         return self._entry.address
 
     def __call__(self, first: int, start: int, fields: Sequence[npt.NDArray[Any]], samples: int) -> tuple[int, int]:
-        """Call the step for the arrays of all fields, shape (samples,)."""
+        """Call the step with the arrays of all fields, each of shape (samples,)."""
         for place, array in zip(self._places, fields, strict=True):
             assert array.flags.c_contiguous, "kernels take it for contiguous"
             assert array.size == samples, "and as long as the block"
@@ -145,7 +145,7 @@ class CompiledStep:
 
 
 def _cause(told: str) -> str:
-    """Numba's reason against code that it cannot compile, in a line: the innermost place, and the error there."""
+    """Return Numba's reason for a compilation error in one line: the innermost location, and the error there."""
     places = [found for found in _PLACE.findall(told) if not Path(found[0]).name.startswith("step_")]
     words = [line.strip() for line in told.splitlines()]
     why = next((line for line in reversed(words) if line.startswith(_WRONG)), next(filter(None, words), "no reason"))
@@ -165,7 +165,7 @@ def _call(
 
 
 class Entry:
-    """The function of addresses for a kind of step, memory and ports; see `CompiledStep`."""
+    """Function of addresses for a kind of step, memory and ports (see `CompiledStep`)."""
 
     def __init__(
         self, step: Step, memory: StructView, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
@@ -176,7 +176,7 @@ class Entry:
 
     @cached_property
     def address(self) -> int:
-        """Address of the function, which is compiled if it never was."""
+        """Address of the function, which is compiled on first use."""
         try:
             return int(_module(self.name, self._text, self._memory).enter.address)
         except NumbaError as error:
@@ -187,7 +187,7 @@ _entry = cache(Entry)  # made once for all that are alike
 
 
 def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
-    """The text of the module."""
+    """Return the source code of the generated module."""
 
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
         return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))
@@ -206,7 +206,7 @@ def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence
 
 
 def is_compiled(function: object) -> bool:
-    """Whether a function is a kernel."""
+    """Return whether a function is a kernel."""
     return hasattr(function, "py_func")
 
 
@@ -217,12 +217,12 @@ def step_of(stage: type, loop: Step, sample: object) -> Step:
 
 
 def _source(module: str) -> str:
-    """The hash that distinguishes versions of a step: ours have a cache each."""
+    """Return the hash that distinguishes versions of a step; built-in steps have a cache each."""
     return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
 
 
 def is_kept(name: str) -> bool:
-    """Whether the compiled code of a module is on this machine, undamaged."""
+    """Return whether the compiled code of a module is in the cache of this machine, undamaged."""
     files = list(cache_folder().glob(f"*/{name}.*"))
     # To read them checks them: a damaged file is removed, and compiled anew.
     return any(path.suffix == ".nbi" for path in files) and None not in [read_kept(path) for path in files]
@@ -230,7 +230,7 @@ def is_kept(name: str) -> bool:
 
 @cache
 def _module(name: str, text: str, memory: StructView) -> ModuleType:
-    """The module of a text, in no file: only what is compiled of it is kept."""
+    """Create a module from source code, without a file; only its compiled code is stored."""
     module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory
     # Numba looks a function's module up by its name when it loads compiled code.

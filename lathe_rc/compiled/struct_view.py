@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structs at an address, for kernels: a NamedTuple whose members are read where they are used.
+"""Structs at an address, for kernels: a NamedTuple whose members are read on use.
 
-Numba takes a NamedTuple of arrays by value: each call hands over seven words an array and counts references to it. A
-`StructView` is one word, the address of the layout that `lathe_rc.compiled` describes. The caller that lays a value out
-(`Struct`) keeps its arrays meanwhile, and changes no word during a call.
+Numba passes a NamedTuple of arrays by value: each call copies seven words per array and counts references. A
+`StructView` is one word, the address of the layout described in `lathe_rc.compiled`. The caller that creates a layout
+(`Struct`) keeps the arrays alive, and changes no word during a call.
 
 The shapes of the arrays of a NamedTuple that is `sized` are part of the type: the compiler then unrolls the loops over
-matrices of two or six rows. That is for few and small arrays, since each shape is compiled by itself.
+matrices of two or six rows. Use it for few and small arrays, since each shape is compiled separately.
 """
 
 import ctypes
@@ -40,18 +40,18 @@ _SIZED: set[type] = set()
 
 
 def sized(kind: T) -> T:
-    """Let the compiler know the shapes of the arrays of a NamedTuple; decorates its class."""
+    """Class decorator that makes the array shapes of a NamedTuple known to the compiler."""
     _SIZED.add(kind)
     return kind
 
 
 class StructView(types.Type):
-    """Numba's type of a NamedTuple that stands at an address.
+    """Numba type of a NamedTuple at an address.
 
     Attributes:
-        members: type and place [word] of each member, by name.
-        shapes: shapes of the arrays that the type fixes, by name.
-        size: of the layout [word].
+        members: type and offset [word] of each member, by name.
+        shapes: array shapes that are part of the type, by name.
+        size: size of the layout [word].
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class StructView(types.Type):
 
 
 def explain_unfit(value: object, name: str = "") -> str:
-    """Return why a value cannot be laid out, with the name of the member; empty if it can.
+    """Return the reason why a value cannot be laid out, with the name of the member; empty if it can.
 
     Args:
         value: NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those.
-        name: of it, for the members of others.
+        name: name of the value, for nested members.
     """
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         reasons = (
@@ -96,7 +96,7 @@ class _Layout(NamedTuple):
 
 
 def _spread(value: tuple[Any, ...], sorts: list[Any], leaves: list[Any]) -> None:
-    """Collect what the layout of a NamedTuple depends on, and its arrays and constants, in order."""
+    """Collect the properties that determine the layout of a NamedTuple, and its arrays and constants, in order."""
     kind = type(value)
     sorts.append(kind)
     known = kind in _SIZED
@@ -114,14 +114,14 @@ def _spread(value: tuple[Any, ...], sorts: list[Any], leaves: list[Any]) -> None
 
 @cache
 def _layout(sorts: tuple[Any, ...]) -> _Layout:
-    """The layout for what `_spread` has collected; made once for all values that are alike."""
+    """Return the layout for the result of `_spread`, shared by all values with equal properties."""
     formats: list[str] = []
     kind = _view(iter(sorts), formats)
     return _Layout(kind, struct.Struct("=" + "".join(formats)))
 
 
 def _view(sorts: Iterator[Any], formats: list[str]) -> StructView:
-    """The type of the NamedTuple that comes next; ``formats`` gets those of its words."""
+    """Return the type of the next NamedTuple; append the formats of its words to ``formats``."""
     kind = next(sorts)
     members: dict[str, tuple[types.Type, int]] = {}
     shapes: dict[str, tuple[int, ...]] = {}
@@ -155,13 +155,13 @@ def _words_of(member: types.Type) -> int:
 
 
 class Struct:
-    """A NamedTuple laid out in words.
+    """NamedTuple laid out in words.
 
     Args:
         value: see `explain_unfit`.
 
     Attributes:
-        kind: its type.
+        kind: type of the NamedTuple.
         words: shape (size,).
     """
 
@@ -177,7 +177,7 @@ class Struct:
         self._value = value  # keeps the arrays
 
     def update(self, value: tuple[Any, ...]) -> None:
-        """Lay out anew the members that are other objects than before, of the same types."""
+        """Update the words of the members that have been replaced by other objects of the same types."""
         self._update(self.kind, 0, value, self._value)
         self._value = value
 
@@ -198,7 +198,7 @@ class Struct:
 
 
 def address(array: npt.NDArray[Any]) -> int:
-    """Address of a contiguous array; NumPy takes ten times as long to tell it."""
+    """Return the address of a contiguous array, 10 times as fast as NumPy."""
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # it is a buffer
     except (TypeError, ValueError):  # it is read-only, or empty
@@ -228,14 +228,14 @@ class _Members(AttributeTemplate):
 
 
 def _load(builder: Any, address: Any, kind: ir.Type) -> Any:
-    """The value at an address. It does not change during a call, so that it may be read once for a whole loop."""
+    """Load the value at an address, constant during a call, so that it can be read once for a whole loop."""
     loaded = builder.load(builder.inttoptr(address, kind.as_pointer()))
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
 
 
 def _entry(builder: Any, table: Any, number: Any) -> Any:
-    """The word with a number in a table."""
+    """Load the word with a given number from a table."""
     return _load(builder, builder.add(table, builder.mul(number, _WORD(8))), _WORD)
 
 

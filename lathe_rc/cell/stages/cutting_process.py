@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cut: from tool, feed and part to the force, and the deflection of the edge by it."""
+"""Cutting process: from tool, feed and part to the force, and the resulting deflection of the edge."""
 
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -35,7 +35,7 @@ _HEIGHTS = 201  # places along a shaft between which its compliance is linear
 
 
 class CuttingProcessParameters(NodeParameters):
-    """Parameters of the edge, the material, the blank and the part, and of everything that gives way."""
+    """Parameters of edge, material, blank and part, and of all compliant elements."""
 
     moved_by: list[Literal["tool", "cross", "longitudinal"]] = parameter(
         ["cross", "longitudinal"], "what moves the edge: the tool drives, the cross feed, the longitudinal feed"
@@ -93,7 +93,7 @@ class CuttingProcessParameters(NodeParameters):
     resolution: NonNegative = parameter(0.0, "quantisation step of the force sensor; 0: none", "N")
 
     def allowance(self, node: str, prefix: str = "") -> Allowance:
-        """The allowance of a node; ``prefix`` begins the parameters where they are part of a table."""
+        """Return the machining allowance of a node; ``prefix`` precedes its parameters in a composed table."""
         if self.allowance_rms and self.allowance_rate:
             raise InputError(
                 f"{node}.{prefix}allowance_rms and {prefix}allowance_rate are both given; allowed: one of them"
@@ -112,17 +112,17 @@ class CuttingProcessParameters(NodeParameters):
             )
 
     def flexible(self) -> Shaft | None:
-        """The shaft, if there is one."""
+        """Flexible shaft, if there is one."""
         if self.shaft == "none":
             return None
         support: Support = self.shaft
         return made_of(Shaft, self, "shaft_", support=support)
 
     def part(self, node: str, prefix: str = "") -> Part:
-        """The part of a node; ``prefix`` begins the parameters where they are part of a table.
+        """Return the part of a node; ``prefix`` precedes its parameters in a composed table.
 
         Raises:
-            InputError: lists of different lengths, or windows that are none.
+            InputError: lists differ in length, or a window is invalid.
         """
         names = [f"hard_spot_{what}" for what in ("start", "width", "bottom", "top", "factor")]
         spots = [getattr(self, name) for name in names]
@@ -151,11 +151,11 @@ class CuttingProcessParameters(NodeParameters):
             )
 
     def deflecting(self) -> Elasticity:
-        """W3; of a shaft only the dynamics, since its compliance is the shaft's own."""
+        """Transfer function W3; of a shaft only the dynamics, since the compliance is that of the shaft itself."""
         return _ELASTICITIES["realistic" if self.shaft != "none" and self.elasticity == "rigid" else self.elasticity]
 
     def process(self, node: str, prefix: str = "") -> CuttingProcess:
-        """The cut of a node, before its first sample; see `part`."""
+        """Return the cutting process of a node before its first sample (see `part`)."""
         part = self.part(node, prefix)
         with about(node, f"{prefix}lag"):
             return made_of(
@@ -171,16 +171,16 @@ class CuttingProcessParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the cutting process.
 
     Attributes:
         cut: the machine.
-        allowance: of the blank.
-        sensor: of the force.
-        tool, cross, longitudinal: number of the first input of each that moves the edge; -1: it does not.
-        even: whether the blank has the form that is wanted.
-        feed: unless the longitudinal slide makes it [m/rad].
-        room: for displacement, position of the cross slide, feed velocity and height.
+        allowance: machining allowance of the blank.
+        sensor: sensor of the force.
+        tool, cross, longitudinal: number of the first input of each; -1 if it does not move the edge.
+        even: whether the blank has the desired form.
+        feed: constant feed without a longitudinal slide [m/rad].
+        room: scratch arrays for displacement, position of the cross slide, feed velocity and height.
     """
 
     cut: CutTable
@@ -196,7 +196,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Cut through one block; the cross feed is positive into the part."""
+    """Compute the cut through one block; the cross feed is positive into the part."""
     angle, speed = inputs[0], inputs[1]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = outputs
     n = angle.size
@@ -225,7 +225,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class CutStage(Stage):
-    """A stage with a cut, whose encoder is its first input and whose cut its last output.
+    """Stage with a cut, whose encoder is its first input and whose cut its last output.
 
     Attributes:
         cut: the machine.
@@ -244,12 +244,12 @@ class CutStage(Stage):
         self._damages = list[Fault]()
 
     def damage(self, fault: Fault) -> None:
-        """Break the tool, or put a hard spot into the material."""
+        """Break the tool, or insert a hard spot into the material."""
         self._damages.append(fault)
         self._suffer()
 
     def mend(self, fault: Fault | None) -> bool:
-        """Lengthen the edge, or take a spot away; None: a new tool in even material."""
+        """Repair a broken edge, or remove a hard spot; None: a new tool in uniform material."""
         mended = self._damages[:] if fault is None else [damage for damage in self._damages if damage == fault][:1]
         for damage in mended:
             self._damages.remove(damage)
@@ -266,7 +266,7 @@ class CutStage(Stage):
         self.cut.damage(shorter=shorter, spots=spots)
 
     def prepare(self, first: int, samples: int) -> None:
-        """Draw allowance and sensor noise for the samples ahead."""
+        """Generate allowance and sensor noise for the samples ahead."""
         super().prepare(first, samples)
         self._allowance.draw(samples)
         self._force_sensor.draw(samples)
@@ -274,17 +274,17 @@ class CutStage(Stage):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """End a run whose cut cannot go on.
+        """End a run whose cut cannot continue.
 
         Raises:
-            LatheError: it cannot go on.
+            LatheError: the cut cannot continue.
         """
         encoder, cut = inputs[0], outputs[-1]
         raise self.failure(reason, encoder["angle_true"][reached], encoder["speed_true"][reached], cut["feed"][reached])
 
 
 class CuttingProcessStage(CutStage):
-    """Cutting process under rigid drives; see `lathe_rc.plants.cutting`.
+    """Cutting process with rigid drives (see `lathe_rc.plants.cutting`).
 
     Attributes:
         parameters: its table.
@@ -305,7 +305,7 @@ class CuttingProcessStage(CutStage):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         parameters = self.parameters
         places, place = dict.fromkeys(READ, -1), 2
         for name in parameters.moved_by:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all drives of the tool: limits of commands, sensors, and a retraction without the cell."""
+"""Common part of all tool drives: command limits, sensors, and autonomous retraction."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from lathe_rc.messages import Samples
 
 
 class BoundedParameters(NodeParameters):
-    """Bounds of a command that is taken over."""
+    """Bounds of a command during a takeover."""
 
     retract_velocity: Positive = parameter(0.1, "largest velocity of a takeover", "m/s")
     retract_acceleration: Positive = parameter(50.0, "its largest acceleration", "m/s^2")
@@ -28,7 +28,7 @@ class BoundedParameters(NodeParameters):
 
 
 class RetractionParameters(BoundedParameters):
-    """Parameters of a drive that takes the tool out of the part."""
+    """Parameters of a drive that retracts the tool from the part."""
 
     safe_position: float = parameter(
         0.3e-3, "where the drive goes by itself when members of the cell are lost: out of the part", "m"
@@ -36,11 +36,11 @@ class RetractionParameters(BoundedParameters):
 
 
 class OwnRetraction:
-    """The command of a drive, until the drive goes its own way.
+    """Command of a drive with an autonomous retraction.
 
     Args:
         parameters: its table.
-        stroke: of the drive, to each side [m]: a command beyond is where the drive cannot be.
+        stroke: largest displacement of the drive to each side [m], beyond which commands are out of reach.
     """
 
     def __init__(self, parameters: RetractionParameters, stroke: float) -> None:
@@ -49,17 +49,17 @@ class OwnRetraction:
 
     @property
     def table(self) -> TakeoverTable:
-        """For `followed`."""
+        """Table for `followed`."""
         return self._takeover.table
 
     def begin(self) -> None:
-        """Retract from the next sample on, whatever is commanded."""
+        """Start the retraction with the next sample, overriding the command."""
         self._takeover.change(Mode.RETRACT)
 
 
 @kernel
 def followed(takeover: TakeoverTable, command: Samples) -> Samples:
-    """The command that the drive follows [m], shape (n,)."""
+    """Return the command that the drive follows [m], shape (n,)."""
     # The input is another node's output, and a takeover writes into it.
     own = command if follows(takeover) else command.copy()
     take_over(takeover, own)
@@ -68,7 +68,7 @@ def followed(takeover: TakeoverTable, command: Samples) -> Samples:
 
 @dataclass(frozen=True)
 class Limits:
-    """The motion that a drive can follow."""
+    """Limits of the motion that a drive can follow."""
 
     stroke: float  #: [m] to each side
     velocity: float  #: [m/s]
@@ -76,7 +76,7 @@ class Limits:
 
 
 class Drive(Stage):
-    """A stage that moves the tool; a subclass sets what it has of the following."""
+    """Stage that moves the tool; subclasses override the methods that apply."""
 
     announces = (LIMITED, FREE)
     _commands: Sequence[LimitedCommand] = ()
@@ -89,11 +89,11 @@ class Drive(Stage):
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
 
     def limits(self) -> Mapping[str, Limits]:
-        """The limits of the drive, by state topic before remapping; for drives that carry the whole profile."""
+        """Limits of the drive, by state topic before remapping; for drives that follow the whole profile."""
         return {"coarse/state": self._limits} if self._limits else {}
 
     def go_safe(self) -> None:
-        """Retract the carriage, whatever is commanded: members of the cell are lost."""
+        """Retract the carriage, overriding the command, after a loss of cell members."""
         if self._retraction:
             self._retraction.begin()
 
@@ -102,5 +102,5 @@ class Drive(Stage):
         return [message for each in (*self._commands, *self._clippings) for message in each.tell(first, end)]
 
     def finish(self, index: int) -> list[Sparse]:
-        """Return the events that are left when the run ends."""
+        """Return the remaining events at the end of the run."""
         return [message for each in (*self._commands, *self._clippings) for message in each.finish(index)]

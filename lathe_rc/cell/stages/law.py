@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control laws as plug-ins: a class with its formula, sample by sample, and nothing of ports, blocks and events."""
+"""Control laws as plug-ins: a class with a formula per sample, independent of ports, blocks and events."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -24,16 +24,16 @@ _DIVERGED = 1  # why a step stops
 
 
 class Now(NamedTuple):
-    """The inputs of a law at a sample.
+    """Inputs of a law at a sample.
 
     Attributes:
         sample: index of the sample.
-        time: since sample 0 [s].
+        time: time since sample 0 [s].
         angle: measured spindle angle [rad], unwrapped.
         speed: measured spindle speed [rad/s].
         error: measured form error [m] of ``feedback_delay`` samples ago; 0 before there is one.
         error_angle: measured spindle angle of that sample [rad].
-        learning: False where the supervisor or an event forbids to learn.
+        learning: False where the supervisor or an event forbids learning.
         position: measured position of the drive [m] of that sample, for a law that ``senses`` it; otherwise 0.
     """
 
@@ -48,13 +48,13 @@ class Now(NamedTuple):
 
 
 class GuardTable(NamedTuple):
-    """Compares a revolution's error with the form; see `LawParameters`.
+    """Divergence guard that compares a revolution's error with the form (see `LawParameters`).
 
     Attributes:
-        limit: square of the ratio; 0: nothing is compared.
+        limit: square of the permitted ratio; 0: guard off.
         sums: squares of error and form in the revolution at hand, of the error in the one that ended last and in the
             first one, and what the latter two are compared with [m²].
-        whole: samples in the revolution at hand, its number.
+        whole: number of samples in the current revolution, and its number.
     """
 
     limit: float
@@ -67,7 +67,7 @@ _ERROR, _FORM, _ENDED, _FIRST, _ALLOWED = range(5)
 
 @inlined
 def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
-    """Whether a revolution ends with this sample whose error is too large."""
+    """Return whether this sample ends a revolution with too large an error."""
     turn = int(np.floor(angle / _TURN))
     found = False
     if turn > guard.whole[1] and guard.whole[0] > 0:
@@ -93,13 +93,13 @@ class LawMemory(NamedTuple):
     """Memory of the step of a law.
 
     Attributes:
-        law: its own.
-        guard: against a loop that diverges.
-        who: may have to obey.
-        delay: of the error [sample].
+        law: memory of the law itself.
+        guard: guard against a diverging loop.
+        who: obedience to the supervisor, if any.
+        delay: delay of the error [sample].
         period: sampling step [s].
-        senses: whether it reads the drive's measured position.
-        learns: whether events let it learn, shape (1,).
+        senses: whether the law reads the drive's measured position.
+        learns: whether events permit learning, shape (1,).
     """
 
     law: Any
@@ -112,10 +112,10 @@ class LawMemory(NamedTuple):
 
 
 def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
-    """Make the step of a law from its formula for one sample."""
+    """Build the step of a law from its formula for one sample."""
 
     def step(memory: LawMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-        """Compute the command of one block, piece by piece between reactions."""
+        """Compute the command of one block, segment by segment between reactions."""
         angle, speed, error_angle, error, form = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
         position, command, who = inputs[-1], outputs[0], memory.who
         while start < command.size:
@@ -139,17 +139,17 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
 
 
 class Law(Sampled, Learner):
-    """Base of control laws: commands a drive from the error that is visible.
+    """Base class of control laws, which command a drive from the measured form error.
 
-    A law of one's own has a table ``Parameters``, the memory that it starts with (`start`), and its formula
-    ``sample(memory, now)``, which gives the command [m]: a `kernel`, for which the memory is a NamedTuple of arrays of
-    float64, int64 or uint8, numbers, and NamedTuples of those; or a function in plain Python, for any memory. It may
+    A user-defined law has a table ``Parameters``, an initial memory (`start`), and a formula
+    ``sample(memory, now)``, which returns the command [m]: a `kernel`, for which the memory is a NamedTuple of arrays of
+    float64, int64 or uint8, numbers, and nested NamedTuples; or a function in plain Python, for any memory. It may
     change arrays of the memory and nothing else, and depends on the memory and on `Now` alone.
 
     Attributes:
         parameters: its table.
-        law: its memory.
-        senses: it reads the measured position of the drive that it commands.
+        law: memory of the law.
+        senses: whether it reads the measured position of the commanded drive.
 
     Example:
         >>> import numpy as np
@@ -201,27 +201,27 @@ class Law(Sampled, Learner):
 
     @abstractmethod
     def start(self) -> Any:
-        """The memory before sample 0, and after the event ``clear``."""
+        """Return the memory before sample 0, and after the event ``clear``."""
 
     def contraction(self, drive: Response, waves: Array, speed: float) -> Complex | None:
-        """The factor by which a revolution changes the error at ``waves`` per revolution, shape (n,).
+        """Return the factor by which a revolution changes the error at ``waves`` per revolution, shape (n,).
 
-        It is what the check before a start goes by: its magnitude must be below 1. A law that does not tell it is said
-        to be unchecked.
+        The check before a start requires a magnitude below 1. A law without this method is reported
+        as unchecked.
 
         Args:
             drive: response of the drive's position to its command at frequencies [rad/s].
-            waves: shape (n,).
-            speed: of the spindle [rad/s].
+            waves: waves per revolution, shape (n,).
+            speed: speed of the spindle [rad/s].
         """
         return None
 
     def highest_waves(self, speed: float) -> float:
-        """Waves per revolution up to which `contraction` is looked at, at ``speed`` [rad/s]: the Nyquist limit."""
+        """Return the highest waves per revolution checked by `contraction`, at ``speed`` [rad/s]: the Nyquist limit."""
         return float(np.pi / (self.parameters.step * speed))
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
-        """Largest magnitude of `contraction`, and the waves per revolution where it is."""
+        """Return the largest magnitude of `contraction`, and the waves per revolution where it occurs."""
         with code_of_others(f"{self.name}: contraction"):
             if self.contraction(drive, np.zeros(1), speed) is None:
                 return None
@@ -234,7 +234,7 @@ class Law(Sampled, Learner):
         return checked(f"{self.name}: contraction", lambda: self.contraction(drive, waves, speed), waves)
 
     def perform(self, action: str) -> None:
-        """Clear the memory, or let the law learn or not."""
+        """Clear the memory, or enable or disable learning."""
         if action == "clear":
             self.law = self.start()
         else:
@@ -242,14 +242,14 @@ class Law(Sampled, Learner):
 
     @property
     def memory(self) -> LawMemory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         delay, period = self.parameters.feedback_delay, self.parameters.step
         return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Obey the supervisor, or end a run that diverges.
+        """Obey the supervisor, or end a diverging run.
 
         Raises:
             LatheError: the loop diverges.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of all controllers that learn a drive: checks before a start, and cures for a loop that diverges."""
+"""Common part of all controllers that learn a drive: checks before a start, and remedies for a diverging loop."""
 
 import math
 from abc import abstractmethod
@@ -35,7 +35,7 @@ _SHAPES = ((2.0, 1e-6), (3.0, 1e-6), (2.0, 1e-4), (3.0, 1e-4), (2.0, 1e-3), (2.0
 
 
 class LawParameters(ObedientParameters, BoundedParameters, RestartParameters):
-    """Parameters that every law has."""
+    """Parameters common to all laws."""
 
     feedback_delay: Annotated[int, Ge(1), Le(2**24)] = parameter(
         2048, "samples from an error to when it is visible; at least a block, at most what the cycle leaves", "sample"
@@ -53,7 +53,7 @@ class LawParameters(ObedientParameters, BoundedParameters, RestartParameters):
 
 
 class Learner(Obedient):
-    """A controller that learns a drive.
+    """Controller that learns a drive.
 
     Attributes:
         parameters: its table.
@@ -66,44 +66,44 @@ class Learner(Obedient):
 
     @abstractmethod
     def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
-        """Largest magnitude of the factor by which a cycle changes the error, and the waves per revolution where it is.
+        """Return the largest magnitude of the error factor per cycle, and the waves per revolution where it occurs.
 
         Args:
             drive: response of the drive's position to its command.
             speed: of the spindle [rad/s].
 
         Returns:
-            None: it does not tell.
+            None if the controller does not provide it.
         """
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
-        """Speeds [rad/s] for which `worst` is asked, of a spindle that turns between two."""
+        """Return the speeds [rad/s] at which `worst` is evaluated, for a spindle between two speeds."""
         return {low, (low + high) / 2, high}
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
-        """Parameters that may make a loop converge which does not: of each kind of cure the gentlest first.
+        """Return parameters that may make a diverging loop converge, the gentlest of each kind first.
 
         Args:
-            lag: of the drive at low frequencies [s].
+            lag: lag of the drive at low frequencies [s].
         """
         return ()
 
     def settings(self) -> str:
-        """The parameters that decide whether learning converges, in words."""
+        """Return the parameters that decide whether learning converges, in words."""
         return "its parameters"
 
     def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """Causes of a form worse than the law can turn, with their cures, one line each; nothing is refused for them.
+        """Return causes of an avoidable form error, with remedies, one line each; none of them is an error.
 
         Args:
-            low: least speed of the spindle [rad/s].
-            high: largest one [rad/s].
-            counts: of its encoder per revolution; 0: an ideal one.
+            low: lowest speed of the spindle [rad/s].
+            high: highest speed of the spindle [rad/s].
+            counts: encoder counts per revolution; 0 for an ideal encoder.
         """
         return []
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int | None:
-        """Longest feedback delay [sample] that the cycle leaves.
+        """Return the longest feedback delay [sample] that the cycle allows.
 
         Args:
             speed: largest of the spindle [rad/s].
@@ -112,14 +112,14 @@ class Learner(Obedient):
             speed_window: time over which the encoder measures its speed [s]: one count more in it is a larger lead.
 
         Returns:
-            None: it does not tell.
+            None if the controller does not provide it.
         """
         return None
 
     # ---- checks before a start ----------------------------------------------------------------------
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse a feedback that comes too late for the cycle, and learning that does not converge."""
+        """Check that the feedback is in time for the cycle and that learning converges."""
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
         self._check_delay(cell, high)
@@ -127,7 +127,7 @@ class Learner(Obedient):
         cell.warnings += self.encoder_warnings(low, high, cell.master.parameters.counts_per_revolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
-        """Return the responses of the drives that it commands, and the drives."""
+        """Return the commanded drives and their responses."""
         commands = {remapped(self.shared, output.topic) for output in self.outputs}
         return [
             (response, drive)
@@ -195,7 +195,7 @@ class Learner(Obedient):
         cell.unchecked += untold
 
     def _check_reach(self, drive: Drive) -> None:
-        """Refuse bounds with which it could not take over from every position of a drive."""
+        """Check that the bounds allow a takeover from every position of a drive."""
         parameters = self.parameters
         reach = parameters.bounds().reach(parameters.retract_time)
         for limits in drive.limits().values() if parameters.reaction_delay else ():
@@ -210,7 +210,7 @@ class Learner(Obedient):
     # ---- obedience ----------------------------------------------------------------------------------
 
     def _make_obedience(self, settled: int) -> Obedience | None:
-        """The obedience to the supervisor, if any; errors of ``settled`` samples after a takeover are not learned."""
+        """Build the obedience to the supervisor, if any; learning ignores ``settled`` samples after a takeover."""
         parameters = self.parameters
         if not parameters.reaction_delay:
             return None
@@ -230,18 +230,18 @@ class Learner(Obedient):
 
 
 def lag(response: Response) -> float:
-    """Lag of a drive at low frequencies [s]."""
+    """Return the lag of a drive at low frequencies [s]."""
     low = 1.0
     return float(-np.angle(response(np.array([low])))[0] / low)
 
 
 class Loop(NamedTuple):
-    """A learning controller with the drives that it commands.
+    """Learning controller with the drives that it commands.
 
     Attributes:
-        stage: the controller.
+        stage: stage of the controller.
         responses: of the drives.
-        speeds: at which the loop is looked at [rad/s].
+        speeds: speeds at which the loop is evaluated [rad/s].
     """
 
     stage: Learner
@@ -249,7 +249,7 @@ class Loop(NamedTuple):
     speeds: Collection[float]
 
     def factor(self, values: Mapping[str, Value]) -> float:
-        """Largest factor of a cycle with some parameters changed; inf: there is no such controller, or it is silent."""
+        """Return the largest factor of a cycle with some parameters changed; inf if invalid or not provided."""
         try:
             stage = type(self.stage)(self.stage.name, self.stage.parameters.model_copy(update=dict(values)))
         except InputError:  # the memory has no room for it
@@ -258,11 +258,11 @@ class Loop(NamedTuple):
         return max((np.inf if worst is None or np.isnan(worst[0]) else worst[0] for worst in told), default=np.inf)
 
     def first(self, candidates: Iterable[Mapping[str, Value]], allowed: float = _SAFE) -> Mapping[str, Value] | None:
-        """The first parameters with which no factor is above what is allowed; None: there are none."""
+        """Return the first parameters with all factors within the allowed value; None if there are none."""
         return next((values for values in candidates if self.factor(values) <= allowed), None)
 
     def cures(self) -> list[str]:
-        """Parameters to set so that a loop converges that does not."""
+        """Return parameter changes with which a diverging loop converges."""
         found: list[Mapping[str, Value]] = []
         for candidates in self.stage.cures(max(map(lag, self.responses))):
             cure = self.first(each for each in candidates if not any(each.keys() >= known.keys() for known in found))
@@ -277,13 +277,13 @@ class Loop(NamedTuple):
         ripple: float | None = None,
         others: Mapping[str, Value] = MappingProxyType({}),
     ) -> dict[str, Value] | None:
-        """The widest flat Q, an FIR low-pass, of the first shape with which the loop converges; None: there is none.
+        """Return the widest flat Q, an FIR low-pass, of the first shape with which the loop converges; None if none.
 
         Args:
-            allowed: factor of a cycle.
-            stop: begin of its stop band [rad/s]; None: free.
-            ripple: None: free.
-            others: parameters that are changed as well.
+            allowed: largest permitted factor of a cycle.
+            stop: start of the stop band [rad/s]; None: free.
+            ripple: ripple of the filter; None: free.
+            others: further parameter changes.
         """
         for ratio, each in dict.fromkeys((ratio, ripple or own) for ratio, own in _SHAPES):
             bands = _BANDS if stop is None else _BANDS[stop > _BANDS]

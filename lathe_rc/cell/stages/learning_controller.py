@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-learning controller of one channel, and its stability margin: how far its loop is from diverging."""
+"""Self-learning controller of one channel, and its stability margin."""
 
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ _LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
 class LearningController(Learner):
-    """Repetitive controller of one drive; see `lathe_rc.control.repetitive`.
+    """Repetitive controller of one drive (see `lathe_rc.control.repetitive`).
 
     Attributes:
         parameters: its table.
@@ -112,11 +112,11 @@ class LearningController(Learner):
 
     @property
     def correction(self) -> Correction:
-        """1/W0 as it is at the moment."""
+        """Current correction 1/W0."""
         return self._controller.correction
 
     def loop(self, drive: Response) -> LearningLoop:
-        """The learning loop around a drive with the given response."""
+        """Return the learning loop around a drive with the given response."""
         parameters = self.parameters
         return LearningLoop(
             drive=drive,
@@ -136,13 +136,13 @@ class LearningController(Learner):
         return self.loop(drive).worst(speed)
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
-        """Speeds at which convergence is checked [rad/s]; a memory over time knows one alone."""
+        """Return the speeds at which convergence is checked [rad/s]; only one for a memory over time."""
         if self.parameters.law == "time_periodic":
             return {self.parameters.nominal_speed}
         return super().checked_speeds(low, high)
 
     def settings(self) -> str:
-        """Lead and Q, which decide whether learning converges, in words."""
+        """Return lead and Q, which decide whether learning converges, in words."""
         parameters = self.parameters
         q = f"q_time = {parameters.q_time * 1e6:.4g} µs"
         if parameters.q_filter == "fir":
@@ -150,7 +150,7 @@ class LearningController(Learner):
         return f"lead_time = {parameters.lead_time * 1e3:.4g} ms, {q}"
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
-        """A lead near what the correction leaves of the lag, or a Q that forgets more."""
+        """Return candidate remedies: a lead near the lag left by the correction, or a Q that forgets more."""
         parameters = self.parameters
         if parameters.correction.startswith("second_order_inverse"):
             lag -= self.correction.inverse[0]
@@ -163,7 +163,7 @@ class LearningController(Learner):
         yield ({name: float(f"{value * by**k:.2g}") for name, value, by in q} for k in range(1, _QS))
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """Longest feedback delay [sample] that cycle and lead leave."""
+        """Return the longest feedback delay [sample] allowed by cycle and lead."""
         parameters = self.parameters
         if parameters.law == "time_periodic":
             speed, acceleration, count = parameters.nominal_speed, 0.0, 0.0
@@ -180,7 +180,7 @@ class LearningController(Learner):
         )
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse an exact preview that does not know the speed law of the spindle, and what `Learner` does."""
+        """Check that an exact preview has the spindle's speed law, in addition to the checks of `Learner`."""
         master = cell.master
         if self.parameters.lead_law == "exact_preview":
             own, true = self.parameters.speed_law(self.name), master.law
@@ -199,13 +199,13 @@ class LearningController(Learner):
     # ---- events -------------------------------------------------------------------------------------
 
     def check_action(self, action: str) -> None:
-        """Refuse an event that the controller does not know, or that lacks its file."""
+        """Check that an event is known to the controller and that its file exists."""
         super().check_action(action)
         if action in _FILE_ACTIONS and not self.parameters.memory_file:
             raise InputError(f"{self.name}.memory_file is empty; name the file for the event {action!r}")
 
     def schedule(self, action: str, index: int) -> None:
-        """Schedule an event; a memory that cannot be loaded is refused now, not in mid-run."""
+        """Schedule an event; a memory that cannot be loaded is rejected now, instead of in mid-run."""
         self.check_action(action)
         if action == "load":
             self._read_memory()
@@ -218,7 +218,7 @@ class LearningController(Learner):
             return memory_file.load(path, parameters.cycle_points, parameters.points_per_revolution)
 
     def perform(self, action: str) -> None:
-        """Carry out an event; the samples from now on feel it."""
+        """Carry out an event, effective from the next sample."""
         controller = self._controller
         if action == "clear":
             controller.clear()
@@ -236,7 +236,7 @@ class LearningController(Learner):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         parameters = self.parameters
         return Memory(
             control=self._controller.table,
@@ -257,7 +257,7 @@ class LearningController(Learner):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Smooth the memory, end a cycle, or obey the supervisor.
+        """Smooth the memory, end a cycle, or react to the supervisor.
 
         Raises:
             AngleLostError: the memory cannot be read at the angle that was measured.
@@ -273,7 +273,7 @@ class LearningController(Learner):
         raise self._controller.lost(reason, first, reached, angle, speed, past_angle)
 
     def _newest_cycle(self, reached: int, outputs: Sequence[Signals]) -> list[Sparse]:
-        """End the cycle that has ended with the sample before; what it gives holds from that one on."""
+        """Complete the cycle that ended with the previous sample; its results apply from that sample on."""
         sparse = [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
         self._margin[0] = sparse[0].values["stability_margin"]
         for published in outputs[1:]:
@@ -282,7 +282,7 @@ class LearningController(Learner):
         return sparse
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return the cycles that have ended, and the loss of the angle."""
+        """Return messages about completed cycles and the loss of the angle."""
         sparse: list[Sparse] = []
         if not self._asks:
             sparse += [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
@@ -329,7 +329,7 @@ class LearningController(Learner):
 
 
 class Margins:
-    """1 - sup|Q - γZ| of a drive model, tabulated as it is asked for: one costs as much as a cycle of samples.
+    """Stability margins 1 - sup|Q - γZ| of a drive model, tabulated on demand: one costs as much as a cycle of samples.
 
     Args:
         parameters: of the stage.
@@ -342,7 +342,7 @@ class Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without responses, which are computed when they are asked for."""
+        """Return the pickled state, without the responses, which are computed on demand."""
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:
@@ -363,7 +363,7 @@ class Margins:
         return discretise(a, b, parameters.model_delay, parameters.step, "foh").response
 
     def untabulated(self, stage: "LearningController", speed: float, model: Identified) -> float:
-        """The margin at ``speed`` [rad/s] of this very model; what was tabulated before and after does not matter."""
+        """Return the margin of a model at ``speed`` [rad/s], independent of the table."""
         return 1.0 - stage.loop(self._computed(model)).supremum(speed)
 
     def _supremum(self, stage: "LearningController", speed: float, model: Identified) -> float:
@@ -376,7 +376,7 @@ class Margins:
         return self._suprema[key]
 
     def at(self, stage: "LearningController", speed: float, model: Identified) -> float:
-        """The margin at ``speed`` [rad/s], between tabulated speeds by interpolation."""
+        """Return the margin at ``speed`` [rad/s], interpolated between tabulated speeds."""
         speeds = _tabulated(self._parameters.nominal_speed)
         after = bisect_left(speeds, speed)
         # Beyond the table each speed would be a new entry.
@@ -389,13 +389,13 @@ class Margins:
 
 @lru_cache(maxsize=16)
 def _tabulated(nominal: float) -> list[float]:
-    """The speeds of the table [rad/s], from half of the nominal one up to one and a half times it."""
+    """Return the speeds of the table [rad/s], from 0.5 to 1.5 times the nominal speed."""
     speeds: list[float] = (nominal / 40 * np.arange(20, 61)).tolist()
     return speeds
 
 
 def _make_room(table: dict[Any, Any]) -> None:
-    """Let the oldest entry go from a full table: a model that wanders would fill it for ever."""
+    """Remove the oldest entry of a full table, which a drifting model would otherwise fill without limit."""
     if len(table) >= _MOST:
         del table[next(iter(table))]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the learning controller, and the pieces of its law that they describe."""
+"""Parameters of the learning controller, and construction of the elements of its law."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -30,14 +30,14 @@ _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 @lru_cache(maxsize=64)
 def _own_q(make: Callable[..., QFilter], *numbers: float) -> QFilter:
-    """One of our filters, which has no memory: those that are alike are one, and so are the loops with them."""
+    """Return a built-in Q filter, shared by equal arguments since it has no memory; its loops are shared as well."""
     return make(*numbers)
 
 
 class LearningControllerParameters(SpeedLawParameters, LawParameters):
-    """Law, lead, Q and correction of a channel, and the drive model that its stability margin is computed from.
+    """Law, lead, Q and correction of a channel, and the drive model for its stability margin.
 
-    The speed deviations are what ``exact_preview`` knows in advance; no other law uses them.
+    The speed deviations are used only by ``exact_preview``, which needs them in advance.
     """
 
     stop_ratio: NonNegative = parameter(
@@ -108,19 +108,19 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """Topic of the drive that the model is of, before remapping."""
+        """Topic of the drive described by the model, before remapping."""
         return "coarse/command"
 
     @property
     def cycle_points(self) -> int:
-        """Grid points in a cycle."""
+        """Number of grid points in a cycle."""
         return self.points_per_revolution * self.cycle_revolutions
 
     def make_q(self, node: str) -> QFilter:
-        """The Q filter of a node.
+        """Return the Q filter of a node.
 
         Raises:
-            InputError: it is wider than the memory can hold, its bands are out of order, or one of others is none.
+            InputError: the filter is wider than the memory, its bands are out of order, or a third-party filter is invalid.
         """
         if self.q_filter not in (*Q_FILTERS.own, "fir"):
             make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])
@@ -141,11 +141,11 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     @property
     def _q_width(self) -> float:
-        """``q_time`` at nominal speed [grid points]; multiplied in this order, on which the bits depend."""
+        """Width ``q_time`` at nominal speed [grid points]; the order of multiplication determines the last bits."""
         return float(self.q_time * self.nominal_speed * (self.points_per_revolution / (2 * np.pi)))
 
     def _own_q(self) -> QFilter:
-        """The Q filter, one of ours."""
+        """Return the built-in Q filter."""
         point = self._point_time
         if self.q_filter == "fir":
             return _own_q(LowPass, self.q_pass * point, self.q_stop * point, self.q_ripple, self.cycle_points)
@@ -153,7 +153,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         return _own_q(make, self._q_width, self.cycle_points)
 
     def _q_that_fits(self) -> str:
-        """The cure of a Q filter that the memory cannot hold: parameters near by that it can, in words."""
+        """Return nearby parameters of a Q filter that fits into the memory, in words."""
         highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # [rad/s] of a wave that the grid has
         tried: list[dict[str, float]] = []
         for k in range(1, 60):
@@ -174,7 +174,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         return "; as with more points_per_revolution"
 
     def make_correction(self, node: str) -> Correction:
-        """The correction of a node with its given model.
+        """Return the correction of a node with its given model.
 
         Raises:
             InputError: a lead-lag term without a lag.
@@ -190,19 +190,19 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     @property
     def preview_time(self) -> float:
-        """The time that the lead law compensates [s]: T0, or with the exact correction the model's delay alone."""
+        """Time compensated by the lead law [s]: T0, or only the model's delay with the exact correction."""
         return self.model_delay if self.correction == "exact" else self.lead_time
 
     @property
     def constant_lead(self) -> float:
-        """Lead angle that does not depend on the speed [rad]: of Wk2, which has constant parameters in the angle."""
+        """Lead angle independent of the speed [rad]: of Wk2, which has constant parameters in the angle."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
     def make_preview(self, node: str) -> Preview:
-        """The lead law of a node.
+        """Return the lead law of a node.
 
         Raises:
-            InputError: the deviations do not fit together.
+            InputError: the speed deviations are inconsistent.
         """
         return Preview(
             _LEAD_LAWS[self.lead_law],
@@ -214,7 +214,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         )
 
     def largest_lead(self, speed: float, acceleration: float) -> float:
-        """Largest lead angle [rad] at a largest measured ``speed`` [rad/s] and ``acceleration`` [rad/s²]."""
+        """Return the largest lead angle [rad] at a largest measured ``speed`` [rad/s] and ``acceleration`` [rad/s²]."""
         time = self.preview_time
         if self.lead_law == "constant_angle":
             return time * self.nominal_speed + self.constant_lead

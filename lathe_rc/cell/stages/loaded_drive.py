@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tool drives that feel the cutting force: drives and cut as one stage, for no block may cut what couples them."""
+"""Tool drives under the cutting force: drives and cut as one stage, since they are coupled within a block."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple
@@ -38,7 +38,7 @@ _REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
 
 
 class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
-    """The coarse drive with its current loop."""
+    """Parameters of the coarse drive with its current loop."""
 
     loop: Literal["ideal", "current"] = parameter(
         "ideal",
@@ -55,10 +55,10 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
     slew_rate: NonNegative = parameter(0.0, "loop current: the set point changes no faster; 0: any", "A/s")
 
     def coil(self, node: str) -> Coil | None:
-        """The current loop, if there is one.
+        """Return the current loop of a node, if there is one.
 
         Raises:
-            InputError: a limit of what is not there.
+            InputError: a limit belongs to a missing current loop.
         """
         if self.loop == "current":
             limits = {name: getattr(self, name) or np.inf for name in _COIL_LIMITS}
@@ -70,7 +70,7 @@ class LoadedCoarseParameters(ElectrodynamicActuatorParameters):
 
 
 class LoadedFineParameters(PiezoActuatorParameters):
-    """The piezo drive with its preload."""
+    """Parameters of the piezo drive with its preload."""
 
     preload: NonNegative = parameter(
         0.0, "of the stack: a larger tension tears it off and ends the run; 0: it holds any", "N"
@@ -78,14 +78,14 @@ class LoadedFineParameters(PiezoActuatorParameters):
 
 
 class LoadedParameters(ComposedParameters):
-    """Parameters of drives under the cutting force beyond those of drives and cut."""
+    """Additional parameters of drives under the cutting force, beyond those of drives and cut."""
 
     radial_ratio: Annotated[float, Ge(0), Le(2)] = parameter(
         0.4, "radial part of the cutting force, which pushes the tool out of the part, over the main one"
     )
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse process damping: the flank's force would have to be solved with drives that give way to it."""
+        """Reject process damping, whose flank force would have to be solved together with the compliant drives."""
         super().model_post_init(context)
         if pressure := getattr(self, f"{_CUT}flank_pressure", 0.0):
             raise InputError(
@@ -95,21 +95,21 @@ class LoadedParameters(ComposedParameters):
 
     @property
     def coarse(self) -> LoadedCoarseParameters:
-        """The table of the coarse drive."""
+        """Parameter table of the coarse drive."""
         return self.part("coarse_", LoadedCoarseParameters)
 
     @property
     def cut(self) -> CuttingProcessParameters:
-        """The table of the cut."""
+        """Parameter table of the cut."""
         return self.part(_CUT, CuttingProcessParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of each drive by itself, without force and current loop."""
+        """Quantities of each drive alone, without force and current loop."""
         return self.coarse.drive_models()
 
 
 class LoadedSeriesParameters(LoadedParameters):
-    """The same of both drives in series."""
+    """Additional parameters of both drives in series under the cutting force."""
 
     mass_ratio: Annotated[float, Gt(0), Le(1)] = parameter(
         0.1, "mass of the tool over coarse_moving_mass; times that and fine_natural_frequency²: stiffness of the stack"
@@ -117,11 +117,11 @@ class LoadedSeriesParameters(LoadedParameters):
 
     @property
     def fine(self) -> LoadedFineParameters:
-        """The table of the fine drive."""
+        """Parameter table of the fine drive."""
         return self.part(FINE, LoadedFineParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of each drive by itself, without force and current loop."""
+        """Quantities of each drive alone, without force and current loop."""
         return {**self.coarse.drive_models(), **self.fine.drive_models()}
 
 
@@ -156,19 +156,19 @@ LoadedSeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the loaded drives.
 
     Attributes:
-        retraction, limits, limits_fine: of the commands.
-        signs: of what makes the fine set point.
+        retraction, limits, limits_fine: retraction and limits of the commands.
+        signs: signs of the terms of the fine set point.
         drive, cut: the machine.
-        noise, sensor: of the carriage's sensor, which the machine itself rounds, and of the piezo's.
-        allowance: of the blank.
-        force_sensor: of the force.
-        cross, longitudinal: number of the first input of each; -1: it does not move the edge.
-        even: whether the blank has the form that is wanted.
-        feed: unless the longitudinal slide makes it [m/rad].
-        room: for arrays of a block.
+        noise, sensor: noise of the carriage sensor, which is quantised by the machine, and sensor of the piezo.
+        allowance: machining allowance of the blank.
+        force_sensor: sensor of the force.
+        cross, longitudinal: number of the first input of each slide; -1 if it does not move the edge.
+        even: whether the blank has the desired form.
+        feed: constant feed without a longitudinal slide [m/rad].
+        room: scratch arrays of a block.
     """
 
     retraction: TakeoverTable
@@ -196,7 +196,7 @@ _MORE = 5
 def _advance(
     memory: Memory, first: int, inputs: Fields, motion: Fields, fine_measured: Samples, of_cut: Fields
 ) -> tuple[int, int]:
-    """The step of both stages; the fine drive's arrays are room where there is none."""
+    """Advance drives and cut through a block; without a fine drive, its arrays are scratch memory."""
     angle, speed, wanted, height, command = inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]
     force, measured_force, depth_of_cut, feed, allowance, wear, deflection = of_cut
     n, room = angle.size, memory.room
@@ -239,7 +239,7 @@ def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: F
 
 
 class LoadedDriveStage(CutStage, CoupledDrive):
-    """Electrodynamic drive that feels the cutting force; see `lathe_rc.plants.tool_drive`.
+    """Electrodynamic drive under the cutting force (see `lathe_rc.plants.tool_drive`).
 
     Attributes:
         parameters: its table.
@@ -286,7 +286,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         cut = self._cut
         return Memory(
             retraction=self._retraction.table,
@@ -307,7 +307,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
 
 
 class LoadedSeriesDrive(LoadedDriveStage):
-    """The same with the piezo and the tool on the carriage."""
+    """Electrodynamic drive with piezo and tool on its carriage, under the cutting force."""
 
     kind = "loaded_series_drive"
     Parameters = LoadedSeriesDriveParameters

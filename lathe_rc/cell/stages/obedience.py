@@ -23,13 +23,13 @@ OBEY = 100  #: why a step stops: a reaction has to be obeyed
 
 
 def listens(parameters: ObedientParameters) -> list[Input]:
-    """Input with the reactions of the supervisor, if the node obeys it."""
+    """Return the input with the reactions of the supervisor, if the node obeys it."""
     delay = parameters.reaction_delay
     return [Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []
 
 
 class FeedObedientParameters(ObedientParameters):
-    """Parameters of a node of the feed that obeys the supervisor."""
+    """Parameters of a feed node that obeys the supervisor."""
 
     stop_rate: Positive = parameter(
         10.0, "largest rate of the command while it is brought to rest, and of what is left of that when given back",
@@ -41,15 +41,15 @@ class FeedObedientParameters(ObedientParameters):
     )
 
     def obedience(self, name: str, *, speed: bool, limit: float, settled: int) -> "Obedience":
-        """The obedience for a command of the feed.
+        """Return the obedience for a feed command.
 
-        A command for a speed goes to 0, one for a position stays: so the slide stands. Nothing is taken out of the
+        The slide stops: a speed command goes to 0, a position command is held. The tool is not retracted from the
         part along the slide.
 
         Args:
-            name: of the node.
-            speed: whether the command stands for a speed.
-            limit: largest command to each side, in its unit; 0: there is none.
+            name: name of the node.
+            speed: whether the command represents a speed.
+            limit: largest magnitude of the command, in its unit; 0: none.
             settled: see `Obedience`.
 
         Raises:
@@ -74,12 +74,12 @@ _REACTION, _WANTS = 0, 1  # places in the state: the reaction that is obeyed, wh
 
 
 class ObedienceTable(NamedTuple):
-    """An `Obedience` for kernels.
+    """Table of an `Obedience` for kernels.
 
     Attributes:
-        whole: the reaction that is obeyed, and whether learning is wanted.
-        forbidden: samples until learning is no longer forbidden, shape (1,).
-        takeover: of the command.
+        whole: the reaction in force, and whether learning is requested.
+        forbidden: number of samples until learning is permitted, shape (1,).
+        takeover: takeover of the command.
     """
 
     whole: npt.NDArray[np.int64]
@@ -88,11 +88,11 @@ class ObedienceTable(NamedTuple):
 
 
 class Listener(NamedTuple):
-    """The obedience of a node, if it has any, for kernels.
+    """Optional obedience of a node, for kernels.
 
     Attributes:
-        obedience: to the supervisor, if it ``listens``.
-        listens: see above.
+        obedience: obedience to the supervisor, valid if ``listens``.
+        listens: whether the node obeys the supervisor.
     """
 
     obedience: ObedienceTable
@@ -101,9 +101,9 @@ class Listener(NamedTuple):
 
 @kernel
 def piece(who: Listener, start: int, end: int, reaction: Samples) -> int:
-    """Where the piece of a block ends that begins with sample ``start`` and in which nothing changes; ``end`` at most.
+    """Return the end of the segment that starts at sample ``start`` with a constant reaction; ``end`` at most.
 
-    It is ``start`` itself where another reaction has to be obeyed first (`OBEY`).
+    The result is ``start`` itself where a new reaction must be obeyed first (`OBEY`).
     """
     if not who.listens:
         return end
@@ -118,19 +118,19 @@ def piece(who: Listener, start: int, end: int, reaction: Samples) -> int:
 
 @kernel
 def may_learn(who: Listener) -> bool:
-    """Whether a node that listens may learn in the next piece."""
+    """Return whether a listening node may learn in the next segment."""
     return bool(who.obedience.whole[_WANTS] and who.obedience.forbidden[0] == 0.0)
 
 
 @kernel
 def obeyed(who: Listener) -> int:
-    """The reaction that is in force."""
+    """Return the reaction in force."""
     return int(who.obedience.whole[_REACTION])
 
 
 @kernel
 def apply(who: Listener, command: Samples) -> None:
-    """Make of what the controller wants in a piece what the drive gets; in place, in its unit."""
+    """Convert the controller's command of a segment into the drive's command, in place, in its unit."""
     if who.listens:
         take_over(who.obedience.takeover, command)
         who.obedience.forbidden[0] = max(who.obedience.forbidden[0] - command.size, 0.0)
@@ -142,14 +142,14 @@ NOBODY = ObedienceTable(
 
 
 class Obedience:
-    """Stops learning, holds or retracts the command, and gives it back when the reaction is over.
+    """Obedience of a node: stops learning, holds or retracts the command, and restores it after the reaction.
 
     Args:
-        name: of the node.
-        takeover: of the command.
-        settled: samples from where a command is given back until errors are worth learning from.
-        hold: what to hold is.
-        retract: what to retract and to stop are.
+        name: name of the node.
+        takeover: takeover of the command.
+        settled: number of samples after the return of control until errors may be learned.
+        hold: takeover action for the reaction hold.
+        retract: takeover action for the reactions retract and stop.
     """
 
     def __init__(
@@ -167,15 +167,15 @@ class Obedience:
 
     @property
     def table(self) -> ObedienceTable:
-        """For `piece` and `apply`."""
+        """Table for `piece` and `apply`."""
         return ObedienceTable(self._whole, self._forbidden, self._takeover.table)
 
     def learn(self, *, wanted: bool) -> None:
-        """Learn or freeze as soon as no reaction forbids it."""
+        """Start or stop learning as soon as no reaction forbids it."""
         self._whole[_WANTS] = wanted
 
     def obey(self, reaction: Reaction, index: int) -> list[Sparse]:
-        """Do what a reaction asks for, from sample ``index``, the next one, on; what is to be said of that."""
+        """Obey a reaction starting at sample ``index``, the next one; return the resulting messages."""
         self._whole[_REACTION] = reaction
         following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
         self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)
@@ -191,20 +191,20 @@ class Obedience:
 
 
 class Obedient(Stage):
-    """A stage that obeys the supervisor, whose reactions are its last input; a subclass sets its obedience, if any."""
+    """Stage that obeys the supervisor, whose reactions are its last input; a subclass sets its obedience, if any."""
 
     _obedience: Obedience | None = None
 
     @property
     def listener(self) -> Listener:
-        """Its obedience for kernels."""
+        """Obedience of the stage for kernels."""
         obedience = self._obedience
         return Listener(obedience.table if obedience else NOBODY, obedience is not None)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Obey a new reaction, where the step has stopped for that (`OBEY`)."""
+        """Obey a new reaction for which the step has stopped (`OBEY`)."""
         if reason != OBEY or self._obedience is None:
             return []
         return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)

@@ -28,7 +28,7 @@ from lathe_rc.signals.example_002 import PERIOD
 
 
 class PositionControllerParameters(ServoParameters):
-    """The law and its settings; those of the PID are by default paper 004's, Fig. 11."""
+    """Parameters of the control law; PID defaults are those of paper 004, Fig. 11."""
 
     axis: Axis = parameter("cross", "which slide; the first word of its topics")
     law: Literal["pid", "sampled_link", "periodic_hyperstable"] = parameter(
@@ -72,7 +72,7 @@ class PositionControllerParameters(ServoParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """Topic of the drive that the model is of, before remapping."""
+        """Topic of the drive described by the model, before remapping."""
         return f"{self.axis}/command"
 
 
@@ -82,13 +82,13 @@ _TOLD = 1  # why a step stops: the log is full
 
 
 class Wanted(NamedTuple):
-    """The controlled quantity, for the steps of all laws.
+    """Controlled quantity, for the steps of all laws.
 
     Attributes:
-        course: of the set point.
-        path: taken off the set point; without heights there is none.
-        edge, height: number of the input with the deflection of the edge, and with the height; 0: there is none.
-        who: may have to obey.
+        course: course of the set point.
+        path: path subtracted from the set point; without heights there is none.
+        edge, height: numbers of the inputs with the deflection of the edge and with the height; 0: none.
+        who: obedience to the supervisor, if any.
     """
 
     course: Course
@@ -117,13 +117,13 @@ class PeriodicMemory(NamedTuple):
     """Memory of the step of the periodic law.
 
     Attributes:
-        wanted: see above.
-        law, state: of the law.
-        unit: displacement that the law takes for 1 [m].
-        divisor: computes every so many samples.
-        held: the command, and the largest error in the period [m].
-        log: of each period the sample after it, the largest error, and what `periodic.achieved` fills in.
-        logged: rows of it, shape (1,).
+        wanted: controlled quantity.
+        law, state: table and state of the law.
+        unit: displacement that corresponds to 1 in the law [m].
+        divisor: computing interval [sample].
+        held: held command, and largest error in the period [m].
+        log: for each period the sample after it, the largest error, and the results of `periodic.achieved`.
+        logged: number of rows in the log, shape (1,).
     """
 
     wanted: Wanted
@@ -138,7 +138,7 @@ class PeriodicMemory(NamedTuple):
 
 @kernel
 def _look(wanted: Wanted, first: int, start: int, inputs: Fields, set_point: Samples, error: Samples) -> Samples:
-    """The position that is controlled [m]; fills set point and error of a block that begins."""
+    """Return the controlled position [m]; fill set point and error at the start of a block."""
     position = inputs[1]
     if wanted.edge:
         # The slide is positive into the part, the deflection out of it.
@@ -164,7 +164,7 @@ def pid_step(memory: PidMemory, first: int, start: int, inputs: Fields, flags: F
 
 @kernel
 def link_step(memory: LinkMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """The same with a sampled link, which has nothing that it could learn with."""
+    """Control the position through one block by the sampled link, which does not learn."""
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
     while start < command.size:
@@ -182,7 +182,7 @@ def _repeat(
     memory: PeriodicMemory, first: int, start: int, stop: int, set_point: Samples, position: Samples,
     error: Samples, command: Samples,
 ) -> int:  # fmt: skip
-    """Step the periodic law through a piece; returns the sample that is reached, its end unless the log is full."""
+    """Step the periodic law through a segment; return the sample reached, which is its end unless the log is full."""
     held, divisor, unit = memory.held, memory.divisor, memory.unit
     period = memory.law.samples * divisor
     for k in range(start, stop):
@@ -207,7 +207,7 @@ def _repeat(
 def periodic_step(
     memory: PeriodicMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields
 ) -> Reached:
-    """The same with the periodic law."""
+    """Control the position through one block by the periodic law."""
     command, set_point, error = outputs
     position, who = _look(memory.wanted, first, start, inputs, set_point, error), memory.wanted.who
     while start < command.size:
@@ -229,7 +229,7 @@ class PositionController(Servo):
 
     Attributes:
         parameters: its table.
-        law: the controller.
+        law: controller of the position.
     """
 
     kind = "position_controller"
@@ -279,13 +279,13 @@ class PositionController(Servo):
 
     @property
     def step(self) -> Step:  # type: ignore[override]
-        """Step of the law that the table names."""
+        """Step of the law selected in the table."""
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         path = self._path.table if self._path else _NO_PATH
         edge = 2 if self.parameters.measures == "edge" else 0
         height = (3 if edge else 2) if self._path else 0
@@ -300,7 +300,7 @@ class PositionController(Servo):
         )  # fmt: skip
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return what the periodic law achieved, where a period has ended."""
+        """Return the results of the periodic law for the completed periods."""
         rows = self._log[: self._logged[0]].tolist()
         self._logged[0] = 0
         return [self._status(int(index), *row) for index, *row in rows]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Piezo and tool on the coarse carriage: both drives as one stage, for no block may cut what couples them."""
+"""Piezo and tool on the coarse carriage: both drives as one stage, since they are coupled within a block."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
@@ -30,22 +30,22 @@ FINE = "fine_"  #: begins the parameters of the fine drive
 
 
 class SeriesParameters(ComposedParameters):
-    """Parameters of the series drive beyond those of both drives."""
+    """Additional parameters of the series drive, beyond those of both drives."""
 
     mass_ratio: Annotated[float, Ge(0), Le(1)] = parameter(0.1, "mass of the tool over coarse_moving_mass", "1")
 
     @property
     def coarse(self) -> ElectrodynamicActuatorParameters:
-        """The table of the coarse drive."""
+        """Parameter table of the coarse drive."""
         return self.part("coarse_", ElectrodynamicActuatorParameters)
 
     @property
     def fine(self) -> PiezoActuatorParameters:
-        """The table of the fine drive."""
+        """Parameter table of the fine drive."""
         return self.part(FINE, PiezoActuatorParameters)
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of each drive by itself, without what one does to the other."""
+        """Quantities of each drive alone, without their interaction."""
         return {**self.coarse.drive_models(), **self.fine.drive_models()}
 
 
@@ -63,7 +63,7 @@ SeriesDriveParameters = create_model(
 
 
 class Memory(NamedTuple):
-    """Memory of the step; the noise is that of the carriage's sensor, which the machine itself rounds."""
+    """Memory of the step of the series drive; the noise is that of the carriage sensor, quantised by the machine."""
 
     retraction: TakeoverTable
     limits: LimiterTable
@@ -88,25 +88,25 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 def piezo_on_carriage(name: str, fine: PiezoActuatorParameters, mass_ratio: float, preload: float = np.inf) -> Piezo:
-    """The piezo of a node, at rest, with the tool on the carriage.
+    """Return the piezo of a node, at rest, with the tool on the carriage.
 
     Args:
-        name: of the node.
-        fine: its table of the fine drive.
+        name: name of the node.
+        fine: parameter table of the fine drive.
         mass_ratio: mass of the tool over that of the carriage.
-        preload: of the stack [N].
+        preload: preload of the stack [N].
     """
     stack, feedback = fine.stack(name, FINE), COARSE in fine.compensates
     return made_of(Piezo, fine, stack=stack, mass_ratio=mass_ratio, feedback=feedback, preload=preload)
 
 
 def tool_drive(coarse: ElectrodynamicActuatorParameters, shared: ComposedParameters, **beside: Any) -> ToolDrive:
-    """The machine of a coarse drive's table, and of what is given ``beside`` it, see `ToolDrive`."""
+    """Return the machine for a coarse drive's table and the further arguments ``beside`` of `ToolDrive`."""
     return made_of(ToolDrive, coarse, method=shared.discretisation, **beside)
 
 
 class CoupledDrive(Drive):
-    """The coarse drive, and maybe the piezo drive with the tool on its carriage, as one machine.
+    """Coarse drive, optionally with the piezo drive and the tool on its carriage, as one machine.
 
     Attributes:
         drive: the machine.
@@ -130,13 +130,13 @@ class CoupledDrive(Drive):
             self._sensors[1] = Sensor(fine.noise_rms, fine.resolution, seed, f"{name}/fine")
 
     def responses(self) -> Mapping[str, Response]:
-        """Responses of the motions to the commands, in air, and as long as nothing is limited."""
+        """Responses of the motions to the commands, in air, without active limits."""
         coarse = {"coarse/command": self.drive.coarse_response}
         return {**coarse, "fine/command": self.drive.fine_response} if self._set_point else coarse
 
 
 class SeriesDriveStage(CoupledDrive):
-    """Piezo and tool on the coarse carriage, in air; see `lathe_rc.plants.tool_drive`.
+    """Piezo and tool on the coarse carriage, in air (see `lathe_rc.plants.tool_drive`).
 
     Attributes:
         parameters: its table.
@@ -166,7 +166,7 @@ class SeriesDriveStage(CoupledDrive):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         limits, limits_fine = (command.table for command in self._commands)
         sensors = (sensor.table for sensor in self._sensors)
         return Memory(self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table, *sensors)

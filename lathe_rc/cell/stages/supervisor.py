@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches the cell and asks for reactions; nodes read them as feedback with a declared delay."""
+"""Supervisor of the cell: monitors and requested reactions, which nodes read as feedback with a declared delay."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,7 +45,7 @@ MONITORS: Registry[PlainMonitor] = Registry("monitor", PlainMonitor, {}, "lathe_
 
 
 class SupervisorParameters(NodeParameters):
-    """Thresholds, each 0 for a monitor that is off, and what is asked for beyond them."""
+    """Thresholds of the monitors, 0 for a monitor that is off, and the reactions requested above them."""
 
     drives: list[str] = parameter(
         [], "drives of the tool that are watched, by the names of their topics; the first takes the tool out"
@@ -138,8 +138,8 @@ class Memory(NamedTuple):
     Attributes:
         watch: the monitors.
         clearance: see `lathe_rc.safety.monitors.Clearance`.
-        out: number of the input with the position that it looks at; below 0: there is none.
-        state: of the cell, the reaction in force, whether there is something to tell.
+        out: number of the input with the position for the clearance; below 0: none.
+        state: state of the cell, reaction in force, whether there is something to publish.
     """
 
     watch: Watch
@@ -150,7 +150,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Watch one block; for `_ANSWER` it stops at the end of the block."""
+    """Monitor one block; with `_ANSWER` the step stops at the end of the block."""
     state, reaction = outputs
     n = state.size
     if start == n:
@@ -173,11 +173,11 @@ def _real(port: Input, field: str) -> bool:
 
 
 class Supervisor(Stage):
-    """Supervisor with its monitors; see `lathe_rc.safety`.
+    """Supervisor with its monitors (see `lathe_rc.safety`).
 
     Attributes:
         parameters: its table.
-        monitors: those that are on.
+        monitors: active monitors.
     """
 
     kind = "supervisor"
@@ -211,7 +211,7 @@ class Supervisor(Stage):
     # ---- monitors -----------------------------------------------------------------------------------
 
     def _reads(self, topic: str, msgtype: str, fields: tuple[str, ...]) -> int:
-        """Place of an input, added if it is not there."""
+        """Return the index of an input, added if missing."""
         for place, port in enumerate(self._inputs):
             if port.topic == topic:
                 return place
@@ -222,14 +222,14 @@ class Supervisor(Stage):
         return max(1, round(seconds * self.shared.sample_rate))
 
     def _each(self, name: str, of: Sequence[str]) -> list[tuple[str, float]]:
-        """The watched signals with their limits, for a list of limits that are on."""
+        """Return the monitored signals with their limits, for a list of limits that are on."""
         limits: list[float] = getattr(self.parameters, name)
         if limits and len(limits) != len(of):
             raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
         return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
 
     def _reaction(self, name: str, text: str = "") -> Reaction:
-        """The reaction that a parameter asks for, or one of its texts."""
+        """Return the reaction that a parameter, or one of its strings, requests."""
         asked = Reaction[(text or getattr(self.parameters, name)).upper()]
         if asked >= Reaction.RETRACT and not self.parameters.drives:
             raise InputError(
@@ -241,7 +241,7 @@ class Supervisor(Stage):
     def _watch(
         self, name: str, subject: str, limit: float, rule: Rule, asked: str, signal: Place, other: Place | None = None
     ) -> None:
-        """Add a monitor; ``asked``: first word of the parameter with its reaction."""
+        """Add a monitor; ``asked`` is the first word of the parameter with its reaction."""
         reaction = self._reaction(f"{asked}_reaction")
         self.monitors.append(Monitor(name, subject, limit, reaction, rule=rule, signal=signal, other=other))
 
@@ -319,7 +319,7 @@ class Supervisor(Stage):
                 self.monitors.append(Plain(name, subject, limit, reaction, signals=places, make=make))
 
     def _field(self, name: str, text: str) -> tuple[int, str]:
-        """Place of an input and its field, for a parameter with TOPIC.FIELD; the input is added or widened."""
+        """Return the input and field indices for a parameter with TOPIC.FIELD; the input is added or extended."""
         topic, _, field = text.rpartition(".")
         msgtype = _WATCHED.get(topic.rpartition("/")[2], "")
         known = messages.sample_fields(msgtype) if msgtype else {}
@@ -336,7 +336,7 @@ class Supervisor(Stage):
     # ---- samples ------------------------------------------------------------------------------------
 
     def perform(self, action: str) -> None:
-        """Reset the state; what is still wrong raises its alarm again."""
+        """Reset the state; a persistent fault raises its alarm again."""
         if self.reaction is Reaction.NONE:
             return  # nothing has been found since the start or the last reset
         to = state_machine.after(self.state, action)
@@ -350,7 +350,7 @@ class Supervisor(Stage):
             self._told.append(RESET_REFUSED)
 
     def go_safe(self) -> None:
-        """Raise an alarm that nothing resets: members of the cell are lost."""
+        """Raise an alarm that cannot be reset, after a loss of cell members."""
         self._told.append(MEMBERS_LOST)
         self._ask_for(Reaction.STOP)
 
@@ -365,7 +365,7 @@ class Supervisor(Stage):
 
     @property
     def state(self) -> State:
-        """State of the cell."""
+        """Current state of the cell."""
         return State(self._state[_STATE])
 
     @property
@@ -375,7 +375,7 @@ class Supervisor(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         # Monitors in Python have to see each block, so the step stops in each.
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
@@ -383,7 +383,7 @@ class Supervisor(Stage):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Publish what the monitors have found, and go from state to state."""
+        """Publish the findings of the monitors and change the state of the cell."""
         (safety,) = outputs
         sparse = [self._status(first, what, "", 0.0, 0.0) for what in self._told]
         self._told.clear()
@@ -397,7 +397,7 @@ class Supervisor(Stage):
         return sparse
 
     def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Watcher, Alarm]]:
-        """Alarms in the samples up to ``reached``, by sample."""
+        """Return the alarms in the samples up to ``reached``, by sample."""
         found: list[tuple[Watcher, Alarm]] = [*self._lookout.found()]
         piece = cut(inputs, 0, reached) if self._plain else ()
         for monitor in self._plain:
@@ -409,7 +409,7 @@ class Supervisor(Stage):
     def _fill(
         self, safety: Signals, inputs: Sequence[Signals], first: int, start: int, stop: int, sparse: list[Sparse]
     ) -> None:
-        """State and reaction of some samples without an alarm; the tool may be out at one of them."""
+        """Fill state and reaction of samples without an alarm, and detect the clearance of the tool."""
         state, reaction = safety["state"][start:stop], safety["reaction"][start:stop]
         if self.state is State.RETRACTING and self._out is not None:
             place = self._clearance.first(inputs[self._out]["measured_position"][start:stop])
@@ -435,7 +435,7 @@ class Supervisor(Stage):
     # ---- checks before a start ----------------------------------------------------------------------
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse a cell whose tool does not get out of the part where a retraction can be asked for."""
+        """Check that the tool clears the part wherever a retraction can be requested."""
         super().check_cell(cell, cures=cures)
         if self.parameters.drives:
             self._check_obedience(cell)
@@ -443,7 +443,7 @@ class Supervisor(Stage):
             self._check_clearance(cell)
 
     def _check_obedience(self, cell: WiredCell) -> None:
-        """A node that moves the first drive obeys."""
+        """Check that a node that moves the first drive obeys the supervisor."""
         asks = next((monitor for monitor in self.monitors if monitor.reaction >= Reaction.RETRACT), None)
         drive, safety = self.parameters.drives[0], remapped(self.shared, "safety")
         movers = [cell.node_of(remapped(self.shared, f"{drive}/{what}")) for what in ("command", "state")]
@@ -456,7 +456,7 @@ class Supervisor(Stage):
             )
 
     def _check_retraction(self, cell: WiredCell) -> None:
-        """The tool has to get as far out of the part as is asked for before it is safe."""
+        """Check that a retraction reaches the requested clearance."""
         drive, clear = self.parameters.drives[0], self.parameters.clear_position
         for topic, name in ((f"{drive}/command", "retract_position"), (f"{drive}/state", "command_stroke")):
             outlet_topic = remapped(self.shared, topic)
@@ -475,7 +475,7 @@ class Supervisor(Stage):
                 )
 
     def _check_clearance(self, cell: WiredCell) -> None:
-        """A drive gets no farther than its stroke."""
+        """Check that the requested clearance is within the stroke of the drive."""
         clear = self.parameters.clear_position
         node = cell.node_of(remapped(self.shared, f"{self.parameters.drives[0]}/state"))
         drive = cell.stages.get(node or "")  # what is unknown has been said of the retraction
