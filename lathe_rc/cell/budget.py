@@ -146,7 +146,7 @@ def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
 
 
 def _speed(scenario: Scenario) -> dict[str, Cause]:
-    """A speed that varies, and how the lead follows it: off is the exact preview of the speed law."""
+    """Return the cause of a varying speed and the lead that follows it; off is the exact preview of the speed law."""
     (master,) = scenario.masters
     law, learners = scenario.nodes[master], _learners(scenario)
     if not isinstance(law, SpeedLawParameters):

@@ -211,7 +211,7 @@ def is_compiled(function: object) -> bool:
 
 
 def step_of(stage: type, loop: Step, sample: object) -> Step:
-    """Make a function that has been written for a class of stages its step; compiled if what it calls is."""
+    """Convert a loop function into the step of a class of stages; compiled if the called function is a kernel."""
     loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
     return kernel(loop) if is_compiled(sample) else loop
 

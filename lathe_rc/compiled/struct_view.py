@@ -240,7 +240,7 @@ def _entry(builder: Any, table: Any, number: Any) -> Any:
 
 
 def _array(context: Any, builder: Any, kind: types.Array, address: Any, shape: list[Any]) -> Any:
-    """An array at an address, whose memory another one keeps."""
+    """Return an array at an address, whose memory is owned by another array."""
     array = context.make_array(kind)(context, builder)
     itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     strides = [_WORD(itemsize)]
@@ -273,9 +273,9 @@ _lower(StructView)(_member)
 
 
 class Ports(types.Type):
-    """Type of the arrays of a step's inputs, however many there are: one after the other in a table of addresses.
+    """Type of the input arrays of a step, of any number: consecutive entries in a table of addresses.
 
-    A kernel counts them and takes one by its number, as of a tuple; a tuple would be another type for each number.
+    A kernel uses ``len`` and an index, as with a tuple; a tuple would be a different type for each length.
     """
 
     def __init__(self) -> None:
@@ -297,7 +297,7 @@ def _at(_context: object, _address: Any, kind: Any) -> Any:
 
 
 def _array_of(element: types.Type) -> Any:
-    """The reader of an array of some element type, as Numba wants it."""
+    """Return the Numba implementation that reads an array of some element type."""
     kind = types.Array(element, 1, "C")
 
     def array(_context: object, _table: Any, _number: Any, _samples: Any) -> Any:

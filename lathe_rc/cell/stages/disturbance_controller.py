@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A law that holds when speed, force and drive vary.
+"""Disturbance-learning law for varying speed, force and drive.
 
-It feeds the form forward through the inverse of the drive in time, learns the disturbance at the drive's input over the
-angle and reads it ahead, and answers what the memory does not know with a disturbance observer. See
+The law feeds the form forward through the inverse of the drive in time, learns the drive's input disturbance over the
+angle and reads it ahead, and compensates the rest with a disturbance observer. See
 `lathe_rc.cell.stages.form_law` and `lathe_rc.control.disturbance`.
 """
 
@@ -49,10 +49,10 @@ class DisturbanceControllerParameters(FormLawParameters):
     )
 
     def make(self, node: str) -> DisturbanceTable:
-        """The state before the first sample.
+        """Return the state before the first sample.
 
         Raises:
-            InputError: a memory that cannot be made.
+            InputError: the memory parameters are invalid.
         """
         points = self.points_per_revolution
         if points & (points - 1):
@@ -63,12 +63,12 @@ class DisturbanceControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the law.
+    """Memory of the disturbance law.
 
     Attributes:
-        spindle: filter of the angle.
-        form: that is turned.
-        known: of drive and disturbance.
+        spindle: filter of the spindle angle.
+        form: form of the part.
+        known: estimates of drive and disturbance.
         ahead: delay of the drive [s].
         late: delay of the measured position [s].
     """
@@ -82,7 +82,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """Command of the law at one sample [m]."""
+    """Return the command of the law at one sample [m]."""
     spindle, known = memory.spindle, memory.known
     follow(spindle, now.angle)
     found = 0.0
@@ -97,7 +97,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class DisturbanceController(FormLaw):
-    """Law that feeds the form forward, learns the disturbance and observes what is left.
+    """Law that feeds the form forward, learns the disturbance and observes the rest.
 
     Attributes:
         parameters: its table.
@@ -122,20 +122,20 @@ class DisturbanceController(FormLaw):
         return Memory(self.make_filter(), self.form, parameters.make(self.name), parameters.model_delay, late)
 
     def perform(self, action: str) -> None:
-        """Carry out an event; ``clear`` forgets the memory, not what is known of angle and drive."""
+        """Carry out an event; ``clear`` erases the memory, but keeps the estimates of angle and drive."""
         if action == "clear":
             forget(self.law.known)
         else:
             super().perform(action)
 
     def settings(self) -> str:
-        """Drive model that decides whether learning converges, in words."""
+        """Return the drive model that decides whether learning converges, in words."""
         parameters = self.parameters
         model = f"{parameters.model_natural_frequency:.4g} rad/s, {parameters.model_damping:.3g}"
         return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
-        """Fewer waves that are learned, a slower observer, or both where neither helps alone."""
+        """Return candidate remedies: fewer learned waves, a slower observer, or both where neither suffices alone."""
         parameters = self.parameters
         waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
         observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
@@ -146,13 +146,13 @@ class DisturbanceController(FormLaw):
             yield ({"learned_waves": waves[i], "observer_bandwidth": observers[j]} for i, j in both)
 
     def _model_error(self, drive: Response, frequency: Array) -> Complex:
-        """E = Wi/Ŵi - 1, the delays included."""
+        """Return the model error E = Wi/Ŵi - 1, the delays included."""
         a1, a2 = self.parameters.inverse
         p = 1j * frequency
         return np.asarray(drive(frequency) * (1.0 + a1 * p + a2 * p * p) * np.exp(p * self.parameters.model_delay) - 1)
 
     def contraction(self, drive: Response, waves: Array, speed: float) -> Complex:
-        """Factor of the memory, or |E·L| of the observer where that is more, with the given model."""
+        """Return the factor of the memory, or |E·L| of the observer where larger, with the given model."""
         parameters, frequency = self.parameters, waves * speed
         error, p = self._model_error(drive, frequency), 1j * frequency
         inside = np.zeros_like(error)
@@ -173,5 +173,5 @@ class DisturbanceController(FormLaw):
         return np.asarray(np.cos(2 * np.pi / points * np.outer(waves, places)) @ taps)
 
     def highest_waves(self, speed: float) -> float:
-        """Nyquist limit of the memory [waves per revolution]."""
+        """Return the Nyquist limit of the memory [waves per revolution]."""
         return 0.5 * self.parameters.points_per_revolution

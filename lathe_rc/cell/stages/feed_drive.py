@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feed drive of a slide: cross or longitudinal."""
+"""Feed drive of a cross or longitudinal slide."""
 
 from collections.abc import Mapping
 from itertools import dropwhile
@@ -115,7 +115,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
     resolution: NonNegative = parameter(0.0, "quantisation step of the position sensor; 0: none", "m")
 
     def transfer(self) -> TransferFunction:
-        """Position over command.
+        """Transfer function from command to position.
 
         Raises:
             InputError: see `lathe_rc.plants.feed`.
@@ -127,10 +127,10 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         return feed_models.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
 
     def rubbing(self, node: str) -> Friction | None:
-        """The friction of a node, if it has any.
+        """Return the friction of a node, if there is any.
 
         Raises:
-            InputError: a model whose lag of the mechanics nobody knows, or see `Friction`.
+            InputError: the mechanical lag of the model is unknown, or see `Friction`.
         """
         if self.friction == "none":
             return None
@@ -147,7 +147,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
             return made_of(Friction, self, "friction_", law=self.friction, mobility=moves)
 
     def screw(self, node: str) -> Screw:
-        """The screw of a node.
+        """Return the feed screw of a node.
 
         Raises:
             InputError: see `Screw`.
@@ -169,16 +169,16 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the feed drive.
 
     Attributes:
-        drive: the machine.
-        sensor: of its position.
-        who: obeys the supervisor, if it ``listens``; once it is ``safe``, nobody.
-        disturbance: amplitude of what adds to the command.
+        drive: machine of the drive.
+        sensor: sensor of the position.
+        who: obedience to the supervisor, if it ``listens``; off once the drive is ``safe``.
+        disturbance: amplitude of the disturbance added to the command.
         period: sampling step [s].
-        clipped: whether the command was not given as it was commanded, of sample n at n modulo its length.
-        room: for the command, the disturbance, the motor and what the sensor sees.
+        clipped: whether the command was limited at sample n, stored at n modulo the length.
+        room: scratch arrays for the command, the disturbance, the motor and the sensor input.
     """
 
     drive: FeedTable
@@ -194,7 +194,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Move the slide through one block, piece by piece between reactions."""
+    """Move the slide through one block, segment by segment between reactions."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
     n = command.size
     while start < n:
@@ -222,11 +222,11 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class FeedDriveStage(Obedient):
-    """Feed drive of a slide; see `lathe_rc.plants.feed`.
+    """Feed drive of a slide (see `lathe_rc.plants.feed`).
 
     Attributes:
         parameters: its table.
-        drive: the machine.
+        drive: machine of the drive.
     """
 
     kind = "feed_drive"
@@ -271,17 +271,17 @@ class FeedDriveStage(Obedient):
         )
 
     def go_safe(self) -> None:
-        """Stop the slide and obey nobody any more: members of the cell are lost."""
+        """Stop the slide and ignore further reactions, after a loss of cell members."""
         self._safe = True
         self._said = self._obedience.obey(Reaction.STOP, 0)
 
     def finish(self, index: int) -> list[Sparse]:
-        """Return the events that are left when the run ends."""
+        """Return the remaining events at the end of the run."""
         return self._clipping.finish(index)
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         parameters = self.parameters
         return Memory(
             drive=self.drive.whole,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The desired form of the part: its parameters, its table under the tool, and the node that publishes it alone."""
+"""Desired form of the part: parameters, table for the kernels, and the node that publishes the form alone."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,7 +29,7 @@ PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc
 
 
 class FormParameters(NodeParameters):
-    """The desired form of the part and the feed along it."""
+    """Desired form of the part and the feed along it."""
 
     profile: Annotated[str, Named(PROFILES, _OWN)] = parameter("harmonics", "kind of profile")
     profile_values: list[float] = parameter(
@@ -70,15 +70,15 @@ class FormParameters(NodeParameters):
     )
 
     def known(self) -> Mapping[str, Value]:
-        """Form of the part, for laws that feed it forward."""
+        """Form of the part, for laws with feed-forward."""
         return {name: getattr(self, name) for name in FORM}
 
     def form(self, node: str) -> Profile:
-        """The profile of a node.
+        """Return the profile of a node.
 
         Raises:
-            InputError: lists of different lengths, sizes that do not fit, a file that cannot be used, or a profile of
-                others that is none.
+            InputError: lists differ in length, sizes do not fit, a file cannot be used, or a third-party profile
+                is invalid.
         """
         if self.profile not in _OWN:
             make: Callable[..., PartProfile] = PROFILES[self.profile]
@@ -108,14 +108,14 @@ FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_f
 
 
 class FormTable(NamedTuple):
-    """A `Form` for kernels.
+    """Table of a `Form` for kernels.
 
     Attributes:
-        heights, table: see `lathe_rc.signals.profile_table.ProfileTable`; of where the tool has to be.
-        told: table of what the controllers take that for.
-        alike: whether both are the same.
-        slide: number of the first input of the longitudinal slide, if that makes the height; 0: it does not.
-        feed, start, part: otherwise, see `lathe_rc.signals.profile_table.height_along`.
+        heights, table: required tool position, see `lathe_rc.signals.profile_table.ProfileTable`.
+        told: table of the tool position assumed by the controllers.
+        alike: whether both tables are equal.
+        slide: number of the first input of the longitudinal slide, if it determines the height; 0: it does not.
+        feed, start, part: height without a slide, see `lathe_rc.signals.profile_table.height_along`.
     """
 
     heights: Samples
@@ -130,7 +130,7 @@ class FormTable(NamedTuple):
 
 @kernel
 def equal(one: Samples, other: Samples) -> bool:
-    """Whether two signals of shape (n,) are equal, sample by sample."""
+    """Return whether two signals of shape (n,) are equal, sample by sample."""
     differs = False
     for k in range(one.size):
         differs |= one[k] != other[k]
@@ -139,7 +139,7 @@ def equal(one: Samples, other: Samples) -> bool:
 
 @kernel
 def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> None:
-    """Fill the height [m] at an angle [rad] or place of the longitudinal slide [m]."""
+    """Fill the height [m] at an angle [rad] or position of the longitudinal slide [m]."""
     if form.slide:
         for k in range(height.size):
             height[k] = form.start + slide[k]
@@ -151,7 +151,7 @@ def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> 
 def evaluate(
     form: FormTable, inputs: tuple[Samples, ...], reference: Samples, expected: Samples, height: Samples
 ) -> None:
-    """Fill the desired displacement and what a controller can know of it, and the height [m], shape (n,).
+    """Fill the desired displacement, the controllers' estimate of it, and the height [m], each of shape (n,).
 
     The inputs of the `Form` are the first of ``inputs``.
     """
@@ -171,21 +171,21 @@ def evaluate(
 
 
 class Form:
-    """A form, tabulated.
+    """Tabulated form of a node.
 
     Args:
-        node: that it belongs to.
+        node: name of the node.
         parameters: its table.
 
     Attributes:
         surface: table of the form of the part.
-        profile: table of what the drives have to follow: the form, or the path of a round tip.
-        inputs: what it reads.
-        table: for `evaluate`.
-        doubts: about the file of a form, one line each.
+        profile: table of the path of the drives: the form, or the path of a round tip.
+        inputs: input ports.
+        table: table for `evaluate`.
+        doubts: warnings about the form's file, one line each.
 
     Raises:
-        InputError: see `FormParameters.form`; a form that the tip does not get into; or a slide that shall begin anew.
+        InputError: see `FormParameters.form`; the tip does not fit into the form; or a slide would have to restart.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
@@ -225,11 +225,11 @@ def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Field
 
 
 class ProfileStage(Stage):
-    """Evaluates the form at the spindle angle and the height.
+    """Stage that evaluates the form at the spindle angle and the height.
 
     Attributes:
         parameters: its table.
-        form: of the part.
+        form: form of the part.
     """
 
     kind = "profile"
@@ -246,10 +246,10 @@ class ProfileStage(Stage):
         )
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the doubts about the form's file, one line each."""
+        """Return the warnings about the form's file, one line each."""
         return self.form.doubts
 
     @property
     def memory(self) -> FormTable:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return self.form.table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of laws that know the form of the part: they feed it forward through the inverse of the drive.
+"""Common part of laws with a known form of the part, fed forward through the inverse of the drive.
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
@@ -40,7 +40,7 @@ _RATES = [1000 * kilo for kilo in range(1, 1001) if 1_000_000 % kilo == 0]
 
 
 class FormLawParameters(LawParameters, FormParameters):
-    """The form, the encoder and the drive as the law knows them; what is not given is that of the cell."""
+    """Form, encoder and drive model of the law; values not given are those of the cell."""
 
     asks: ClassVar[tuple[frozenset[str], ...]] = (FORM, frozenset({"encoder_counts"}))
 
@@ -61,28 +61,28 @@ class FormLawParameters(LawParameters, FormParameters):
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     def known(self) -> Mapping[str, Value]:
-        """Nothing: the form is the tool's, and the law asks for it."""
+        """Empty mapping: the law asks for the form instead of providing it."""
         return {}
 
     @property
     def commanded_topic(self) -> str:
-        """Topic of the drive that the model is of, before remapping."""
+        """Topic of the drive described by the model, before remapping."""
         return "coarse/command"
 
     @property
     def inverse(self) -> tuple[float, float]:
-        """a1 [s] and a2 [s²] of the model."""
+        """Coefficients a1 [s] and a2 [s²] of the model."""
         return 2.0 * self.model_damping / self.model_natural_frequency, 1.0 / self.model_natural_frequency**2
 
 
 class ForwardTable(NamedTuple):
-    """Feed-forward through the model that is given, for kernels.
+    """Feed-forward through the given drive model, for kernels.
 
     Attributes:
-        spindle: filter of the angle.
-        form: that is turned.
-        a1, a2, ahead: of the model [s, s², s].
-        late: samples until an error is seen.
+        spindle: filter of the spindle angle.
+        form: form of the part.
+        a1, a2, ahead: coefficients and lead time of the model [s, s², s].
+        late: delay of the error [sample].
     """
 
     spindle: AngleFilterTable
@@ -94,14 +94,14 @@ class ForwardTable(NamedTuple):
 
 
 class FormLaw(Law):
-    """Base of laws that know the form.
+    """Base class of laws with a known form.
 
     Attributes:
         parameters: its table.
-        form: what the drive has to follow.
+        form: form that the drive must follow.
 
     Raises:
-        InputError: the height along the part is that of a slide, which nobody can look ahead along.
+        InputError: the height along the part is that of a slide, which cannot be previewed.
     """
 
     parameters: FormLawParameters
@@ -120,7 +120,7 @@ class FormLaw(Law):
         super().__init__(name, parameters)
 
     def make_filter(self) -> AngleFilterTable:
-        """The filter of the spindle angle before sample 0."""
+        """Return the filter of the spindle angle before sample 0."""
         return self._filter(self.parameters.step, self.parameters.encoder_counts)
 
     def _filter(self, step: float, counts: int) -> AngleFilterTable:
@@ -130,7 +130,7 @@ class FormLaw(Law):
         )
 
     def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """Return a doubt about counts per sample near a ratio of small numbers."""
+        """Return a warning about encoder counts per sample near a ratio of small numbers."""
         rate = self.parameters.sample_rate
         spindle = self._filter(1.0 / rate, counts)
         ratio = followed_ratio(spindle, low, high, _BAD)
@@ -155,7 +155,7 @@ class FormLaw(Law):
         return [what]
 
     def make_forward(self) -> ForwardTable:
-        """The feed-forward before sample 0."""
+        """Return the feed-forward before sample 0."""
         parameters = self.parameters
         return ForwardTable(
             self.make_filter(), self.form, *parameters.inverse, parameters.model_delay, parameters.feedback_delay
@@ -167,21 +167,21 @@ class FormLaw(Law):
 
 
 def _passed(spindle: AngleFilterTable, low: float, high: float) -> str:
-    """Counts per sample between two speeds [rad/s], in words."""
+    """Return the counts per sample between two speeds [rad/s], in words."""
     slowest, fastest = f"{counts_per_sample(spindle, low):.3g}", f"{counts_per_sample(spindle, high):.3g}"
     return slowest if slowest == fastest else f"{slowest} to {fastest}"
 
 
 @kernel
 def feed_forward(form: FormAhead, a1: float, a2: float, angle: float, speed: float, acceleration: float) -> float:
-    """The command [m] that brings a drive to the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
+    """Return the command [m] for the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
     value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
     return value + a1 * speed * slope + a2 * (speed * speed * bow + acceleration * slope)
 
 
 @inlined
 def fed_forward(forward: ForwardTable, angle: float) -> float:
-    """The command [m] of a sample with the angle that the encoder has measured [rad]."""
+    """Return the feed-forward command [m] of a sample with the measured encoder angle [rad]."""
     follow(forward.spindle, angle)
     ahead, speed, acceleration = at(forward.spindle, forward.ahead)
     return feed_forward(forward.form, forward.a1, forward.a2, ahead, speed, acceleration)

@@ -142,7 +142,7 @@ class Law(Sampled, Learner):
     """Base class of control laws, which command a drive from the measured form error.
 
     A user-defined law has a table ``Parameters``, an initial memory (`start`), and a formula
-    ``sample(memory, now)``, which returns the command [m]: a `kernel`, for which the memory is a NamedTuple of arrays of
+    ``sample(memory, now)`` for the command [m]: a `kernel`, for which the memory is a NamedTuple of arrays of
     float64, int64 or uint8, numbers, and nested NamedTuples; or a function in plain Python, for any memory. It may
     change arrays of the memory and nothing else, and depends on the memory and on `Now` alone.
 

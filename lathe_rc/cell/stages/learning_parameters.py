@@ -120,7 +120,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         """Return the Q filter of a node.
 
         Raises:
-            InputError: the filter is wider than the memory, its bands are out of order, or a third-party filter is invalid.
+            InputError: the filter exceeds the memory, its bands are out of order, or a third-party filter is invalid.
         """
         if self.q_filter not in (*Q_FILTERS.own, "fir"):
             make = cast("Callable[[float, int], QFilter]", Q_FILTERS[self.q_filter])

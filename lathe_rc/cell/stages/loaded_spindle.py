@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spindle that the cut slows, with its encoder."""
+"""Spindle slowed by the cutting torque, with its encoder."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
@@ -23,7 +23,7 @@ _MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] by which a run is longer than its law nee
 
 
 class LoadedSpindleParameters(SpindleEncoderParameters):
-    """A speed law, and what the torque of the cut makes of it; a run is longer than the law by what that delays it."""
+    """Speed law and its change by the cutting torque; a run is longer than the law by the resulting delay."""
 
     inertia: Positive = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
     motor_inertia: Positive = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")
@@ -42,10 +42,10 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
     )
 
     def spindle(self, node: str) -> LoadedSpindle:
-        """The machine of a node.
+        """Return the spindle machine of a node.
 
         Raises:
-            InputError: a speed loop that oscillates.
+            InputError: the speed loop oscillates.
         """
         belt = made_of(Belt, self, "belt_") if self.belt_stiffness else None
         with about(node, "speed_bandwidth", "speed_integral_time", "belt_stiffness", "belt_damping"):
@@ -61,12 +61,12 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the loaded spindle.
 
     Attributes:
-        encoder: with the law.
-        spindle: the machine.
-        room: for the torque.
+        encoder: encoder with the speed law.
+        spindle: machine of the spindle.
+        room: scratch array for the torque.
     """
 
     encoder: EncoderTable
@@ -76,7 +76,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Turn the spindle through one block, under the torque of the cut, and read its encoder."""
+    """Turn the spindle through one block under the cutting torque, and read its encoder."""
     angle_true, speed_true = outputs[3], outputs[4]
     follow_law(memory.encoder, first, angle_true, speed_true)
     reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
@@ -87,10 +87,10 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class LoadedSpindleStage(SpindleEncoder):
-    """Spindle with motor, belt and speed loop, which the cut slows; see `lathe_rc.plants.spindle`.
+    """Spindle with motor, belt and speed loop, slowed by the cut (see `lathe_rc.plants.spindle`).
 
     Attributes:
-        spindle: the machine.
+        spindle: machine of the spindle.
     """
 
     kind = "loaded_spindle"
@@ -110,11 +110,11 @@ class LoadedSpindleStage(SpindleEncoder):
         self._clipping = Clipping(name, parameters, _TORQUE, self.spindle.table.limited)
 
     def _loads(self) -> Sequence[Input]:
-        """The force of the cut, of some samples ago."""
+        """Inputs with the delayed cutting force."""
         return [Input("cut", messages.CUT, ("force",), self._delay)]
 
     def _lag(self) -> float:
-        """Angle that the integral of the speed loop needs for the largest load [rad]; less than a turn."""
+        """Angle needed by the integral of the speed loop for the largest load [rad]; less than a revolution."""
         table = self.spindle.table
         return min(table.largest_load / table.integral, _MOST_LAG) if table.radius else 0.0
 
@@ -129,16 +129,16 @@ class LoadedSpindleStage(SpindleEncoder):
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return Memory(self._encoder.table, self.spindle.table, self.room)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """End a run whose spindle cannot go on.
+        """End a run whose spindle cannot continue.
 
         Raises:
-            LatheError: the load is larger than allowed, or what it does.
+            LatheError: the load or its effect exceeds the permitted limit.
         """
         angle, force = outputs[0]["angle_true"][reached], inputs[0]["force"][reached]
         raise failure(reason, self.spindle.table, angle, force)
@@ -148,5 +148,5 @@ class LoadedSpindleStage(SpindleEncoder):
         return self._clipping.tell(first, end)
 
     def finish(self, index: int) -> list[Sparse]:
-        """Return the events that are left when the run ends."""
+        """Return the remaining events at the end of the run."""
         return self._clipping.finish(index)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fine piezo tool drive, and its set point: a learned command, the reference, displacements to compensate."""
+"""Fine piezo tool drive, and its set point from a learned command, the reference, and compensated displacements."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -32,7 +32,7 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 
 class SetPointParameters(NodeParameters):
-    """The set point is command + reference - what is compensated, each where it is chosen."""
+    """Composition of the set point: command + reference - compensated displacements, each selectable."""
 
     use_command: bool = parameter(default=True, doc="the set point has the learned command in it")
     use_reference: bool = parameter(
@@ -46,20 +46,20 @@ class SetPointParameters(NodeParameters):
 
 
 class SetPoint:
-    """The sum that a table chooses.
+    """Set point as the sum of the terms selected in a table.
 
     Args:
-        node: that it is for.
-        table: its parameters.
-        inside: compensated displacements that the drive itself knows and no topic has to bring.
-        prefix: of the parameters, where the table is part of another one.
+        node: name of the node.
+        table: parameters of the set point.
+        inside: compensated displacements known inside the drive, without a topic.
+        prefix: prefix of the parameters in a composed table.
 
     Attributes:
-        inputs: what it reads.
-        signs: with which each of them counts, shape (n,).
+        inputs: input ports.
+        signs: sign of each input in the sum, shape (n,).
 
     Raises:
-        InputError: nothing is chosen, or something twice.
+        InputError: no term is selected, or one is selected twice.
     """
 
     def __init__(self, node: str, table: SetPointParameters, inside: Sequence[str] = (), prefix: str = "") -> None:
@@ -85,7 +85,7 @@ class SetPoint:
 
 @kernel
 def sum_up(signs: Samples, inputs: tuple[Samples, ...], begin: int, samples: int) -> Samples:
-    """The set point [m], shape (n,), from the inputs of a `SetPoint`, the first of which is number ``begin``."""
+    """Return the set point [m], shape (n,), from the inputs of a `SetPoint`, starting at input number ``begin``."""
     set_point = np.zeros(samples)
     for place in range(signs.size):
         part = inputs[begin + place]
@@ -157,7 +157,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     def _identified(
         self, named: _Named, real: PrandtlIshlinskii | BoucWen | None
     ) -> PrandtlIshlinskii | BoucWen | None:
-        """The linearisation's model of the ``real`` hysteresis."""
+        """Return the hysteresis model of the linearisation, for the ``real`` hysteresis."""
         if not self.identified_weights:
             with named("identified_weights"):
                 if self.identified_thresholds or self.identified_proportional:
@@ -171,15 +171,15 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of the drive that controllers may know; the amplifier's lag is left out."""
+        """Quantities of the drive that controllers may know; the amplifier's lag is omitted."""
         known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": 0.0}
         return {"fine/command": known}
 
     def stack(self, node: str, prefix: str = "") -> Stack:
-        """Amplifier and ceramics of a node, at rest; ``prefix`` begins the parameters where they are part of a table.
+        """Return amplifier and ceramics of a node, at rest; ``prefix`` precedes the parameters in a composed table.
 
         Raises:
-            InputError: a hysteresis without an inverse, or a lag far shorter than the step.
+            InputError: the hysteresis has no inverse, or a lag is far shorter than the step.
         """
 
         def named(*names: str) -> AbstractContextManager[None]:
@@ -204,14 +204,14 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
 
 @lru_cache(maxsize=64)
 def _plays(thresholds: tuple[float, ...], weights: tuple[float, ...], proportional: float) -> PrandtlIshlinskii:
-    """Weighted plays at rest, where they stay: a `Stack` has a state of its own."""
+    """Return a copy of weighted plays at rest, since a `Stack` has a state of its own."""
     return PrandtlIshlinskii(
         np.array(thresholds) if thresholds else THRESHOLDS, np.array(weights) if weights else WEIGHTS, proportional
     )
 
 
 class Memory(NamedTuple):
-    """Memory of the step."""
+    """Memory of the step of the piezo drive."""
 
     signs: Samples
     limits: LimiterTable
@@ -230,12 +230,12 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class PiezoActuator(Drive):
-    """Fine piezo drive; see `lathe_rc.plants.piezo`.
+    """Fine piezo drive (see `lathe_rc.plants.piezo`).
 
     Attributes:
         parameters: its table.
-        drive: the machine.
-        set_point: what it is asked for.
+        drive: machine of the drive.
+        set_point: set point of the drive.
     """
 
     kind = "piezo_actuator"
@@ -261,5 +261,5 @@ class PiezoActuator(Drive):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return Memory(self.set_point.signs, self._commands[0].table, self.drive.table, self._sensors[0].table)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spindle and encoder: where time, angle and the run itself begin and end."""
+"""Spindle and encoder: source of time and angle, and of start and end of a run."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
@@ -38,7 +38,7 @@ class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     signal_skew: float = parameter(0.0, "encoder: what the two signals lack of a right angle", "rad")
 
     def errors(self, node: str) -> EncoderErrors:
-        """Errors of a node's encoder.
+        """Return the encoder errors of a node.
 
         Raises:
             InputError: see `EncoderErrors`.
@@ -57,11 +57,11 @@ def step(memory: EncoderTable, first: int, start: int, inputs: Fields, flags: Fi
 
 
 class SpindleEncoder(TimeMaster):
-    """Spindle that follows a speed law, with its encoder; see `lathe_rc.signals.encoder`.
+    """Spindle that follows a speed law, with its encoder (see `lathe_rc.signals.encoder`).
 
     Attributes:
         parameters: its table.
-        law: the speed law; None: a load changes it.
+        law: speed law; None if a load changes it.
     """
 
     kind = "spindle_encoder"
@@ -86,15 +86,15 @@ class SpindleEncoder(TimeMaster):
         self.declare(inputs=loads, outputs=outputs, tells=bool(loads))
 
     def _loads(self) -> Sequence[Input]:
-        """The inputs from its loads."""
+        """Inputs with the loads of the spindle."""
         return ()
 
     def _lag(self) -> float:
-        """By how much a load may hold it back behind its law [rad]."""
+        """Largest lag behind the speed law caused by a load [rad]."""
         return 0.0
 
     def _check_end(self) -> None:
-        """A law of others is known up to the end of its tachogram."""
+        """Check that the run ends within the tachogram of a third-party speed law."""
         parameters, seconds = self.parameters, (self.samples or 0) * self.shared.step
         if parameters.deviation_law and seconds > parameters.deviation_law_end:
             raise InputError(
@@ -103,7 +103,7 @@ class SpindleEncoder(TimeMaster):
             )
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the doubt about a tachogram that does not meet the run."""
+        """Return a warning about a tachogram outside the run."""
         time, deviation, _ = self._law.tachogram
         rpm, doubt = self.parameters.nominal_rpm * (1.0 + deviation), ""
         if self.parameters.tachogram_file and time[-1] < (1.0 - _SHORT) * seconds:
@@ -120,7 +120,7 @@ class SpindleEncoder(TimeMaster):
         return [f"{self.name}.{doubt}"] if doubt else []
 
     def sample_at(self, angle: float) -> int:
-        """First sample at which the law has reached an angle [rad]."""
+        """Return the first sample at which the speed law has reached an angle [rad]."""
         return self._law.samples_until(angle, self.parameters.step)
 
     def speed_range(self) -> tuple[float, float]:
@@ -133,5 +133,5 @@ class SpindleEncoder(TimeMaster):
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return self._encoder.table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool against the part: desired form, displacement, form error."""
+"""Tool and part: desired form, displacement, form error."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, NamedTuple
@@ -21,7 +21,7 @@ from lathe_rc.signals.tip_path import steepest_fall
 
 
 class ToolParameters(FormParameters):
-    """The drives that move the tool, and the desired form of the part unless a profile node publishes it."""
+    """Drives that move the tool, and the desired form of the part unless a profile node publishes it."""
 
     reference: Literal["own", "topic"] = parameter(
         "own", "own: the form below; topic: what a profile node publishes, which others can read before the tool"
@@ -51,18 +51,18 @@ class ToolParameters(FormParameters):
     judging = frozenset({"tolerance"})
 
     def known(self) -> Mapping[str, Value]:
-        """Form of the part, unless a profile node has it."""
+        """Form of the part for laws, unless a profile node provides it."""
         return super().known() if self.reference == "own" else {}
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the tool.
 
     Attributes:
-        form: of the part; without a table if a profile node has it.
+        form: form of the part; without a table if a profile node provides it.
         begin: number of the first input of the drives.
-        drives: how many there are, with a true and a measured position each.
-        cross_slide, deflects: whether these come after the drives.
+        drives: number of drives, each with a true and a measured position.
+        cross_slide, deflects: whether cross slide and edge deflection follow the drives.
     """
 
     form: FormTable
@@ -83,10 +83,10 @@ def add_drive(
     known: Samples,
     error: Samples,
 ) -> None:
-    """Add a drive's motion; all [m] and of shape (n,). The first drive ``begins`` the sum.
+    """Add a drive's motion; all [m] and of shape (n,). The first drive, marked by ``begins``, starts the sum.
 
-    The error is Xd - X of what is true (paper 000, Fig. 1); what can be known of it is what is expected at the measured
-    angle less the measured motions.
+    The error is Xd - X of the true signals (paper 000, Fig. 1); the known error is the expected form at the measured
+    angle minus the measured motions.
     """
     for k in range(reference.size):
         displacement[k] = position[k] if begins else displacement[k] + position[k]
@@ -126,11 +126,11 @@ _ELSEWHERE = FormTable(
 
 
 class Tool(Stage):
-    """Sums the motions (paper 001, Fig. 1a) and compares with the desired form.
+    """Tool position as the sum of the motions (paper 001, Fig. 1a), compared with the desired form.
 
     Attributes:
         parameters: its table.
-        form: of the part; None if a profile node has it.
+        form: form of the part; None if a profile node provides it.
     """
 
     kind = "tool"
@@ -156,11 +156,11 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the doubts about the form's file, one line each."""
+        """Return the warnings about the form's file, one line each."""
         return self.form.doubts if self.form else []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse a profile that the first drive cannot follow, and a flank that would rub."""
+        """Check that the first drive can follow the profile and that the flank does not rub."""
         super().check_cell(cell, cures=cures)
         owner = self._form_owner(cell)
         topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
@@ -177,7 +177,7 @@ class Tool(Stage):
             _check_flank(owner.name, owner.parameters, owner.form)
 
     def _form_owner(self, cell: WiredCell) -> "Tool | ProfileStage | None":
-        """The stage that has the tool's desired form."""
+        """Return the stage that provides the tool's desired form."""
         if self.form is not None:
             return self
         source = cell.publisher(
@@ -187,7 +187,7 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
         # A form has two fields in each of its inputs; a profile node gives three.
@@ -196,7 +196,7 @@ class Tool(Stage):
 
 
 def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed: float) -> None:
-    """Refuse a profile that a drive cannot follow at a speed [rad/s]."""
+    """Check that a drive can follow a profile at a speed [rad/s]."""
     for what, asked, allowed, unit in (
         ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
         ("velocity", demand.velocity, limits.velocity, "m/s"),
@@ -210,7 +210,7 @@ def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed:
 
 
 def _check_flank(owner: str, parameters: FormParameters, form: Form) -> None:
-    """Refuse a flank that does not leave the surface behind the edge free."""
+    """Check that the flank clears the surface behind the edge."""
     fall = steepest_fall(form.surface, parameters.part_radius, parameters.feed)
     if fall.clearance >= parameters.clearance:
         raise InputError(
