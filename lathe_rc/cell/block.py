@@ -21,10 +21,10 @@ class Block:
 
     Attributes:
         run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
-        samples: its length.
-        log_ns: its stamp [ns].
+        samples: number of samples.
+        log_ns: time stamp [ns].
         signals: arrays of shape (samples,) by field.
-        whole: the same as one array of shape (fields, samples), where it was computed in this process.
+        whole: all signals as one array of shape (fields, samples), if computed in this process.
     """
 
     run_id: str
@@ -39,7 +39,7 @@ class Block:
     whole: Samples | None = None
 
     def part(self, start: int, stop: int) -> "Block":
-        """Its samples ``start`` to ``stop``, as views."""
+        """Return samples ``start`` to ``stop`` of the block, as views."""
         first, last = self.first_index + start, self.last and stop == self.samples
         log_ns = START_NS + (first + stop - start - 1) * self.step_ns
         signals = {name: array[start:stop] for name, array in self.signals.items()}
@@ -47,10 +47,10 @@ class Block:
         return Block(self.run_id, self.source, first, self.step_ns, last, self.companions, samples, log_ns, signals)
 
     def copy_to(self, signals: Signals, *, check: bool = True) -> None:
-        """Copy samples into arrays of shape (samples,), by field.
+        """Copy the samples into arrays of shape (samples,), by field.
 
         Raises:
-            ValueError: a sample is NaN or infinite, unless that has been checked.
+            ValueError: a sample is NaN or infinite, if ``check`` is set.
         """
         for name, array in signals.items():
             array[:] = self.signals[name]
@@ -58,7 +58,7 @@ class Block:
                 self._check(name, array)
 
     def check(self) -> None:
-        """Refuse samples that no reader could use.
+        """Check that no sample is NaN or infinite.
 
         Raises:
             ValueError: a sample is NaN or infinite.
@@ -72,10 +72,10 @@ class Block:
 
 
 class NotFiniteError(ValueError):
-    """A sample that no reader could use.
+    """Error for a NaN or infinite sample.
 
     Attributes:
-        index: of the sample.
+        index: index of the sample.
     """
 
     def __init__(self, message: str, index: int) -> None:
@@ -84,16 +84,16 @@ class NotFiniteError(ValueError):
 
 
 def check_finite(source: str, name: str, array: Samples, first: int) -> None:
-    """Refuse samples that no reader could use.
+    """Check that no sample of a field is NaN or infinite.
 
     Args:
-        source: who publishes them.
-        name: of the field.
+        source: name of the publisher.
+        name: name of the field.
         array: shape (n,), any type; n up to `lathe_rc.messages.MAX_BLOCK`.
         first: index of the first sample.
 
     Raises:
-        NotFiniteError: a sample is NaN or infinite; the first.
+        NotFiniteError: a sample is NaN or infinite; the error holds the first.
     """
     # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
     if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
@@ -103,10 +103,10 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
 
 
 class Pool:
-    """Memory for the samples of blocks of one type.
+    """Memory pool for the samples of blocks of one type.
 
-    What is handed to readers in the same process is theirs as long as they want it, so each block needs memory of its
-    own; to make it for some blocks at once takes a quarter of the time.
+    Readers in the same process may keep the arrays as long as needed, so each block needs memory of its
+    own; allocating it for several blocks at once takes 25 % of the time.
 
     Args:
         msgtype: message type.
@@ -131,7 +131,7 @@ class Pool:
 
 
 class Framer:
-    """Makes the sparse messages of one node.
+    """Factory of the sparse messages of one node.
 
     Args:
         run_id: identity of the run.
@@ -139,7 +139,7 @@ class Framer:
         step_ns: sampling step [ns].
 
     Attributes:
-        companions: messages made so far, which the node's next block reports.
+        companions: number of messages created so far, which the node's next block reports.
     """
 
     def __init__(self, run_id: str, source: str, step_ns: int) -> None:
@@ -147,7 +147,7 @@ class Framer:
         self.companions = 0
 
     def sparse(self, message: Sparse) -> Any:
-        """A message at a chosen sample; counted, so that blocks can say how many came before."""
+        """Return a message at a chosen sample, and count it, since blocks report the number of preceding messages."""
         self.companions += 1
         head = messages.header(message.index, self._step_ns)
         kind = messages.store().types[message.type]

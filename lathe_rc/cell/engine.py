@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offline host: all stages of a cell in one program."""
+"""Offline host: all stages of a cell in one program."""
 
 import gc
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -21,25 +21,25 @@ K = TypeVar("K")
 
 
 class Sink(Protocol):
-    """A sink for the results of a run, piece by piece, in order."""
+    """Sink for the results of a run, chunk by chunk, in order."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Take the samples ``first`` on of every topic heard, and the sparse messages among them, by relative topic."""
 
 
 class Engine:
-    """Runs a cell as fast as it goes.
+    """Engine that runs a cell offline, as fast as possible.
 
-    A stage computes as much in one go as the shortest feedback allows, whatever ``block_size`` says; sinks get whole
-    numbers of blocks, which can be cut into the messages of any other host. No bit depends on either.
+    A stage computes as many samples per call as the shortest feedback allows, whatever ``block_size`` is; sinks get whole
+    numbers of blocks, which can be cut into the messages of any other host. The results depend on neither.
 
     Args:
         cell: the wired cell; must have passed its check.
-        heard: what the sinks take: relative names of topics, or ``TOPIC.FIELD`` for one field of signals; None: all.
-            Nothing else is kept, and no other sparse message is made.
+        heard: relative topics requested by the sinks, or ``TOPIC.FIELD`` for one field of signals; None: all.
+            Other signals are not kept, and other sparse messages are not created.
 
     Raises:
-        InputError: the run has no end.
+        InputError: the run is endless.
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
@@ -65,7 +65,7 @@ class Engine:
         self._program = Program(wires, self._tapes, self._chunk)
 
     def _take(self, cell: Cell) -> None:
-        """Have the stages of a cell ready."""
+        """Load the stages of a cell."""
         self.samples = cell.samples
         self._wiring, self._block = cell.wiring, cell.master.shared.block_size
         self._stages = list(cell.stages.values())
@@ -74,10 +74,10 @@ class Engine:
             stage.unheard = {topic for name, topic in names.items() if name not in self._heard}
 
     def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
-        """Begin anew with another cell, which has passed its check.
+        """Restart with another cell, which has passed its check.
 
         Returns:
-            Whether that can be: it must be wired as the one before, and as much heard of it.
+            Whether the restart is possible: wiring and requested topics must equal those of the previous cell.
         """
         block = cell.master.shared.block_size
         # Cells whose ports are alike share one `Wiring`, so that to compare objects is enough.
@@ -89,11 +89,11 @@ class Engine:
         return True
 
     def run(self, sinks: Iterable[Sink]) -> None:
-        """Run to the end.
+        """Run the cell to completion.
 
         Raises:
-            DivergedError: a sample that sinks would take is NaN or infinite; names the first.
-            LatheError: a stage cannot go on.
+            DivergedError: a requested sample is NaN or infinite; the message names the first.
+            LatheError: a stage cannot continue.
         """
         # Freeze existing objects so that the garbage collector skips them.
         gc.freeze()
@@ -106,7 +106,7 @@ class Engine:
             gc.unfreeze()
 
     def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
-        """Run piece by piece; the sample index after each. Raises as `run`."""
+        """Run chunk by chunk, yielding the sample index after each chunk; raise as `run`."""
         for first in range(0, self.samples, self._piece):
             self._tapes.advance(first)
             broken = False
@@ -121,7 +121,7 @@ class Engine:
             yield self._program.reached
 
     def _break_off(self) -> NoReturn:
-        """Name the first sample that is not finite, as nodes do: it is in the newest chunk."""
+        """Raise an error that names the first NaN or infinite sample, which is in the newest chunk, as nodes do."""
         found: list[tuple[int, int, str]] = []
         end = self._program.reached
         first = (end - 1) // self._chunk * self._chunk
@@ -134,7 +134,7 @@ class Engine:
         raise DivergedError(min(found)[2])
 
     def _hand_over(self, first: int, end: int, sinks: Sequence[Sink]) -> None:
-        """Give a piece to the sinks."""
+        """Pass a chunk to the sinks."""
         if first == end:
             return
         dense = _Kept[Signals]({})
@@ -155,7 +155,7 @@ class Engine:
 
 
 class _Kept(dict[str, K]):
-    """Signals that are kept for sinks, by name."""
+    """Signals kept for sinks, by name."""
 
     def __init__(self, content: Mapping[str, K], of: str = "") -> None:
         super().__init__(content)
@@ -166,5 +166,5 @@ class _Kept(dict[str, K]):
 
 
 def _heard(cell: Cell, heard: Collection[str] | None) -> frozenset[str]:
-    """Topics and fields that the sinks of a cell take; see `Engine`."""
+    """Return the topics and fields requested by the sinks of a cell (see `Engine`)."""
     return frozenset((*cell.dense, *cell.sparse) if heard is None else heard)

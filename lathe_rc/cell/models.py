@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that a controller has of drive, form and encoder: those of the nodes, unless the scenario gives others.
+"""Controller models of drive, form and encoder, taken from the nodes unless the scenario gives others.
 
-A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that nobody has given,
-gets the value of the drive that reads what the controller commands. Quantities with the same word before a dot belong
-together: a scenario gives all of them or none. The same holds for what a table ``asks``: the node that knows it tells
-it.
+A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that is not set,
+gets the value of the drive that reads the controller's command. Quantities with the same word before a dot belong
+together: a scenario gives all of them or none. The parameters that a table ``asks`` for are provided likewise by the
+node that has them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,24 +19,24 @@ Quantity = float | list[float]
 
 @cache
 def _marked(table: type[NodeParameters]) -> Mapping[str, str]:
-    """Quantity of the drive by parameter."""
+    """Return the drive quantity by parameter."""
     return {name: row.drive for name, row in table.rows().items() if row.drive}
 
 
 def _together(quantity: str) -> str:
-    """The group that a quantity is part of; itself, if of none."""
+    """Return the group of a quantity; the quantity itself without a group."""
     return quantity.partition(".")[0]
 
 
 def _not_given(table: NodeParameters) -> Mapping[str, str]:
-    """Quantity of the drive by parameter, of those that the scenario does not give."""
+    """Return the drive quantity by parameter, for the parameters that the scenario does not give."""
     marked = _marked(type(table))
     given = {_together(quantity) for name, quantity in marked.items() if name in table.model_fields_set}
     return {name: quantity for name, quantity in marked.items() if _together(quantity) not in given}
 
 
 def _drives(tables: Mapping[str, NodeParameters], topic: str) -> Iterator[tuple[str, Mapping[str, Quantity]]]:
-    """Names and quantities of the drives that read a topic."""
+    """Return names and quantities of the drives that read a topic."""
     for node, table in tables.items():
         for command, known in table.drive_models().items():
             if remapped(table, command) == topic:
@@ -44,7 +44,7 @@ def _drives(tables: Mapping[str, NodeParameters], topic: str) -> Iterator[tuple[
 
 
 def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
-    """Values of the commanded drives for the parameters that the scenario does not give."""
+    """Return the commanded drives' values for the parameters that the scenario does not give."""
     values: dict[str, Quantity] = {}
     of: dict[str, str] = {}
     missing = _not_given(table)
@@ -61,7 +61,7 @@ def _model(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
 
 
 def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters]) -> dict[str, Value]:
-    """Values of other nodes for what a table asks and the scenario does not give."""
+    """Return other nodes' values for the parameters that a table asks for and the scenario does not give."""
     values: dict[str, Value] = {}
     for names in table.asks:
         if names & table.model_fields_set:
@@ -78,17 +78,17 @@ def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
 
 
 def given(table: NodeParameters) -> NodeParameters:
-    """Return the same table, whose models count as given."""
+    """Return a copy of the table whose models count as given."""
     made = table.model_copy()
     made.model_fields_set.update(_marked(type(table)))
     return made
 
 
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
-    """Return the tables of a cell by node, with the models that the scenario does not give; they count as not given.
+    """Return the tables of a cell by node, with the missing models filled in; these count as not given.
 
     Raises:
-        InputError: several drives are commanded, and a model that is not given cannot be that of all.
+        InputError: several drives are commanded, and a missing model cannot match all of them.
     """
     made = dict(tables)
     for node, table in tables.items():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 parameter files without ROS, read as rcl reads them.
+"""Parser of ROS 2 parameter files without ROS, with the scalar rules of rcl.
 
 YAML leaves the meaning of a scalar to its reader, and rcl's differs from that of every Python library: ``1e-3``
 is a double, ``0x10`` and ``010`` are integers, ``yes`` is true. So the text is parsed by PyYAML and the scalars
 by the C library's own strtol and strtod, as rcl_yaml_param_parser does it. Patterns for PyYAML's resolvers would need
-more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and a number out of range is a text.
+more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and a number out of range is a string.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ _libc.strtol.restype, _libc.strtod.restype = ctypes.c_long, ctypes.c_double
 
 
 def _converted(function: Callable[..., Any], text: str, *base: int) -> Any:
-    """The number that strtol or strtod reads from a text; None if it does not take all of it, or is out of range."""
+    """Return the number that strtol or strtod reads from a string; None after a partial conversion or range error."""
     data, end = ctypes.create_string_buffer(text.encode()), ctypes.c_char_p()
     ctypes.set_errno(0)
     number = function(data, ctypes.byref(end), *base)
@@ -41,7 +41,7 @@ def _converted(function: Callable[..., Any], text: str, *base: int) -> Any:
 
 
 def scalar(text: str) -> bool | int | float | str:
-    """The value that rcl gives a scalar without quotes."""
+    """Return the value that rcl assigns to a scalar without quotes."""
     if text in _TRUE | _FALSE:
         return text in _TRUE
     number: int | float | None = _converted(_libc.strtol, text, 0)
@@ -51,10 +51,10 @@ def scalar(text: str) -> bool | int | float | str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Leaves open what a scalar means, so that an explicit ``!!str`` can be told from what YAML would guess."""
+    """YAML loader that leaves scalars unresolved, to distinguish an explicit ``!!str`` from YAML's implicit types."""
 
     def resolve(self, kind: object, value: object, implicit: object) -> str:
-        """The tag of a node that the file gives none."""
+        """Return the tag of a node without an explicit tag."""
         return _PLAIN
 
 
@@ -84,7 +84,7 @@ def _value(node: yaml.Node, where: str) -> Value:
 
 
 def _flatten(node: yaml.Node, where: str, prefix: str, into: dict[str, Value]) -> None:
-    """Collect parameters; nested maps make dotted names."""
+    """Collect parameters; nested maps form dotted names."""
     if not isinstance(node, yaml.MappingNode):
         raise InputError(f"{where}: not a map of parameters")
     for key, item in node.value:
@@ -98,7 +98,7 @@ def _flatten(node: yaml.Node, where: str, prefix: str, into: dict[str, Value]) -
 
 
 def _check_events(text: str, source: str) -> None:
-    """Refuse what rcl does not read, and what would take PyYAML for ever, before any of it is built."""
+    """Reject YAML that rcl does not read, or that would take PyYAML forever, before building any object."""
     in_brackets: list[bool] = []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -127,16 +127,16 @@ def _compose(text: str, source: str) -> yaml.Node | None:
 
 
 def parse_value(text: str, source: str) -> Value:
-    """A value as it would stand in a parameter file, e.g. ``1e-3`` or ``[1, 2]``."""
+    """Parse a value as written in a parameter file, e.g. ``1e-3`` or ``[1, 2]``."""
     node = _compose(text, source)
     return "" if node is None else _value(node, source)
 
 
 def rows(text: str, source: str) -> list[dict[str, Value]]:
-    """A list of maps of values, each by the same rules.
+    """Parse a list of maps of values, with the same scalar rules.
 
     Raises:
-        InputError: it is none.
+        InputError: the string is not a list of maps.
     """
     root = _compose(text, source)
     items = root.value if isinstance(root, yaml.SequenceNode) else []
@@ -149,7 +149,7 @@ def rows(text: str, source: str) -> list[dict[str, Value]]:
 
 
 def read(path: Path) -> dict[str, dict[str, Value]]:
-    """Parameters by node and name, in the order of the file.
+    """Read parameters by node and name, in the order of the file.
 
     Node names lose their leading ``/`` or ``/**/``; the wildcard for all nodes is ``/**``.
 
@@ -168,10 +168,10 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
 
 
 def parse(text: str, source: str) -> dict[str, dict[str, Value]]:
-    """The same as `read` of a text; ``source`` is where it is from.
+    """Parse parameters from a string, as `read` does; ``source`` is its origin, for messages.
 
     Raises:
-        InputError: it is larger than 1 MiB, or not a ROS 2 parameter file.
+        InputError: the string is larger than 1 MiB, or not a ROS 2 parameter file.
     """
     if len(text) > _MAX_BYTES:
         raise InputError(f"{source}: {_TOO_LARGE}")

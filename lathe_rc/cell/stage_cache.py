@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of a batch that run again: all that a run may change of a stage is set back to its start.
+"""Reuse of stages in a batch, by resetting everything that a run may change in a stage.
 
-A cell of a batch differs from the one before in a few tables. To make the other stages anew takes longer than to copy
-what their runs have changed, and their memories stay where the caches have them: without this module a cell of the
+A cell of a batch differs from the previous one in a few tables. Creating the other stages takes longer than copying
+the state that a run has changed, and their memories stay in the caches: without this module a cell of the
 batch benchmark takes 10 % longer (full cell, three nodes of twelve differ) or 3 % (two-channel cell, four of seven).
 """
 
@@ -33,21 +33,21 @@ _CONSTANT = (
 
 
 class _Plain:
-    """An object with nothing but its attributes; an object of another layout may hide something."""
+    """Reference class with nothing but attributes; an object of another layout may have hidden state."""
 
 
 class UnknownPartError(Exception):
-    """An object that this module cannot set back."""
+    """Error for an object that this module cannot reset."""
 
 
 class Start:
-    """The state of a stage before its run.
+    """Initial state of a stage, taken before its run.
 
     Args:
-        stage: which has not run.
+        stage: stage that has not run yet.
 
     Raises:
-        UnknownPartError: part of it is of a kind that cannot be set back, such as an open file.
+        UnknownPartError: the stage contains an object that cannot be reset, such as an open file.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -56,12 +56,12 @@ class Start:
         self._look(stage)
 
     def rewind(self) -> None:
-        """Set everything back."""
+        """Reset the stage to its initial state."""
         for back in self._back:
             back()
 
     def _look(self, part: Any) -> None:
-        """Remember a part of the stage, and what hangs on it."""
+        """Record a part of the stage and everything that it references."""
         if isinstance(part, _CONSTANT) or id(part) in self._seen:
             return
         if isinstance(part, types.FunctionType) and part.__closure__ is None:
@@ -94,12 +94,12 @@ class Start:
 
 
 def _is_cache(part: object, name: str) -> bool:
-    """Whether an attribute is computed once from others that nobody changes."""
+    """Return whether an attribute is computed once from constant attributes."""
     return isinstance(getattr(type(part), name, None), cached_property)
 
 
 def _reset(part: Any, attributes: dict[str, Any]) -> None:
-    """Give an object the attributes that it had."""
+    """Restore the attributes of an object."""
     there = vars(part)
     for name, value in attributes.items():
         if name not in there or there[name] is not value:
@@ -122,16 +122,16 @@ def _refill(part: Any, content: Any) -> None:
 
 
 class StageCache:
-    """The newest stage of each name, and its start; for cells that run one after the other."""
+    """Cache of the newest stage of each name with its initial state, for cells run one after the other."""
 
     def __init__(self) -> None:
         self._stages: dict[str, Stage] = {}
         self._starts: dict[str, Start | None] = {}  # of those that were asked for again; None: they cannot be set back
 
     def take(self, name: str, table: NodeParameters) -> Stage:
-        """Return the stage of a node: the one before if its table is the same, or a new one.
+        """Return the stage of a node: the cached one if its table is equal, or a new one.
 
-        The first with a table is not remembered: the next cell may have another one.
+        The first stage with a table is not cached, since the next cell may have a different table.
         """
         before = self._stages.get(name)
         again = before is not None and _same(before, table)
@@ -154,7 +154,7 @@ class StageCache:
 
 
 def _same(stage: Stage, table: NodeParameters) -> bool:
-    """Whether a stage has such a table; the name of the run counts for those of others, who may write it somewhere."""
+    """Return whether a stage has an equal table; for third-party stages the run id counts as well."""
     before = stage.shared
     if before is table:
         return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of what a drive is commanded, and what is said of samples that are clipped."""
+"""Limits of a drive's command, and events about clipped samples."""
 
 import numpy as np
 import numpy.typing as npt
@@ -25,19 +25,19 @@ class LimitedParameters(NodeParameters):
     command_jerk: NonNegative = parameter(0.0, "and within this jerk; 0: none", "m/s^3")
 
     def command_limits(self) -> CommandLimits:
-        """The limits that are set."""
+        """Active limits of the command."""
         given = (self.command_stroke, self.command_velocity, self.command_acceleration, self.command_jerk)
         return CommandLimits(*(limit or np.inf for limit in given))
 
 
 class Clipping:
-    """Says with which sample a command begins to be clipped, and when it is free again.
+    """Monitor of the clipping of a command: events at its start and end.
 
     Args:
-        node: whose command it is.
+        node: name of the commanding node.
         parameters: its table.
-        which: of its commands; empty if it has one.
-        flags: whether sample n was clipped, at n modulo their number, a power of two; one alone: there is no limit.
+        which: name of the command; empty if the node has one.
+        flags: whether sample n was clipped, at n modulo the length, a power of two; length 1: no limit.
     """
 
     def __init__(self, node: str, parameters: NodeParameters, which: str, flags: npt.NDArray[np.uint8]) -> None:
@@ -50,7 +50,7 @@ class Clipping:
         self._clipped, self._before, self._left = 0, 0, 0
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """The events of the samples from ``first`` on and before ``end``, which were computed last."""
+        """Return the events for samples ``first`` to ``end`` (exclusive), which were computed last."""
         found: list[Sparse] = []
         if self._flags.size == 1:
             return found
@@ -71,7 +71,7 @@ class Clipping:
         return found
 
     def finish(self, index: int) -> list[Sparse]:
-        """The events of the samples up to ``index`` that have not been published yet."""
+        """Return the unpublished events of the samples up to ``index``."""
         if self._clipped == self._before:
             return []
         action = f"{LIMITED}:{self._which} {self._clipped - self._before} samples were clipped"
@@ -79,7 +79,7 @@ class Clipping:
         return [Sparse(self._topic, messages.EVENT, index, {"action": action})]
 
     def _ends(self, first: int, clipped: Samples) -> list[Sparse]:
-        """With which sample it begins, and is free again."""
+        """Return the samples at which clipping starts and ends."""
         found: list[Sparse] = []
         count, place, samples = self._clipped, 0, clipped.size
         self._clipped += int(clipped.sum())
@@ -110,16 +110,16 @@ class Clipping:
 
 
 class LimitedCommand(Clipping):
-    """Keeps a command within its limits, and says with which sample that begins and ends.
+    """Limiter that keeps a command within its limits, and reports the samples at which clipping starts and ends.
 
     Args:
-        node: whose command it is.
+        node: name of the commanding node.
         parameters: its table.
-        which: of its commands; empty if it has one.
+        which: name of the command; empty if the node has one.
 
     Attributes:
         on: whether there is a limit.
-        table: for `limited`.
+        table: table for `limited`.
     """
 
     def __init__(self, node: str, parameters: LimitedParameters, which: str = "") -> None:
@@ -131,7 +131,7 @@ class LimitedCommand(Clipping):
 
 @kernel
 def limited(limits: LimiterTable, first: int, command: Samples) -> Samples:
-    """The drive's input [m], shape (n,), of samples ``first`` on; see `LimitedCommand`."""
+    """Return the drive's input [m], shape (n,), for samples starting at ``first`` (see `LimitedCommand`)."""
     if limits.clipped.size == 1:
         return command
     given = np.empty_like(command)

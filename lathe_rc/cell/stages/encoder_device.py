@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real encoder as time master: its counts, as they come or from a file, say how the spindle has turned."""
+"""Real encoder as time master: the spindle motion follows from its counts, live or from a file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,10 +24,10 @@ _RPM = 30.0 / np.pi  # for 1 rad/s
 
 
 class EncoderDeviceParameters(TimeMasterParameters):
-    """A real encoder in place of the spindle: where its counts come from, and length and pace of the run.
+    """Real encoder in place of the spindle: source of the counts, and length and pace of the run.
 
-    The angle is linear between readings; what is called true is what was measured. A topic or a line sets the pace
-    itself: `speed_factor` is for a file alone.
+    The angle is linear between readings; the measured angle counts as the true one. A topic or a serial line sets the pace
+    itself: `speed_factor` applies to files only.
     """
 
     counts_per_revolution: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
@@ -61,11 +61,11 @@ class EncoderDeviceParameters(TimeMasterParameters):
 
 
 class EncoderDevice(TimeMaster):
-    """Time master that follows the counts of a real encoder; see `lathe_rc.signals.counts`.
+    """Time master that follows the counts of a real encoder (see `lathe_rc.signals.counts`).
 
     Attributes:
         parameters: its table.
-        counted: the angle.
+        counted: angle from the counts.
     """
 
     kind = "encoder_device"
@@ -127,20 +127,20 @@ class EncoderDevice(TimeMaster):
     # ---- readings -----------------------------------------------------------------------------------
 
     def hear(self, time_ns: int, count: float) -> None:
-        """Take a reading: its time [ns] and the counter.
+        """Append a reading: its time [ns] and the counter.
 
         Raises:
-            LatheError: it cannot be; names the node.
+            LatheError: the reading is invalid; the message names the node.
         """
         with self.named():
             self.counted.add(time_ns, count)
         self._look_for_the_end()
 
     def end(self) -> None:
-        """No reading will come any more.
+        """Mark the end of the readings.
 
         Raises:
-            LatheError: the run was to be longer.
+            LatheError: the run should have been longer.
         """
         self._look_for_the_end()
         if self.samples is None and not self.parameters.revolutions:
@@ -149,7 +149,7 @@ class EncoderDevice(TimeMaster):
             raise LatheError(self._too_short(f"{self.name}: the line"))
 
     def go_on(self) -> None:
-        """Go on at the last speed: the encoder is lost, and the others have to come to their safe state."""
+        """Continue at the last speed after a loss of the encoder, so that the cell can go to its safe state."""
         self.counted.go_on(self._speed)
 
     def _look_for_the_end(self) -> None:
@@ -159,13 +159,13 @@ class EncoderDevice(TimeMaster):
 
     @property
     def available(self) -> int:
-        """Samples that can be computed."""
+        """Number of samples that can be computed."""
         return self.counted.available if self.samples is None else self.samples
 
     # ---- for the checks before a start --------------------------------------------------------------
 
     def sample_at(self, angle: float) -> int:
-        """First sample at which the readings have reached an angle [rad]; later ones say nothing."""
+        """Return the first sample at which the readings have reached an angle [rad]; later readings do not matter."""
         found = None if self.live else self.counted.reached(angle)
         if found is None:
             where = f"{angle / _TURN:g} revolutions"
@@ -209,7 +209,7 @@ class EncoderDevice(TimeMaster):
         return self._say(first, out["speed"])
 
     def _say(self, first: int, speed: Samples) -> list[Sparse]:
-        """Events of these samples; those of the speed once."""
+        """Return the events of these samples; those of the speed only once."""
         low, high = self.speed_range()
         said = []
         for what, outside in ((TOO_FAST, speed > high), (TOO_SLOW, speed < low)):

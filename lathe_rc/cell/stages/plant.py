@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives as plug-ins: a class with its equation, sample by sample, and nothing of ports, blocks and events."""
+"""Drives as plug-ins: a class with an equation per sample, independent of ports, blocks and events."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -36,10 +36,10 @@ class PlantMemory(NamedTuple):
     """Memory of the step of a drive.
 
     Attributes:
-        retraction: what it does by itself when members are lost.
-        limits: of its command.
-        plant: its own.
-        sensor: of its position.
+        retraction: autonomous retraction after a loss of cell members.
+        limits: limits of the command.
+        plant: memory of the drive itself.
+        sensor: sensor of the position.
     """
 
     retraction: TakeoverTable
@@ -49,7 +49,7 @@ class PlantMemory(NamedTuple):
 
 
 class SingleDrive(Drive):
-    """A drive that moves the tool alone: its command is limited, its position is measured, and it can retract.
+    """Drive that moves the tool alone, with limited command, measured position, and retraction.
 
     Attributes:
         parameters: its table.
@@ -73,11 +73,11 @@ class SingleDrive(Drive):
     @property
     @abstractmethod
     def machine(self) -> Any:
-        """Its own part of the memory."""
+        """Memory of the drive itself."""
 
     @property
     def memory(self) -> PlantMemory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return PlantMemory(self._retraction.table, self._commands[0].table, self.machine, self._sensors[0].table)
 
 
@@ -85,7 +85,7 @@ Moved = tuple[float, float, float]  #: position [m], velocity [m/s], and effort 
 
 
 def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
-    """Make the step of a drive from its equation for one sample."""
+    """Build the step of a drive from its equation for one sample."""
 
     def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
         """Move the drive through one block, within its limits."""
@@ -100,15 +100,15 @@ def _loop(sample: Callable[[Any, float], Moved]) -> Callable[..., Reached]:
 
 
 class Plant(Sampled, SingleDrive):
-    """Base of drives of one's own.
+    """Base class of user-defined drives.
 
-    One has a table ``Parameters``, the memory that it starts with (`start`), and its equation ``sample(memory,
-    command)``, which gives position, velocity and effort: a `kernel`, for which the memory is a NamedTuple of arrays of
-    float64, int64 or uint8, numbers, and NamedTuples of those; or a function in plain Python, for any memory. It may
+    A drive has a table ``Parameters``, an initial memory (`start`), and an equation ``sample(memory,
+    command)``, which returns position, velocity and effort: a `kernel`, whose memory is a NamedTuple of arrays of
+    float64, int64 or uint8, numbers, and nested NamedTuples; or a function in plain Python, for any memory. It may
     change arrays of the memory and nothing else.
 
     Attributes:
-        plant: its memory.
+        plant: memory of the drive.
 
     Example:
         >>> import numpy as np
@@ -141,9 +141,9 @@ class Plant(Sampled, SingleDrive):
         self.plant = self.started()
 
     def response(self, frequency: Array) -> Complex | None:
-        """Response of the position to the command at frequencies [rad/s], shape (n,).
+        """Return the response of the position to the command at frequencies [rad/s], shape (n,).
 
-        It is what the check before a start and the stability margin go by. A drive that does not tell it is said to be
+        The check before a start and the stability margin use it. A drive without this method is reported as
         unchecked.
         """
         return None

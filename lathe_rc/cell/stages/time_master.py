@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source of the cell's time and angle: an emulated spindle, a real encoder, or a recorded one."""
+"""Source of the cell's time and angle: an emulated spindle, a real encoder, or a recorded one."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ _LEAST_SAMPLES = 4  # of a revolution
 
 
 class TimeMasterParameters(NodeParameters):
-    """The measured speed, and length and pace of the run."""
+    """Measured speed, and length and pace of the run."""
 
     counts_per_revolution: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
         0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
@@ -52,13 +52,13 @@ class TimeMasterParameters(NodeParameters):
 
 
 class TimeMaster(Stage):
-    """The stage that all others follow; it reads no other.
+    """Stage that provides time and angle to all others, and reads no other stage.
 
     Attributes:
         parameters: its table.
         samples: length of the run [sample]; None: endless, or not known yet.
-        live: readings come while the cell runs, in real time: it cannot run offline.
-        law: the speed law that it follows; None: nobody knows it in advance.
+        live: whether readings arrive in real time while the cell runs, which excludes offline runs.
+        law: speed law of the spindle; None: not known in advance.
     """
 
     live = False
@@ -70,7 +70,7 @@ class TimeMaster(Stage):
         self.samples: int | None = None
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Refuse a spindle that turns back, or too fast for the sampling rate."""
+        """Reject a spindle that turns back, or too fast for the sampling rate."""
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
         if low <= 0.0:
@@ -85,10 +85,10 @@ class TimeMaster(Stage):
 
     @abstractmethod
     def sample_at(self, angle: float) -> int:
-        """First sample at which the true angle has reached ``angle`` [rad].
+        """Return the first sample at which the true angle has reached ``angle`` [rad].
 
         Raises:
-            InputError: it never does, or nobody can know.
+            InputError: the angle is never reached, or this is not known.
         """
 
     @abstractmethod
@@ -101,7 +101,7 @@ class TimeMaster(Stage):
 
     @property
     def expected_samples(self) -> int | None:
-        """Length of the run [sample], at the nominal speed where it is not known yet; None: endless."""
+        """Return the expected length of the run [sample], at nominal speed if not known yet; None if endless."""
         if self.samples is not None or not self.parameters.revolutions:
             return self.samples
         return round(self.parameters.revolutions * 2.0 * np.pi / self.shared.nominal_speed / self.shared.step)
