@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiling the steps of stages ahead of a run: once on a machine, on all cores.
+"""Compilation of the steps of stages ahead of a run, once per machine, on all cores.
 
-Numba compiles one function at a time, so processes do it: each gets some stages and says when it is done with one.
-What they have compiled is on the disk, where whoever runs the stages finds it.
+Numba compiles one function at a time, so several processes are used: each gets some stages and reports each one.
+The compiled code is cached on disk, where later runs find it.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ _REFUSED = "refused: "  # begins what a process says of a stage whose step canno
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
-    """Return the stages whose steps are not compiled on this machine; of those with the same step, the first."""
+    """Return the stages whose steps are not compiled on this machine; the first of those with an equal step."""
     # Backwards, so that of stages with one step the first stays in the dictionary.
     steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
     return [stage for name, stage in reversed(steps.items()) if not is_kept(name)]
@@ -39,11 +39,11 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
     """Compile the steps of stages that are not compiled on this machine.
 
     Yields:
-        The names of the stages that are left, before the first and after each but the last.
+        The names of the remaining stages, before the first compilation and after each but the last.
 
     Raises:
         InputError: a step cannot be compiled.
-        LatheError: a process that compiles has ended.
+        LatheError: a compiling process has exited.
     """
     # The longest first, so that all processes end at about the same time: the larger its memory, the more a step does.
     missing = sorted(uncompiled(stages), key=lambda stage: -stage.native().words.size)
@@ -72,7 +72,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
 
 
 def _start() -> "subprocess.Popen[str]":
-    """Start a process that compiles the steps of the stages that its input names."""
+    """Start a process that compiles the steps of the stages named on its standard input."""
     environment = os.environ | {"PYTHONPATH": search_path()}
     command = [*allowed_code.interpreter(__name__), *allowed_code.arguments()]
     return subprocess.Popen(command, stdin=-1, stdout=-1, text=True, env=environment)
@@ -81,7 +81,7 @@ def _start() -> "subprocess.Popen[str]":
 def _have_compiled(
     process: "subprocess.Popen[str]", waiting: deque[tuple[int, Stage]], done: "queue.SimpleQueue[tuple[int, str]]"
 ) -> None:
-    """Name stages to a process, one after the other; ``done`` gets its answers, and an empty one if it has ended."""
+    """Send stages to a process one by one; ``done`` receives its answers, and an empty one if it has exited."""
     assert process.stdin is not None, "it is a pipe"
     assert process.stdout is not None, "the same"
     with contextlib.suppress(IndexError):  # nothing waits any more
@@ -97,7 +97,7 @@ def _have_compiled(
 
 
 def main() -> None:
-    """Compile what each line of the standard input names."""
+    """Compile the stages named on standard input, one per line."""
     allowed_code.taken_from(sys.argv[1:])
     for line in sys.stdin:
         name, kind, values = json.loads(line)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes that are no members of a cell: they compute nothing, and no member waits for them."""
+"""Parameters of the nodes outside the cell: they compute no samples, and no member waits for them."""
 
 from typing import Annotated, Literal
 
@@ -16,7 +16,7 @@ RerunOutput = Literal["spawn", "serve", "connect", "save"]
 
 
 class ReplayerParameters(Table):
-    """The messages to send again, and their pace."""
+    """Messages to be replayed, and their pace."""
 
     bag: str = parameter("", "folder or file of the bag", path=True)
     rate: NonNegative = parameter(1.0, "pace against the bag's time; 0: as fast as the readers follow")
@@ -32,7 +32,7 @@ class ReplayerParameters(Table):
 
 
 class RerunBridgeParameters(Table):
-    """The signals to show live in Rerun, and the place for them."""
+    """Signals to be shown live in Rerun, and their output: viewer, web page or files."""
 
     output: RerunOutput = parameter("spawn", "a window, a page for the browser, a viewer that runs already, or files")
     file: str = parameter(
@@ -47,7 +47,7 @@ class RerunBridgeParameters(Table):
 
 
 class TopicRecorderParameters(Table):
-    """The topics to record of any ROS system, and the clock for them."""
+    """Topics to be recorded in any ROS system, and the clock for them."""
 
     bag: str = parameter("", "folder of the bag; must not exist", path=True)
     topics: list[str] = parameter([], "fully qualified; none: all but hidden ones, /rosout and /parameter_events")

@@ -17,7 +17,7 @@ _AT_ONCE = 8192  # numbers for which memory is made at once, if that are several
 
 @dataclass(slots=True)
 class Block:
-    """A block as it came, its samples views of its bytes; or several in one piece that were computed in this process.
+    """Block of samples, either received (signals are views of its bytes) or computed in this process.
 
     Attributes:
         run_id, source, first_index, step_ns, last, companions: see BlockInfo.msg.
@@ -119,7 +119,7 @@ class Pool:
         self._free: list[Samples] = []
 
     def take(self, samples: int) -> tuple[Signals, Samples | None]:
-        """Arrays of shape (samples,) by field, not zeroed; and all of them as one, if they are all of one type."""
+        """Return uninitialised arrays of shape (samples,) by field, and one array of all if they share a type."""
         if not self._uniform:
             return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
         if not self._free or samples != self._samples:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeping the signals of an offline run in memory."""
+"""Storage of the signals of an offline run in memory."""
 
 import contextlib
 import math
@@ -20,7 +20,7 @@ from lathe_rc.names import instead
 
 
 def _free_memory() -> int:
-    """Memory that programs can still have without swapping [B]; all memory where the system does not say."""
+    """Return the memory available without swapping [B]; all memory where the system does not report it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             name, _, size = line.partition(":")
@@ -30,10 +30,10 @@ def _free_memory() -> int:
 
 
 def check_room(cell: Cell) -> None:
-    """Refuse a run whose signals this machine cannot keep: form errors and digests are made of all of them.
+    """Check that the memory of this machine suffices for all signals, needed for form errors and digests.
 
     Raises:
-        InputError: says what they take, what there is, and how long a run may be.
+        InputError: memory is insufficient; the message gives need, available memory, and the longest run.
     """
     fields = [messages.sample_fields(source.type).values() for source in cell.dense.values()]
     needed = cell.expected_samples * sum(np.dtype(kind).itemsize for kinds in fields for kind in kinds)
@@ -50,12 +50,12 @@ def check_room(cell: Cell) -> None:
 
 
 class Collector:
-    """Collects whole arrays; a sink of the engine.
+    """Collector of complete signals; a sink of the engine.
 
     Args:
-        cell: that runs.
-        samples: of the run.
-        topics: relative names of those to collect; None: all.
+        cell: the running cell.
+        samples: length of the run [sample].
+        topics: relative names of the topics to collect; None: all.
 
     Raises:
         InputError: the cell has no such topic.
@@ -79,7 +79,7 @@ class Collector:
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in self._sources if topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take a piece of the run, as a sink of the engine."""
+        """Process a chunk of the run, as a sink of the engine."""
         for topic, whole in self._dense.items():
             for name, array in dense[topic].items():
                 whole[name][first : first + samples] = array
@@ -87,7 +87,7 @@ class Collector:
             kept.extend(sparse.get(topic, ()))
 
     def recording(self) -> Recording:
-        """The collected signals, by fully qualified topic."""
+        """Recording of the collected signals, by fully qualified topic."""
         sparse = {}
         for topic, found in self._sparse.items():
             part = sparse[f"/{topic}"] = SparseTopic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signal topics as tables: columns with units, one row a sample or a message."""
+"""Signal topics as tables: columns with units, one row per sample or message."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -22,12 +22,12 @@ _UNIT = re.compile(r"\[([^\[\]]+)\]")
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a topic's table.
+    """Column of a topic's table.
 
     Attributes:
-        name: of the message's field; ``sample`` and ``time`` come first in every table.
-        dtype: of its elements; `TEXT` for texts.
-        unit: empty where the message's definition has none.
+        name: name of the message's field; ``sample`` and ``time`` come first in every table.
+        dtype: type of the elements; `TEXT` for strings.
+        unit: unit; empty if the message definition has none.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Column:
 
     @property
     def label(self) -> str:
-        """Name and unit, like ``angle [rad]``."""
+        """Name with unit, as in ``angle [rad]``."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
@@ -45,9 +45,9 @@ _FIRST = (Column("sample", np.dtype(np.int64)), Column("time", np.dtype(np.float
 
 @cache
 def units(msgtype: str) -> Mapping[str, str]:
-    """Unit by field, from the comments of the type's .msg file; where it depends on the sender, like ``m or N``.
+    """Return the unit by field, from the comments of the type's .msg file; ``m or N`` if it depends on the sender.
 
-    Types that are not of lathe_rc say nothing that could be read.
+    Types of other packages have no readable units.
     """
     package, _, name = msgtype.partition("/msg/")
     if package != messages.PACKAGE:
@@ -59,7 +59,7 @@ def units(msgtype: str) -> Mapping[str, str]:
 
 @cache
 def columns(msgtype: str) -> tuple[Column, ...]:
-    """The table of a signal topic of this type."""
+    """Return the columns of the table of a signal topic of this type."""
     known = units(msgtype)
     if msgtype in messages.block_types():
         fields = messages.sample_fields(msgtype)
@@ -72,19 +72,19 @@ def columns(msgtype: str) -> tuple[Column, ...]:
 
 
 def _element(kind: Nodetype, detail: Any) -> np.dtype[Any]:
-    """Element type of a field that is a number, a text, or a list of them."""
+    """Return the element type of a field that is a number, a string, or a list of them."""
     base = detail if kind == Nodetype.BASE else cast("Any", detail)[0][1]
     return TEXT if base[0] == "string" else np.dtype(base[0])
 
 
 def dense_rows(first: int, signals: Signals, step_ns: int) -> dict[str, Samples]:
-    """The columns of consecutive samples ``first`` on, shape (samples,)."""
+    """Return the columns of consecutive samples starting at ``first``, shape (samples,)."""
     sample = np.arange(first, first + next(iter(signals.values())).size)
     return {"sample": sample, "time": _seconds(sample, step_ns), **signals}
 
 
 def sparse_rows(table: Sequence[Column], found: Sequence[Sparse], step_ns: int) -> dict[str, Samples]:
-    """The columns of messages at chosen samples; a message with lists has a row for each element."""
+    """Return the columns of messages at chosen samples; a message with lists has one row per element."""
     cells: dict[str, list[Any]] = {column.name: [] for column in table}
     for message in found:
         parts = {column.name: message.values[column.name] for column in table[len(_FIRST) :]}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recent past of a topic, contiguous in memory, so that a view of several blocks, or a late one, costs no copy."""
+"""Delay buffer: recent past of a topic in contiguous memory, for views of several or delayed blocks without a copy."""
 
 from collections.abc import Iterable, Mapping
 from math import ceil
@@ -16,7 +16,7 @@ _VIEWS = 256  # that are made once
 
 
 def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
-    """Longest delay [sample] at which each field is read by some ports."""
+    """Return the longest delay [sample] at which each field is read by the given ports."""
     delays: dict[str, int] = {}
     for port in ports:
         for name in port.fields:
@@ -25,17 +25,17 @@ def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
 
 
 class DelayBuffer:
-    """Samples of some fields of a topic: the newest ones and, where they are read late, those before them.
+    """Buffer of the newest samples of some fields of a topic, and of earlier samples for delayed readers.
 
-    Before sample 0 everything is zero. What `extend` and `view` hand out is good until the next block is added.
+    Before sample 0 everything is zero. Views from `extend` and `view` are valid until the next block is added.
 
     Args:
         msgtype: message type of the topic.
-        delays: longest delay at which each field is read [sample]; fields that are not named are not kept at all.
-        longest: of what is added or viewed at once [sample].
+        delays: longest delay at which each field is read [sample]; other fields are not kept.
+        longest: largest number of samples added or viewed at once.
 
     Attributes:
-        delay: longest of them.
+        delay: longest of the delays [sample].
     """
 
     def __init__(self, msgtype: str, delays: Mapping[str, int], longest: int) -> None:
@@ -50,11 +50,11 @@ class DelayBuffer:
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without views of arrays, which would be kept as copies."""
+        """Return the pickled state, without array views, which would be pickled as copies."""
         return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
-        """Views of ``samples`` elements from ``start`` on; the same ones come again and again."""
+        """Return views of ``samples`` elements starting at ``start``, cached for repeated use."""
         views = self._views.get((start, samples))
         if views is None:
             views = {name: array[start : start + samples] for name, array in self._arrays.items()}
@@ -64,7 +64,7 @@ class DelayBuffer:
         return views
 
     def extend(self, samples: int) -> Signals:
-        """Views of ``samples`` new samples, for the caller to fill."""
+        """Return views of ``samples`` new samples, for the caller to fill."""
         if self.end + samples - self._base > self._capacity:
             # The kept samples move to the begin, once in several times their number.
             shift = self.end - self._kept - self._base
@@ -76,7 +76,7 @@ class DelayBuffer:
         return self._newest
 
     def view(self, first: int, samples: int) -> Signals:
-        """Views of the samples ``first`` on, which must have been added and not be too old."""
+        """Return views of samples starting at ``first``, which must be in the buffer."""
         # Most readers want the block that came last, as a whole.
         if first == self._first and samples == self._size:
             return self._newest
@@ -86,7 +86,7 @@ class DelayBuffer:
         return self._at(start, samples)
 
     def restart(self, first: int) -> None:
-        """Begin at sample ``first``, with zeros before it; drops all samples."""
+        """Restart at sample ``first``, with zeros before it; all samples are dropped."""
         for array in self._arrays.values():
             array[:] = 0
         self._base, self.end = first - self._kept, first

@@ -24,14 +24,14 @@ class Sink(Protocol):
     """Sink for the results of a run, chunk by chunk, in order."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Take the samples ``first`` on of every topic heard, and the sparse messages among them, by relative topic."""
+        """Process the samples of each requested topic starting at ``first``, and their sparse messages."""
 
 
 class Engine:
     """Engine that runs a cell offline, as fast as possible.
 
-    A stage computes as many samples per call as the shortest feedback allows, whatever ``block_size`` is; sinks get whole
-    numbers of blocks, which can be cut into the messages of any other host. The results depend on neither.
+    A stage computes as many samples per call as the shortest feedback allows, independent of ``block_size``; sinks get
+    whole blocks, which can be cut into the messages of any other host. The results depend on neither.
 
     Args:
         cell: the wired cell; must have passed its check.

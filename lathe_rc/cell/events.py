@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events and faults of a stage as a scenario lists them: what happens, and when."""
+"""Events and faults of a stage as listed in a scenario: action and time of each."""
 
 import math
 import re
@@ -18,7 +18,7 @@ _MOST_SAMPLES = 2**53  # that a double counts
 
 @dataclass(frozen=True)
 class Trigger:
-    """When an event takes effect."""
+    """Trigger: the time at which an event takes effect."""
 
     kind: str  # revolution, second or sample
     value: float
@@ -28,11 +28,11 @@ class Trigger:
 
     @property
     def text(self) -> str:
-        """How it is written."""
+        """Text of the trigger as written in a scenario."""
         return f"{self.kind} {self.value:g}: {self.action}"
 
     def sample(self, rate: int) -> int:
-        """Return the sample at which an event is due that does not depend on the angle; ``rate`` in Hz."""
+        """Return the sample of a trigger that does not depend on the angle; ``rate`` in Hz."""
         if self.kind == "sample":
             return math.ceil(self.value)
         # The factor keeps 0.1 s · 64000 from becoming sample 6401.
@@ -40,10 +40,10 @@ class Trigger:
 
 
 def triggers(node: str, table: NodeParameters) -> list[Trigger]:
-    """Return when the events and faults of a node take effect; a fault that ends is two of them.
+    """Return the triggers of the events and faults of a node; a fault with an end has two.
 
     Raises:
-        InputError: a text is none, or a fault ends before it begins.
+        InputError: a trigger is invalid, or a fault ends before it begins.
     """
     found = [_trigger(node, table, "events", text) for text in table.events]
     return found + [trigger for text in table.faults for trigger in _begin_and_end(node, table, text)]

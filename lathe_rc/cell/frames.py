@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables as those of other libraries: pandas where it is installed, otherwise Arrow."""
+"""Tables for other libraries: pandas if installed, otherwise Arrow."""
 
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ _SPINDLE = (Column("revolution", np.dtype(np.int64)), Column("spindle_angle", np
 
 
 def arrow_schema(columns: Sequence[Column], name: Callable[[Column], str]) -> Any:
-    """Arrow's view of a table; the units are metadata of the fields."""
+    """Return the Arrow schema of a table, with the units as metadata of the fields."""
     return pa.schema(
         [
             pa.field(
@@ -31,11 +31,11 @@ def arrow_schema(columns: Sequence[Column], name: Callable[[Column], str]) -> An
 def with_spindle(
     table: Sequence[Column], rows: Mapping[str, Samples], angle: Samples
 ) -> tuple[Sequence[Column], Mapping[str, Samples]]:
-    """A table with the spindle's revolution and the angle in it after the first two columns.
+    """Insert the spindle's revolution and angle into a table, after the first two columns.
 
     Args:
-        table: columns.
-        rows: their values, shape (rows,), in this order.
+        table: columns of the table.
+        rows: values of the columns, shape (rows,), in this order.
         angle: true angle of the spindle in each row [rad], shape (rows,).
     """
     turns = np.floor(angle / (2.0 * np.pi))
@@ -45,12 +45,12 @@ def with_spindle(
 
 
 def frame(topic: str, table: Sequence[Column], rows: Mapping[str, Samples]) -> Any:
-    """A table as a ``pandas.DataFrame`` where pandas is installed, otherwise a ``pyarrow.Table``.
+    """Return a table as a ``pandas.DataFrame`` if pandas is installed, otherwise as a ``pyarrow.Table``.
 
     Args:
-        topic: fully qualified.
-        table: columns, `time` among them.
-        rows: their values, shape (rows,).
+        topic: fully qualified topic.
+        table: columns, including `time`.
+        rows: values of the columns, shape (rows,).
     """
     if importlib.util.find_spec("pandas") is None:
         fields = arrow_schema(table, lambda column: column.name)

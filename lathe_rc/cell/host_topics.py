@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of a cell in ROS: those outside the signals, and the queue depth of the signals'."""
+"""ROS topics of a cell other than signals, and the queue depth of signal topics."""
 
 from typing import NamedTuple
 
@@ -12,24 +12,24 @@ _SPARE, _FREE_RUNNING = 32, 2080  # messages
 
 
 def signal_depth(shared: SharedParameters) -> int:
-    """Queue length of signal topics: all blocks in flight and some more; many where nothing holds the spindle back.
+    """Return the queue length of signal topics: all blocks in flight with a reserve; large without flow control.
 
-    A publisher may be a window ahead of a reader that goes on in the place of a dead one, from two windows before.
+    A publisher may be one window ahead, and a reader that replaces a dead one starts two windows back.
     """
     return 3 * shared.window + _SPARE if shared.window else _FREE_RUNNING
 
 
 class HostTopic(NamedTuple):
-    """A topic outside the signals: it carries wall time, or how the run goes, and enters no digest.
+    """Topic other than a signal: it carries wall time, or the progress of the run, and is not part of a digest.
 
     Attributes:
         name: relative, or absolute where the whole ROS domain shares it.
         type: message type.
         depth: queue length that publishers offer.
-        durability: ``transient local``: late readers get the newest messages, or ``volatile``.
+        durability: ``transient local`` (late readers get the newest messages), or ``volatile``.
         publishers: kinds of node that publish it.
         subscribers: kinds of node that read it.
-        doc: what it is for.
+        doc: purpose of the topic.
     """
 
     name: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Latency histograms: durations of wall time, counted by size, as text in a diagnostic report."""
+"""Latency histograms: wall-clock durations counted by size, as text in a diagnostic report."""
 
 import re
 from collections import Counter
@@ -17,30 +17,30 @@ _TEXT = re.compile(r"(?:[0-9]{1,2}:[0-9]{1,15})(?: [0-9]{1,2}:[0-9]{1,15})*")
 
 
 class Durations:
-    """Histogram of durations, whose bins are powers of 2 µs.
+    """Histogram of durations with bins of powers of 2 µs.
 
     Attributes:
         counts: number of durations in each bin, shape (`BINS`,): bin 0 below 1 µs, bin b from 2^(b-1) to 2^b µs; the
-            last has all that are longer.
+            last bin has all longer ones.
     """
 
     def __init__(self) -> None:
         self.counts = [0] * BINS
 
     def add(self, seconds: float, count: int = 1) -> None:
-        """Count ``count`` equal durations [s]; none may be negative."""
+        """Count ``count`` equal durations [s], not negative."""
         self.counts[min(int(seconds * 1e6).bit_length(), BINS - 1)] += count
 
     def __str__(self) -> str:
-        """Bins that are not empty, as BIN:COUNT."""
+        """Return the non-empty bins, as BIN:COUNT."""
         return " ".join(f"{place}:{count}" for place, count in enumerate(self.counts) if count)
 
     @classmethod
     def parse(cls, text: str) -> "Durations":
-        """Read a histogram that `__str__` has written, or another program.
+        """Parse a histogram in the format of `__str__`.
 
         Raises:
-            ValueError: it is none.
+            ValueError: the string is not a histogram.
         """
         found = cls()
         if text and not _TEXT.fullmatch(text):
@@ -55,14 +55,14 @@ class Durations:
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late the blocks of a run were let go.
+    """Statistics of the lateness of the blocks of a run.
 
     Attributes:
-        blocks: that were due at some time.
-        late: those of them that were let go after the next one was due as well.
+        blocks: number of blocks with a due time.
+        late: number of blocks released after the due time of the next one.
         worst: largest lateness [s].
-        within: lateness [s] that so many per cent of the blocks did not exceed, by per cent.
-        slipped: what the schedule gave up to make up for [s].
+        within: percentiles of the lateness [s], by per cent of the blocks.
+        slipped: delay that the schedule did not catch up [s].
     """
 
     blocks: int
@@ -73,11 +73,11 @@ class Lateness:
 
 
 class Percentiles:
-    """Durations, kept by size, so that percentiles are up to 3 % too large and as many as you like take no memory.
+    """Percentiles of durations in constant memory, by counts per size; values are up to 3 % too large.
 
     Attributes:
-        count: of all.
-        worst: the longest [s].
+        count: number of durations.
+        worst: longest duration [s].
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class Percentiles:
         self._counts: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """Count a duration [s], which may not be negative."""
+        """Count a duration [s], not negative."""
         self.count += 1
         self.worst = max(self.worst, seconds)
         microseconds = int(seconds * 1e6)
@@ -94,7 +94,7 @@ class Percentiles:
         self._counts[((microseconds >> halvings) + 1 << halvings)] += 1
 
     def within(self, percent: float) -> float:
-        """The shortest duration [s] that at least so many per cent did not exceed; 0 if there is none at all."""
+        """Return the shortest duration [s] not exceeded by the given percentage; 0 without durations."""
         wanted, found = self.count * percent / 100.0, 0
         for upper in sorted(self._counts):
             found += self._counts[upper]

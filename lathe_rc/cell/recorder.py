@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the recorder, which is no stage: it computes nothing and delays nobody's samples."""
+"""Parameters of the recorder, which is not a stage: it computes no samples and delays none."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +13,7 @@ KIND = "recorder"
 
 
 class RecorderParameters(NodeParameters):
-    """Where, when and how to record."""
+    """Destination, time and manner of the recording."""
 
     bag: str = parameter("", "folder of the bag; must not exist; empty: bag_ and the run id", path=True)
     compression: Literal["zstd", "none"] = parameter("zstd", "compression of the bag's chunks")
@@ -38,7 +38,7 @@ class RecorderParameters(NodeParameters):
     )
 
     def model_post_init(self, context: Any, /) -> None:
-        """Refuse a trigger that no event could ever match, and events of its own."""
+        """Reject a trigger that cannot match any event, and events of the recorder itself."""
         super().model_post_init(context)
         for name in ("events", "faults"):
             if asked := getattr(self, name):
@@ -48,5 +48,5 @@ class RecorderParameters(NodeParameters):
                 raise InputError(f"triggers = {pattern!r}; allowed: a pattern of NODE: ACTION, like '*: {pattern}'")
 
     def snapshots_of(self, bag: Path) -> Path:
-        """The folder of the snapshots, with the bag in ``bag``."""
+        """Return the folder of the snapshots, for a bag at ``bag``."""
         return Path(self.snapshots) if self.snapshots else bag.with_name(f"{bag.name}_snapshots")

@@ -362,7 +362,7 @@ class Stage(ABC):
         """Compute one block.
 
         Args:
-
+            first: index of the first sample.
             inputs: arrays of shape (n,) by field, in the order of the ports.
             outputs: output arrays in the same layout, to be filled.
             last: whether the run ends with this block.

@@ -111,7 +111,7 @@ def _reset(part: Any, attributes: dict[str, Any]) -> None:
 
 
 def _refill(part: Any, content: Any) -> None:
-    """Give a list, dictionary or set what it held; one that is as it was may be read by another thread meanwhile."""
+    """Restore the content of a list, dictionary or set; skip it if unchanged, as another thread may read it."""
     if isinstance(part, list):
         part[:] = content
     elif [*part] != [*content] or (

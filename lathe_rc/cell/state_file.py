@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a node in a file, so that another process can go on in its place, to the bit.
+"""State files of nodes, with which another process can replace a node with bit-identical results.
 
-Python's pickle, with limits. Arrays are written as type, shape and bytes, parameter tables not at all: the node that
-reads has its own. Of classes there are only those that a fresh state of the node is made of. A file that another user
-owns or may write is refused, since what is in it is believed.
+The format is Python's pickle, restricted. Arrays are written as type, shape and bytes, parameter tables not at all: the
+reading node has its own. Only classes that occur in a fresh state of the node are allowed. A file that another user
+owns or may write is rejected, since its content is trusted.
 """
 
 import enum
@@ -57,7 +57,7 @@ def _dtype(text: object) -> np.dtype[Any]:
 
 
 class _Reader(pickle.Unpickler):
-    """Args: the file's content, parameters of the node, and names of classes; without these any, and they are noted."""
+    """Restricted unpickler for a file's content, the node's parameters, and class names; without names any class."""
 
     def __init__(self, stream: io.BytesIO, table: Table, classes: frozenset[_Name] | None) -> None:
         super().__init__(stream)
@@ -96,19 +96,19 @@ class _Reader(pickle.Unpickler):
 
 
 def dump(state: Mapping[str, object]) -> bytes:
-    """The content of a state file."""
+    """Return the content of a state file."""
     buffer = io.BytesIO()
     _Writer(buffer).dump(dict(state))
     return buffer.getvalue()
 
 
 def save(path: Path, *parts: bytes) -> None:
-    """Write a state, and changes of it since then, each as `dump` gives it.
+    """Write a state, and later changes of it, each part as returned by `dump`.
 
-    A reader finds the one before or this one, also after this process was killed.
+    The file is replaced atomically: a reader finds the previous or the new state, even if this process is killed.
 
     Raises:
-        LatheError: it cannot be written.
+        LatheError: the file cannot be written.
     """
     new = path.with_name(f"{path.name}.new")
     try:
@@ -130,13 +130,13 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     """Read a state.
 
     Args:
-        path: of the file.
+        path: path of the file.
         table: parameters of the node.
-        fresh: a state of the same node: it may be made of the same classes.
-        others: classes that may be there as well.
+        fresh: fresh state of the same node, whose classes are allowed in the file.
+        others: further allowed classes.
 
     Raises:
-        LatheError: it cannot be read, somebody else may have written it, or it is none.
+        LatheError: the file cannot be read, is writable by another user, or is not a state file.
     """
     own = _Reader(io.BytesIO(dump(fresh)), table, None)
     own.load()

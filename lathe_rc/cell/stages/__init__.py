@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stages of the cell: physics and control laws with their parameters and ports.
+"""Stages of the cell: physics and control laws with their parameters and ports.
 
 Time and angle: `time_master`, `spindle_encoder` (with `speed_law`), `loaded_spindle`, `encoder_device`.
 Form and tool: `form`, `tool`, `vibration`.

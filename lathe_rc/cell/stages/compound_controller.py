@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compound law for non-circular turning: PID with input feed-forward and dynamic compensation.
+"""Compound law for non-circular turning: PID with input feed-forward and dynamic compensation.
 
-The structure is that of PMC8878366, of which only the abstract was at hand: input feed-forward of the form with its
-velocity and acceleration, dynamic compensation of what the drive lags (here its inverse and its delay), and a PID on
+The structure is that of PMC8878366, of which only the abstract was available: input feed-forward of the form with its
+velocity and acceleration, dynamic compensation of the drive's lag (here its inverse and its delay), and a PID on
 the following error. The settings are ours, tuned on the conditions of ``lathe study robust``.
 """
 
@@ -28,13 +28,13 @@ class CompoundControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the law.
+    """Memory of the compound law.
 
     Attributes:
-        forward: the form through the inverse of the drive.
-        proportional, integral, derivative: of the PID, the latter two per sample.
-        keep: of a sample before in the low-pass of the derivative.
-        state: integral, filtered derivative, error before, shape (3,).
+        forward: feed-forward of the form through the inverse of the drive.
+        proportional, integral, derivative: gains of the PID, the latter two per sample.
+        keep: weight of the previous sample in the low-pass of the derivative.
+        state: integral, filtered derivative, previous error, shape (3,).
     """
 
     forward: ForwardTable
@@ -47,7 +47,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """Command of the law at one sample [m]."""
+    """Return the command of the law at one sample [m]."""
     state, late = memory.state, memory.forward.late
     command = fed_forward(memory.forward, now.angle)
     if now.sample < late:
@@ -87,7 +87,7 @@ class CompoundController(FormLaw):
         )
 
     def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
-        """Response of the open loop at frequencies [rad/s], shape (n,)."""
+        """Return the open-loop response at frequencies [rad/s], shape (n,)."""
         parameters, p = self.parameters, 1j * frequency
         derived = p * parameters.derivative / (1.0 + p / parameters.derivative_bandwidth)
         pid = parameters.proportional + parameters.integral / p + derived

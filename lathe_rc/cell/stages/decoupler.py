@@ -19,7 +19,7 @@ _CHANNELS = ("w1", "w2", "w3", "w4")
 
 
 class DecouplerParameters(NodeParameters):
-    """The model of the plant by which K1 and K2 are made, and which of them are on."""
+    """Plant model from which K1 and K2 are computed, and the selection of active decouplers."""
 
     preset: Literal["paper", "realistic"] = parameter("realistic", "model of the plant; paper: W3 as it is printed")
     w1_numerator: list[float] = parameter(
@@ -43,14 +43,14 @@ class DecouplerParameters(NodeParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """Topic of the drive that W2 is the model of; W1, W3 and W4 are no drive's alone."""
+        """Topic of the drive modelled by W2; W1, W3 and W4 do not belong to a single drive."""
         return "cross/command"
 
     def channels(self, node: str) -> Channels:
-        """The model of the plant.
+        """Return the plant model of a node.
 
         Raises:
-            InputError: half a transfer function, or one that is not proper.
+            InputError: a transfer function is incomplete or not proper.
         """
         preset, made = PRESETS[self.preset], {}
         for name in _CHANNELS:
@@ -73,7 +73,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Decouple the commands of one block; set points and errors go on unchanged."""
+    """Decouple the commands of one block; set points and errors are passed on unchanged."""
     force, position = inputs[0], inputs[3]
     for place in (1, 2, 4, 5):
         put(outputs[place], inputs[place])
@@ -82,7 +82,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class DecouplerStage(Stage):
-    """Decoupler between force and position loop; see `lathe_rc.control.decoupler`.
+    """Decoupler between force and position loop (see `lathe_rc.control.decoupler`).
 
     Attributes:
         parameters: its table.
@@ -113,6 +113,6 @@ class DecouplerStage(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         made = self._decoupler
         return Memory(made.k1, made.state1, made.k2, made.state2)

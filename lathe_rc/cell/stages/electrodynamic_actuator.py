@@ -20,7 +20,7 @@ from lathe_rc.signals.noise import measure
 
 
 class ElectrodynamicActuatorParameters(PlantParameters):
-    """The drive closed by its own loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
+    """Drive with closed internal loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
     natural_frequency: Positive = parameter(1038.0, "natural frequency ωn", "rad/s")
     damping: Positive = parameter(0.804, "damping ratio ζ", "1")
@@ -46,10 +46,10 @@ def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fie
 
 
 class ElectrodynamicActuator(SingleDrive):
-    """Coarse electrodynamic drive in air; see `lathe_rc.plants.electrodynamic`.
+    """Coarse electrodynamic drive in air (see `lathe_rc.plants.electrodynamic`).
 
     Attributes:
-        drive: the machine.
+        drive: machine of the drive.
     """
 
     kind = "electrodynamic_actuator"

@@ -26,7 +26,7 @@ _RPM = 30.0 / np.pi  # for 1 rad/s
 class EncoderDeviceParameters(TimeMasterParameters):
     """Real encoder in place of the spindle: source of the counts, and length and pace of the run.
 
-    The angle is linear between readings; the measured angle counts as the true one. A topic or a serial line sets the pace
+    The angle is linear between readings; the measured angle counts as the true one. A topic or a line sets the pace
     itself: `speed_factor` applies to files only.
     """
 

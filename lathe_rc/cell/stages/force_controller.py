@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force controller: holds the main cutting force by the longitudinal feed (paper 004)."""
+"""Force controller of the main cutting force by the longitudinal feed (paper 004)."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class ForceControllerParameters(ServoParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step."""
+    """Memory of the step of the force controller."""
 
     course: Course
     pid: PidTable
@@ -49,11 +49,11 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class ForceController(Servo):
-    """PID of the cutting force on the longitudinal feed; see `lathe_rc.control.pid`.
+    """PID of the cutting force on the longitudinal feed (see `lathe_rc.control.pid`).
 
     Attributes:
         parameters: its table.
-        pid: the controller.
+        pid: PID controller.
     """
 
     kind = "force_controller"
@@ -76,5 +76,5 @@ class ForceController(Servo):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return Memory(self.trajectory.course, self.pid.table, self.pid.state, self.listener)

@@ -162,7 +162,7 @@ class FormLaw(Law):
         )
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """Half a revolution [sample], since what is late must not meet what is learned."""
+        """Return the largest delay, half a revolution [sample], since delayed and learned errors must not meet."""
         return int(np.pi / (speed * self.parameters.step))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The step of the learning controller."""
+"""Step of the learning controller."""
 
 from typing import NamedTuple
 
@@ -22,20 +22,20 @@ _INSIDE, _BEGIN, _END, _LOST, LOST_AT = range(5)
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the learning controller.
 
     Attributes:
-        control: the memory of the channel.
-        preview: its lead law.
-        identifier: of its drive, if it ``identifies``.
-        who: may have to obey.
-        nominal: speed of the spindle [rad/s].
+        control: repetitive memory of the channel.
+        preview: lead law.
+        identifier: identifier of the drive, if ``identifies``.
+        who: obedience to the supervisor, if any.
+        nominal: nominal speed of the spindle [rad/s].
         period: sampling step [s].
-        by_time: whether time stands for the angle.
-        falls_back: whether the lead angle is that of the nominal speed where the supervisor asks to fall back.
+        by_time: whether time replaces the angle.
+        falls_back: whether the lead angle of the nominal speed is used when the supervisor requests a fallback.
         rates: whether the correction needs the rates of the lead.
-        finer: how many finer drives the error has in it.
-        margin: of the newest cycle, shape (1,).
+        finer: number of finer drives included in the error.
+        margin: stability margin of the newest cycle, shape (1,).
         state: see above.
     """
 
@@ -56,7 +56,7 @@ class Memory(NamedTuple):
 
 @inlined
 def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
-    """The angle that the memory goes by [rad], ``late`` samples before the samples ``first`` on."""
+    """Return the angle of the memory [rad], ``late`` samples before the samples starting at ``first``."""
     if not memory.by_time:
         return measured
     angle = np.empty(measured.size)
@@ -70,7 +70,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
 
 @inlined
 def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) -> None:
-    """Look ahead along a piece of a block, and take its errors."""
+    """Preview a segment of a block, and record its errors."""
     control, samples = memory.control, stop - start
     speed, error = inputs[1][start:stop], inputs[3][start:stop]
     if memory.by_time or (memory.falls_back and obeyed(memory.who) >= Reaction.FALL_BACK.value):
@@ -90,7 +90,7 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) ->
 
 @inlined
 def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
-    """Without an angle the command stays, from sample ``start`` of a block on."""
+    """Hold the command from sample ``start`` of a block, after a loss of the angle."""
     command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.who.obedience.takeover.given[1]
 
 

@@ -26,17 +26,17 @@ from lathe_rc.jit import kernel
 
 
 class ResonantControllerParameters(FormLawParameters):
-    """The orders that are cancelled and how fast."""
+    """Orders to be cancelled, and the rate of adaptation."""
 
     highest_order: Annotated[int, Ge(0), Le(64)] = parameter(24, "K: waves per revolution that are cancelled at most")
     rate: Positive = parameter(8.0, "g: how fast an order is taken up", "1/s")
 
 
 class Memory(NamedTuple):
-    """Memory of the law.
+    """Memory of the resonant law.
 
     Attributes:
-        forward: the form through the inverse of the drive.
+        forward: feed-forward of the form through the inverse of the drive.
         step: sampling step [s].
         gain: 2g·step.
         amplitudes: a and b by order, shape (2, K + 1) [m].
@@ -50,7 +50,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """Command of the law at one sample [m]."""
+    """Return the command of the law at one sample [m]."""
     forward, amplitudes = memory.forward, memory.amplitudes
     command = fed_forward(forward, now.angle)
     spindle, a1, a2 = forward.spindle, forward.a1, forward.a2
@@ -97,7 +97,7 @@ class ResonantController(FormLaw):
         )
 
     def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
-        """Response of the open loop at frequencies [rad/s] and a constant ``speed`` [rad/s], shape (n,)."""
+        """Return the open-loop response at frequencies [rad/s] and a constant ``speed`` [rad/s], shape (n,)."""
         parameters, p = self.parameters, 1j * frequency
         late = parameters.feedback_delay * parameters.step
         a1, a2 = parameters.inverse

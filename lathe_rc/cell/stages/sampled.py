@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of users' laws and drives: a step that calls a function of theirs for each sample."""
+"""Common part of user-defined laws and drives: a step that calls a user function for each sample."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -16,10 +16,10 @@ from lathe_rc.extensions import code_of_others
 
 
 class Sampled(Stage):
-    """A stage whose step calls ``sample``, compiled if that is a kernel.
+    """Stage whose step calls ``sample``, compiled if ``sample`` is a kernel.
 
     Raises:
-        InputError: it has none.
+        InputError: the class has no ``sample``.
     """
 
     sample: ClassVar[Callable[..., Any]]
@@ -37,32 +37,32 @@ class Sampled(Stage):
     @staticmethod
     @abstractmethod
     def loop(sample: Callable[..., Any]) -> Step:
-        """The step in plain Python, which calls ``sample``."""
+        """Return the step in plain Python, which calls ``sample``."""
 
     @abstractmethod
     def start(self) -> Any:
-        """The memory before sample 0."""
+        """Return the memory before sample 0."""
 
     def started(self) -> Any:
-        """Like `start`, with plug-in errors as one line.
+        """Return the memory of `start`, with plug-in errors as one line.
 
         Raises:
-            InputError: it raises something.
+            InputError: `start` raises an exception.
         """
         with code_of_others(f"{self.name}: start"):
             return self.start()
 
 
 def checked(what: str, ask: Callable[[], Complex | None], at: Array) -> Complex:
-    """A response that a law or drive of others tells, shape (n,).
+    """Return the response provided by a third-party law or drive, checked, shape (n,).
 
     Args:
-        what: it is, in words.
-        ask: gives it.
-        at: the waves or frequencies that it is asked for, shape (n,).
+        what: description of the response.
+        ask: function that returns the response.
+        at: waves or frequencies of the response, shape (n,).
 
     Raises:
-        InputError: it raises something, or gives another shape.
+        InputError: ``ask`` raises an exception, or the shape is wrong.
     """
     with code_of_others(what):
         told = np.asarray(ask(), np.complex128)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common part of servo controllers: a PID, converters, and a feedback edge."""
+"""Common part of servo controllers: a PID, converters, and a feedback edge."""
 
 from typing import Annotated, Literal
 
@@ -51,10 +51,10 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     )
 
     def obeys(self, name: str) -> Obedience | None:
-        """The obedience of a node; None if it reads no supervisor.
+        """Return the obedience of a node to the supervisor; None without a supervisor input.
 
         Raises:
-            InputError: see `FeedObedientParameters.obedience`; so no command is ever out of reach.
+            InputError: a command may be out of reach, see `FeedObedientParameters.obedience`.
         """
         if not self.reaction_delay:
             return None
@@ -62,7 +62,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         return self.obedience(name, speed=speed, limit=limit, settled=self.feedback_delay)
 
     def pid(self, node: str) -> Pid:
-        """The PID of a node, whose table has gains.
+        """Return the PID of a node whose table has gains.
 
         Raises:
             InputError: see `lathe_rc.control.pid`.
@@ -74,10 +74,10 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
 
 
 class Servo(Obedient):
-    """A servo controller with its set point.
+    """Servo controller with its set point.
 
     Attributes:
-        trajectory: of the set point.
+        trajectory: trajectory of the set point.
     """
 
     def __init__(self, name: str, parameters: ServoParameters) -> None:
@@ -86,7 +86,7 @@ class Servo(Obedient):
         self._obedience = parameters.obeys(name)
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the doubt about a trajectory that does not meet the run."""
+        """Return the warning about a trajectory outside the run."""
         return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 
     def prepare(self, first: int, samples: int) -> None:
@@ -106,7 +106,7 @@ def pid_along(
     measured: Samples,
     command: Samples,
 ) -> tuple[int, int]:
-    """Step a PID through a block from its sample ``start`` on, see `lathe_rc.cell.stage`; arrays of shape (n,)."""
+    """Step a PID through a block from sample ``start`` (see `lathe_rc.cell.stage`); arrays of shape (n,)."""
     while start < command.size:
         stop = piece(who, start, command.size, reaction)
         if stop == start:

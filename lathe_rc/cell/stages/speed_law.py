@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spindle's speed law as parameters: of the spindle that follows it, and of laws that know it in advance."""
+"""Parameters of the spindle's speed law, for the spindle and for laws that know the speed in advance."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -22,7 +22,7 @@ SPEED_LAWS: Registry[DeviationLaw] = Registry("speed law", DeviationLaw, {}, "la
 
 
 class SpeedLawParameters(NodeParameters):
-    """Deviations from the nominal speed; their sum is the law."""
+    """Deviations from the nominal speed; their sum is the speed law."""
 
     deviation_amplitude: list[float] = parameter(
         [], "harmonic speed deviations: amplitudes relative to the nominal speed", "1"
@@ -53,11 +53,11 @@ class SpeedLawParameters(NodeParameters):
     )
 
     def speed_law(self, node: str) -> speed.SpeedLaw:
-        """The sum of all deviations, for a node.
+        """Return the sum of all deviations, for a node.
 
         Raises:
-            InputError: lists of different lengths, a tachogram or a band out of order, a file or law of others that
-                cannot be used, or more than one tachogram.
+            InputError: lists differ in length, a tachogram or a band is out of order, a file or third-party law
+                cannot be used, or there is more than one tachogram.
         """
         nominal = self.nominal_speed
         lines = self.deviation_amplitude, self.deviation_frequency, self.deviation_phase
@@ -71,7 +71,7 @@ class SpeedLawParameters(NodeParameters):
             return law + made_of(speed.band_limited_random, self, "random_", nominal=nominal)
 
     def _tachogram(self, node: str) -> speed.SpeedLaw | None:
-        """The one of the lists, of the file, or of a law of others, if there is one."""
+        """Return the tachogram of the lists, the file, or a third-party law, if there is one."""
         lists = bool(self.tachogram_time or self.tachogram_deviation)
         given = {"deviation_law": self.deviation_law, "tachogram_file": self.tachogram_file, "tachogram_time": lists}
         named = [name for name, value in given.items() if value]
@@ -102,6 +102,6 @@ class SpeedLawParameters(NodeParameters):
 def _harmonic(
     nominal: float, amplitude: tuple[float, ...], frequency: tuple[float, ...], phase: tuple[float, ...], start: float
 ) -> speed.SpeedLaw:
-    """The harmonic deviations, made once for all nodes that know them."""
+    """Return the harmonic deviations, created once for all nodes that use them."""
     phases = np.array(phase) if phase else np.zeros(len(amplitude))
     return speed.harmonic(nominal, np.array(amplitude), np.array(frequency), phases, start)

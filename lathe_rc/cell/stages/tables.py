@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of parameters: of parts under a prefix, and what is made of a table by the names of its parameters."""
+"""Composition of parameter tables with prefixes, and construction of objects from parameters by name."""
 
 import inspect
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _DERIVED = ("step", "step_ns", "nominal_speed")  # of every table
 
 @cache
 def _sources(make: Callable[..., Any], table: type[NodeParameters], prefixes: tuple[str, ...]) -> dict[str, str]:
-    """The parameter that gives each argument of ``make``, of those that the table has."""
+    """Return the parameter for each argument of ``make`` that the table has."""
     sources = {}
     for name in inspect.signature(make).parameters:
         known = [prefix + name for prefix in (*prefixes, "") if prefix + name in table.model_fields]
@@ -27,25 +27,25 @@ def _sources(make: Callable[..., Any], table: type[NodeParameters], prefixes: tu
 
 
 def made_of(make: Callable[..., R], table: NodeParameters, *prefixes: str, **beside: Any) -> R:
-    """An object whose arguments are parameters of a table, by their names.
+    """Construct an object whose arguments are parameters of a table, matched by name.
 
     Args:
-        make: its class, or a function.
-        table: with the parameters.
-        prefixes: that parameters may have before the names of arguments.
-        beside: arguments that are something else; they come before the parameters of their names.
+        make: class of the object, or a factory function.
+        table: table with the parameters.
+        prefixes: prefixes that parameter names may have before the names of arguments.
+        beside: arguments given directly; they take precedence over parameters of the same name.
     """
     sources = _sources(make, type(table), prefixes)
     return make(**{name: getattr(table, sources[name]) for name in sources.keys() - beside.keys()}, **beside)
 
 
 class ComposedParameters(NodeParameters):
-    """Parameters that the parts share."""
+    """Parameters composed of the tables of several elements, with shared common parameters."""
 
     discretisation: Discretisation = parameter("foh", "foh: exact for commands linear between samples; or tustin")
 
     def part(self, prefix: str, table: type[T]) -> T:
-        """The table of a part, whose parameters stand under ``prefix``."""
+        """Return the table of an element, whose parameters have the prefix ``prefix``."""
         values = {name: getattr(self, prefix + name) for name in _own(table)}
         return table(**values, **{name: getattr(self, name) for name in _SHARED if name in table.model_fields})
 
@@ -58,6 +58,6 @@ def _own(table: type[NodeParameters]) -> list[str]:
 
 
 def prefixed(prefix: str, table: type[NodeParameters]) -> dict[str, Any]:
-    """The parameters of a part under their names in the whole, as pydantic makes a model of them."""
+    """Return the parameters of an element under their prefixed names, as fields for a pydantic model."""
     fields = table.model_fields
     return {prefix + name: (fields[name].annotation, fields[name]) for name in _own(table)}

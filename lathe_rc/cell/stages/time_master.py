@@ -107,7 +107,7 @@ class TimeMaster(Stage):
         return round(self.parameters.revolutions * 2.0 * np.pi / self.shared.nominal_speed / self.shared.step)
 
     def place_triggers(self) -> None:
-        """The stage that makes the angle knows when events by revolutions come."""
+        """Convert events by revolutions into events by sample, from the angle that this stage determines."""
         self._triggers = [self._by_sample(trigger) for trigger in self._triggers]
 
     def _by_sample(self, trigger: Trigger) -> Trigger:

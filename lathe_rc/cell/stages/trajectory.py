@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The set point of a servo controller, over time."""
+"""Set point of a servo controller, over time."""
 
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -31,11 +31,11 @@ class TrajectoryParameters(NodeParameters):
 
 
 class Course(NamedTuple):
-    """Samples of a set point for kernels.
+    """Precomputed samples of a set point, for kernels.
 
     Attributes:
-        values: computed in advance.
-        span: sample index of the first of them, and of the one after the last.
+        values: samples computed in advance.
+        span: sample indices of the first value, and after the last.
     """
 
     values: Samples
@@ -44,23 +44,23 @@ class Course(NamedTuple):
 
 @kernel
 def follow(course: Course, first: int, set_point: Samples) -> None:
-    """Fill the set point from sample ``first`` on, shape (n,), which has been made ready."""
+    """Fill the set point, shape (n,), from prepared samples starting at ``first``."""
     begin = first - course.span[0]
     put(set_point, course.values[begin : begin + set_point.size])
 
 
 class Trajectory:
-    """The set point of a node.
+    """Set point of a node.
 
     Args:
-        node: that it is for.
+        node: name of the node.
         parameters: its table.
 
     Attributes:
-        course: for `follow`.
+        course: samples for `follow`.
 
     Raises:
-        InputError: lists of different lengths, times that do not rise, or a file that cannot be used.
+        InputError: lists differ in length, times do not increase, or a file cannot be used.
     """
 
     def __init__(self, node: str, parameters: TrajectoryParameters) -> None:
@@ -88,21 +88,21 @@ class Trajectory:
         self.course = Course(np.empty(MAX_BLOCK), np.zeros(2, np.int64))
 
     def doubts(self, seconds: float) -> list[str]:
-        """A file that begins after the end of a run of so many seconds, as one line."""
+        """Return a one-line warning about a file that begins after the end of a run of ``seconds``."""
         if self._kind != "csv" or self._times[0] < seconds:
             return []
         start = f"trajectory_file begins at {self._times[0]:.10g} s, after the end of the run at {seconds:.5g} s"
         return [f"{start}: the set point is its first value throughout; times count from the start of the run"]
 
     def prepare(self, first: int, samples: int) -> None:
-        """Make the samples ``first`` on ready, up to 8192."""
+        """Prepare up to 8192 samples starting at ``first``."""
         values, span = self.course
         if not span[0] <= first <= first + samples <= span[1]:
             self.block(first, values[:samples])
             span[:] = first, first + samples
 
     def block(self, first: int, set_point: Samples) -> None:
-        """Fill the set point from sample ``first`` on, shape (n,)."""
+        """Fill the set point, shape (n,), for samples starting at ``first``."""
         if self._kind == "paper_002":
             fill_reference(first, self._step, set_point)
             return

@@ -33,7 +33,7 @@ class VibrationParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step."""
+    """Memory of the step of the vibration source."""
 
     lines: Samples
     period: float
@@ -51,7 +51,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class Vibration(Stage):
-    """Source of vibration between tool and part; see `lathe_rc.signals.vibration`.
+    """Source of vibration between tool and part (see `lathe_rc.signals.vibration`).
 
     Attributes:
         parameters: its table.
@@ -91,5 +91,5 @@ class Vibration(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Memory of the step, as it is now."""
+        """Current memory of the step."""
         return Memory(self.lines, self.parameters.step, self._sensors[0].table)
