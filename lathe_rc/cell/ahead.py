@@ -25,12 +25,12 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path
 from lathe_rc.jit import can_keep
 
-_REFUSED = "refused: "  # begins what a process says of a stage whose step cannot be compiled
+_REFUSED = "refused: "  # prefix of the answer for a stage whose step cannot be compiled
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
     """Return the stages whose steps are not compiled on this machine; the first of those with an equal step."""
-    # Backwards, so that of stages with one step the first stays in the dictionary.
+    # Reversed, so that of stages with equal steps the first stays in the dictionary.
     steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
     return [stage for name, stage in reversed(steps.items()) if not is_kept(name)]
 
@@ -84,7 +84,7 @@ def _have_compiled(
     """Send stages to a process one by one; ``done`` receives its answers, and an empty one if it has exited."""
     assert process.stdin is not None, "it is a pipe"
     assert process.stdout is not None, "the same"
-    with contextlib.suppress(IndexError):  # nothing waits any more
+    with contextlib.suppress(IndexError):  # no more stages are waiting
         while True:
             number, stage = waiting.popleft()
             asked = stage.name, kind_of(stage.name, stage.shared.stage), stage.shared.model_dump()

@@ -33,7 +33,7 @@ from lathe_rc.messages import Signals
 
 K_co = TypeVar("K_co", covariant=True)
 
-_AHEAD = 2  # cells that are made for each thread before the first of them has been taken
+_AHEAD = 2  # cells created ahead for each thread
 
 
 class Keeper(Sink, Protocol[K_co]):
@@ -114,12 +114,12 @@ def run_many(
     make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
-    # A runner a thread; a deque hands one out and takes it back without a lock.
+    # One runner per thread; a deque lends and takes them back without a lock.
     pool, idle = ThreadPoolExecutor(count), deque(CellRunner() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
             waiting.append(pool.submit(_outcome, scenario, make, idle))
-            # The first compiles what the others use.
+            # The first run compiles the code that the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()
         while waiting:

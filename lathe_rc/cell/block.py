@@ -12,7 +12,7 @@ from lathe_rc.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _MOST_FIELDS = 16
 _ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
-_AT_ONCE = 8192  # numbers for which memory is made at once, if that are several pieces
+_AT_ONCE = 8192  # numbers allocated at once, if these are several blocks
 
 
 @dataclass(slots=True)
@@ -95,7 +95,7 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
     Raises:
         NotFiniteError: a sample is NaN or infinite; the error holds the first.
     """
-    # 0 times anything finite is 0, and NaN otherwise: one product tells for the whole block.
+    # 0 times anything finite is 0, and NaN otherwise: one product checks the whole block.
     if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
         bad = int(np.flatnonzero(~np.isfinite(array))[0])
         index = first + bad
@@ -151,7 +151,7 @@ class Framer:
         self.companions += 1
         head = messages.header(message.index, self._step_ns)
         kind = messages.store().types[message.type]
-        # Types of ROS, such as JointState, have no place for run and source.
+        # ROS types, such as JointState, have no fields for run and source.
         if message.type.startswith(messages.PACKAGE):
             return kind(
                 header=head,

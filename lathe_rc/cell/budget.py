@@ -27,9 +27,9 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
-_PREFIXES = ("", "coarse_", "fine_", "cut_")  # of the parameters of a part; those of stages with several have one
-_FACTOR = 0.9  # of a cycle, which a flat Q may have; or what the scenario's own has, if that is more
-_CONVERGES = 0.98  # but never more than this: the own one may run with allow_unstable
+_PREFIXES = ("", "coarse_", "fine_", "cut_")  # of parameters; stages composed of several devices use prefixes
+_FACTOR = 0.9  # largest factor of a cycle for a flat Q, unless the scenario's own Q has a larger one
+_CONVERGES = 0.98  # upper limit: the scenario may run with allow_unstable
 
 _Off = Mapping[str, Value]
 #: Parameters of nodes with a table of some kind that are a cause, with the values that switch it off.
@@ -57,7 +57,7 @@ _CAUSES: Mapping[str, tuple[type[NodeParameters], _Off]] = {
 }
 #: Of these causes, those that make one revolution differ from the next.
 _CHANGING = {name: _CAUSES[name][1] for name in ("noise", "quantisation", "vibration")}
-_CONSTANT = ("harmonics", "polygon")  # profiles that are the same all along the part
+_CONSTANT = ("harmonics", "polygon")  # profiles that are constant along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
 
@@ -111,7 +111,7 @@ class _Keep:
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)
-        # One more than is reported, for the spline; the last may be short of two samples.
+        # One revolution more than reported, for the spline; the last may lack two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
         error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
@@ -231,7 +231,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
         height: height of the tool along the part in the reported revolutions [m].
 
     Returns:
-        The causes, each after the one that it needs; and those that cannot be switched off, with the reason.
+        The causes, each after its prerequisite; and the causes that cannot be switched off, with the reason.
     """
     left_out: dict[str, str] = {}
     found = {

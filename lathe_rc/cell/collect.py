@@ -75,7 +75,7 @@ class Collector:
         }
         for signals in self._dense.values():
             for array in signals.values():
-                array.fill(0)  # touches the memory now: page faults would cost a quarter of the run
+                array.fill(0)  # touches the memory now: page faults would cost 25 % of the run
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in self._sources if topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:

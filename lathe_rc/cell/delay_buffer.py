@@ -11,8 +11,8 @@ from lathe_rc import messages
 from lathe_rc.cell.stage import Input
 from lathe_rc.messages import Signals
 
-_MOVED = 0.25  # of the samples, at most, are copied once more to keep them contiguous
-_VIEWS = 256  # that are made once
+_MOVED = 0.25  # largest share of samples copied again to keep them contiguous
+_VIEWS = 256  # largest number of cached views
 
 
 def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
@@ -46,7 +46,7 @@ class DelayBuffer:
         self._arrays = {name: np.zeros(self._capacity, types[name]) for name in delays}
         self._base = -self._kept  # sample index of element 0
         self._views = dict[tuple[int, int], Signals]()
-        self._first, self._size, self._newest = 0, 0, Signals()  # what was added last
+        self._first, self._size, self._newest = 0, 0, Signals()  # the newest samples
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class DelayBuffer:
         views = self._views.get((start, samples))
         if views is None:
             views = {name: array[start : start + samples] for name, array in self._arrays.items()}
-            # With blocks of changing lengths hardly a view comes again.
+            # With blocks of varying lengths, views are rarely reused.
             if len(self._views) < _VIEWS:
                 self._views[start, samples] = views
         return views
@@ -66,7 +66,7 @@ class DelayBuffer:
     def extend(self, samples: int) -> Signals:
         """Return views of ``samples`` new samples, for the caller to fill."""
         if self.end + samples - self._base > self._capacity:
-            # The kept samples move to the begin, once in several times their number.
+            # The kept samples move to the start, once per several times their number.
             shift = self.end - self._kept - self._base
             for array in self._arrays.values():
                 array[: self._kept] = array[shift : shift + self._kept]
@@ -77,7 +77,7 @@ class DelayBuffer:
 
     def view(self, first: int, samples: int) -> Signals:
         """Return views of samples starting at ``first``, which must be in the buffer."""
-        # Most readers want the block that came last, as a whole.
+        # Most readers need the complete newest block.
         if first == self._first and samples == self._size:
             return self._newest
         start = first - self._base

@@ -44,7 +44,7 @@ class Engine:
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
-        # Whole chunks, and so whole blocks: no sink gets a part of one.
+        # Whole chunks, and so whole blocks: no sink gets a partial block.
         self._piece = MAX_BLOCK // self._chunk * self._chunk
         self._heard = _heard(cell, heard)
         self._take(cell)
@@ -53,7 +53,7 @@ class Engine:
         wires = [wired(stage) for stage in self._stages]
         topics = {topic: (source.type, longest_delays(cell.inputs(topic))) for topic, source in cell.dense.items()}
         fields = {topic: list(messages.sample_fields(kind)) for topic, (kind, _) in topics.items()}
-        # Joint states are made of the samples of a stage's outputs.
+        # Joint states are generated from the samples of a stage's outputs.
         whole = self._heard.union(*(each.outputs for each in wires if each.stage.tells_joints))
         kept = {
             topic: [name for name in names if topic in whole or f"{topic}.{name}" in self._heard]
@@ -80,7 +80,7 @@ class Engine:
             Whether the restart is possible: wiring and requested topics must equal those of the previous cell.
         """
         block = cell.master.shared.block_size
-        # Cells whose ports are alike share one `Wiring`, so that to compare objects is enough.
+        # Cells with equal ports share one `Wiring`, so that comparing identities suffices.
         if cell.wiring is not self._wiring or block != self._block or _heard(cell, heard) != self._heard:
             return False
         self._take(cell)
@@ -98,7 +98,7 @@ class Engine:
         # Freeze existing objects so that the garbage collector skips them.
         gc.freeze()
         try:
-            # What is not finite is named here; NumPy need not warn of it too.
+            # NaN and infinity are reported here, so NumPy's warnings are redundant.
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in self.steps(list(sinks)):
                     pass
@@ -113,7 +113,7 @@ class Engine:
             try:
                 broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
             finally:
-                # After a number that is not finite there is nothing that a sink could use; after an error there is.
+                # After a NaN or infinite sample the chunk is useless to sinks; after an error it is not.
                 if not broken:
                     self._hand_over(first, self._program.reached, sinks)
             if broken:
@@ -145,7 +145,7 @@ class Engine:
                 for topic, names in kept.items()
             ]
             dense.update(zip(kept, outputs, strict=True))
-            # Where a stage has failed, those before it have gone on.
+            # After a failure of a stage, the stages before it are further ahead.
             said, last = self._program.said(number, end), end == self.samples
             if said or last or stage.tells_joints:
                 for message in stage.conclude(first, end, said, outputs, last=last):

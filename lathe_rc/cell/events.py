@@ -13,7 +13,7 @@ SAFE = "safe"  #: event that only a host may ask for: members of the cell are lo
 NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")
-_MOST_SAMPLES = 2**53  # that a double counts
+_MOST_SAMPLES = 2**53  # largest exact integer of a double
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Trigger:
     kind: str  # revolution, second or sample
     value: float
     action: str
-    parameter: str  # that lists it: events or faults
-    ends: bool = False  # a fault that has begun
+    parameter: str  # parameter that lists the trigger: events or faults
+    ends: bool = False  # end of a fault
 
     @property
     def text(self) -> str:

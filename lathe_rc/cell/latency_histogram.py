@@ -90,7 +90,7 @@ class Percentiles:
         self.worst = max(self.worst, seconds)
         microseconds = int(seconds * 1e6)
         halvings = max(microseconds.bit_length() - _EXACT_BITS, 0)
-        # What is equal down to its leading bits is counted together.
+        # Durations with equal leading bits are counted together.
         self._counts[((microseconds >> halvings) + 1 << halvings)] += 1
 
     def within(self, percent: float) -> float:

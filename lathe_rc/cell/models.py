@@ -95,7 +95,7 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
         values: dict[str, Value] = {**_model(node, table, tables), **_known(node, table, tables)}
         if any(getattr(table, name) != value for name, value in values.items()):
             made[node] = table.model_copy(update=values)
-            # They stay not given: another drive in a variation changes them again.
+            # These still count as not given: another drive in a variation changes them again.
             made[node].model_fields_set.difference_update(values)
     return made
 

@@ -30,18 +30,18 @@ Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[s
 T = TypeVar("T", bound="Table")
 
 _LONGEST = 60  # characters of a value in a summary
-_FAR = 1e9  # times the default, or the same part of it, from which on floating point may fail
-_HUGE = 1e12  # the same where the default is 0
+_FAR = 1e9  # ratio to the default, or its inverse, from which floating point may fail
+_HUGE = 1e12  # magnitude from which floating point may fail, if the default is 0
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
 
 def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, drive: str = "") -> Any:
     """Define a field of a parameter table; ``path`` marks a file name relative to the scenario's folder.
 
-    ``drive`` marks what a controller takes for a quantity of the drive that it commands, by the name of the quantity in
-    `NodeParameters.drive_models`: where a scenario does not give it, it is the drive's (`lathe_rc.cell.models`).
+    ``drive`` marks a controller's model of a quantity of the commanded drive, by the name of the quantity in
+    `NodeParameters.drive_models`; its default is the drive's value (`lathe_rc.cell.models`).
 
-    Ranges stand in the annotation.
+    Ranges are part of the annotation.
 
     Example:
         >>> from typing import Annotated
@@ -65,7 +65,7 @@ class Row:
         choices: allowed strings; empty if unrestricted.
         is_file: whether the value is a path, relative to the scenario or not.
         named: kind of third-party classes that may be named as well; None: none.
-        low, high: range of a number, ends allowed or not as ``limits`` says; infinite where there is none.
+        low, high: range of a number, infinite if unlimited; ``limits`` tells whether the ends are included.
         limits: the range in words, empty where there is none.
         drive: quantity of the commanded drive that the parameter models, see `parameter`; empty: none.
     """
@@ -169,7 +169,7 @@ class Table(BaseModel):
                 listing = cls.listing.format(shown(values.get("stage") or node))
                 known = instead(name, sorted(cls.model_fields), listing=listing)
                 raise InputError(f"{shown(f'{node}.{name}')}: unknown parameter; {known}") from None
-            if why := str(first.get("ctx", {}).get("error", "")):  # there is such a name, but the class cannot be used
+            if why := str(first.get("ctx", {}).get("error", "")):  # the name exists, but the class cannot be used
                 raise InputError(f"{node}.{name}: {why}") from None
             given = f"{values.get(name, cls.model_fields[name].default)!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
@@ -177,14 +177,14 @@ class Table(BaseModel):
     def changed(self: T, node: str, values: Mapping[str, object]) -> T:
         """Return a copy of the table with other values; raises as `read`."""
         kind = type(self)
-        checks = kind.__pydantic_decorators__  # those of others' tables may look at all values at once
+        checks = kind.__pydantic_decorators__  # validators of third-party tables may use all values
         if not (checks.field_validators or checks.model_validators):
             try:
-                # Checks the changed values alone: in a batch, cells differ in a few.
+                # Checks only the changed values: in a batch, cells differ in a few.
                 found = self.model_copy(update={name: _check(kind, name)(value) for name, value in values.items()})
                 found.model_post_init(None)
             except (KeyError, InputError, ValidationError):
-                pass  # all of it is read again, and says what is wrong
+                pass  # the complete table is read again, which reports the error
             else:
                 return found
         return kind.read(node, {**self.model_dump(exclude_unset=True), **values})

@@ -18,7 +18,7 @@ from lathe_rc.compiled.struct_view import Integers, address, call, floats
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 
-_CHUNK = 1024  # samples that a stage computes in one go, at most: what stages hand on stays in the cache
+_CHUNK = 1024  # largest number of samples per call of a stage, so that signals between stages stay in the cache
 
 
 class Tapes:
@@ -79,7 +79,7 @@ class Tapes:
     def place(self, topic: str, name: str, delay: int) -> tuple[int, int]:
         """Return the base address of a field for a reader with a delay, and the address increment per sample."""
         array = self._arrays[topic, name]
-        # The address counts from the begin of the history; a field that passes stays where it is.
+        # The address counts from the start of the history; a passing field has a fixed address.
         return address(array) - delay * array.itemsize, 0 if (topic, name) in self._passing else array.itemsize
 
     def advance(self, first: int) -> None:
@@ -103,7 +103,7 @@ NOT_FINITE = -3  #: why a program has stopped: a number is not finite
 _NOBODY = np.empty(0, np.int64)
 
 # Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
-# the spindle angle or -1, the sample from which on it needs Python.
+# the spindle angle or -1, the sample from which it needs Python.
 _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 
 
@@ -114,13 +114,13 @@ def _run(
     """Compute from `where` (block, stage, sample in the block) to sample ``end`` (see `Program`).
 
     Args:
-        plan: see above; one row more ends it.
+        plan: plan of the loop, terminated by an additional row.
         turn: spindle angle from which each stage needs Python [rad].
-        fields: of each the address of its first sample on the tape less the delay, by how much it moves with a sample,
-            and the address of the block at hand, shape (3, fields); those of a stage are its `AddressTable`.
+        fields: per field the address of its first sample on the tape less the delay, the increment per sample,
+            and the address of the current block, shape (3, fields); the addresses of a stage form its `AddressTable`.
         where: current position; updated.
         base: position of sample 0 on the tape.
-        end: see above.
+        end: index after the last sample.
         chunk: number of samples that a stage computes per call.
         told: numbers of the fields that must be finite.
 
@@ -136,14 +136,14 @@ def _run(
         while stage < plan.shape[0] - 1:
             row = plan[stage]
             block = at.ctypes.data + 8 * row[_FIELD]
-            # Events are looked for where a stage begins a chunk; a step that goes on inside one has none in it.
+            # Events are searched at the start of a chunk; a step that resumes inside a chunk has none in it.
             waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
             if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
                 waits = waits or _passes(floats(block, row[_ANGLE] - row[_FIELD], n), turn[stage])
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
-            # An exception in a step is printed and swallowed by Numba: then the step does not write this place.
+            # An exception in a step is printed and swallowed by Numba: then the step does not write this word.
             where[2] = BROKEN
             reason: int = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
             if where[2] == BROKEN:
@@ -200,7 +200,7 @@ class Wired(NamedTuple):
     """Stage with the tapes that it reads and writes.
 
     Attributes:
-        stage: see above.
+        stage: the stage.
         inputs: tape of each input, and its delay [sample].
         outputs: tape of each output.
     """
@@ -237,7 +237,7 @@ class Program:
         self._plan = np.zeros((len(stages) + 1, 5), np.int64)
         fields: list[tuple[int, int, int]] = []
         told: list[int] = []
-        # The plan has one row more, in which the fields of the last stage end.
+        # The plan has an additional row with the end of the last stage's fields.
         for row, (stage, inputs, outputs) in zip(self._plan, stages, strict=False):
             begin, angle, table = len(fields), stage.angle_input, AddressTable(*stage.field_types)
             row[_FIELD], row[_ANGLE] = begin, -1
@@ -303,7 +303,7 @@ class Program:
             return self._compute(end, self._told_of if finite else _NOBODY)
         finally:
             first = self.reached
-            # Stages before the one that has failed have computed the chunk at hand, the others have not.
+            # Only the stages before the failed one have computed the current chunk.
             ahead = min(first + self._chunk, end)
             self.ends = [ahead if number < self._where[1] else first for number in range(len(self._stages))]
             for number, reached in enumerate(self.ends):
@@ -323,7 +323,7 @@ class Program:
                 return True
             first, self.number, reached = self._where.tolist()
             self._serve(reason, first, self.number, reached, min(self._chunk, end - first))
-            # What Python has done may have given the step another memory, or another event to wait for.
+            # Python code may have replaced the step's memory, or its next event.
             self._load(self.number)
         return False
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from lathe_rc.drawing.form import TurnedForm
 
-_PIECE = 2**15  # samples that are hashed in one go
+_PIECE = 2**15  # samples per hash update
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Recording:
             >>> tool.attrs["units"]["error"]
             'm'
         """
-        from lathe_rc.cell import frames  # pyarrow takes its time
+        from lathe_rc.cell import frames  # pyarrow is slow to import
 
         name = full(topic)
         if name not in self.types:
@@ -163,7 +163,7 @@ class Recording:
         Raises:
             InputError: there is no tool, or not one complete revolution.
         """
-        from lathe_rc.drawing import form  # Matplotlib takes its time
+        from lathe_rc.drawing import form  # Matplotlib is slow to import
 
         other = beside and (beside[0], beside[1].turned_form())
         return form.draw(self.turned_form(), title, other)

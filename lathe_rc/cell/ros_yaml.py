@@ -66,7 +66,7 @@ def _name(node: yaml.Node, where: str) -> str:
 
 def _value(node: yaml.Node, where: str) -> Value:
     if isinstance(node, yaml.ScalarNode):
-        # rcl would cut it short, or not read it at all
+        # rcl would truncate it, or not read it at all
         if "\0" in node.value or any("\ud800" <= character <= "\udfff" for character in node.value):
             raise InputError(f"{where}: {node.value!r}; allowed: text without NUL and surrogates")
         # Blocks (| and >) count as plain.

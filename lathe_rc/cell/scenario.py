@@ -58,7 +58,7 @@ TABLES = _Tables()
 
 _EVERYONE = "/**"
 _ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
-# What changes neither a sample nor a message of a run, and so not its identity.
+# Parameters that affect neither samples nor messages of a run, and so not its identity.
 _HOST_PARAMETERS = {
     *("run_id", "speed_factor", "window", "members", "processes", "autostart"),
     *("stall_reaction", "stall_time", "safe_time", "restart_time", "restart_file"),
@@ -233,7 +233,7 @@ class Scenario:
             values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter; ``NODE.PARAM[K]`` is element K of a list.
 
         Raises:
-            InputError: one line for the first thing that is wrong.
+            InputError: the input is invalid; one line for the first error.
 
         Example:
             >>> import lathe_rc
@@ -264,11 +264,11 @@ class Scenario:
         given = "run_id" in values or not self._has_own_run_id
         for node, changed in changes.items():
             tables[node] = self.nodes[node].changed(node, changed)
-        # A drive that has changed changes the models of its controllers, unless those were given.
+        # A changed drive changes the models of its controllers, unless these are given.
         tables = models.resolved(tables)
         other = {node: table for node, table in tables.items() if table is not self.nodes[node]}
         if given and (run_id := next(iter(tables.values())).run_id):
-            # With a given run id, changed tables are hashed only when somebody asks for the identity.
+            # With a given run id, changed tables are hashed only when the identity is requested.
             known = {node: told for node, told in fingerprints.items() if node not in other}
             return _agreed(self.name, tables, known, run_id)
         fingerprints |= {node: _fingerprint(table) for node, table in other.items()}
@@ -282,7 +282,7 @@ class Scenario:
                 their drives.
         """
         tree = {}
-        # One that is made of the content would be wrong as soon as a reader changes a value.
+        # A run id derived from the content would be wrong as soon as a reader changes a value.
         left_out = {"run_id"} if given and self._has_own_run_id else None
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
@@ -343,7 +343,7 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
     parsed = ros_yaml.parse_value(value, f"--set {shown(target)}")
     if node == _EVERYONE:
         for values in nodes.values():
-            # A node's own value would be refused beside that for all.
+            # A node's own value would conflict with the shared one.
             values.pop(name, None)
         nodes.setdefault(node, {})[name] = parsed
     else:
@@ -368,20 +368,20 @@ def read(
     copies: Mapping[str, Path] | None = None,
     stages: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, dict[str, Value]]:
-    """Read the values of a parameter file by node and name, with absolute paths.
+    """Read the values of a parameter file by node and name, with absolute paths; a file in a bag counts as data.
 
     Args:
-        path: of the file.
+        path: path of the file.
         overrides: see `load`.
         copies: see `load`.
-        stages: of nodes for which the file names none.
+        stages: stages of nodes for which the file names none.
 
     Raises:
-        InputError: the file is none, or it is data and names code that is not allowed, or files elsewhere.
+        InputError: the file is invalid, or it is data and names code that is not allowed, or files elsewhere.
     """
     folder = path.parent if copies is not None else allowed_code.bag_around(path.parent)
     nodes = ros_yaml.read(path)
-    # Collected, not refused at once: an override may name another file.
+    # Collected instead of rejected at once: an override may name another file.
     outside: dict[tuple[str, str], Path] = {}
     for name, values in nodes.items():
         if name == _EVERYONE:
@@ -423,7 +423,7 @@ def content(path: Path) -> str:
     try:
         return hashlib.sha256(files.contents(path)).hexdigest()
     except OSError:
-        return path.name  # who needs the file says why it cannot be read
+        return path.name  # the reader of the file reports why it cannot be read
 
 
 def _fingerprint(table: NodeParameters) -> str:
@@ -480,13 +480,13 @@ def load(
     Args:
         path: ROS 2 parameter file, or the name of a scenario that comes with lathe_rc, such as ``piston``.
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
-        complete: what the file leaves out has its default, as in those of `Scenario.to_yaml`; otherwise models of
-            drives that are not given are those of the drives, see `lathe_rc.cell.models`.
-        copies: of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; it is data then, and
-            names no others. None: it is the user's own, unless it lies in a bag (`lathe_rc.allowed_code`).
+        complete: whether omitted parameters get their defaults, as in files of `Scenario.to_yaml`; otherwise models of
+            drives that are not given are taken from the drives, see `lathe_rc.cell.models`.
+        copies: copies of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; it is data then
+            and names no other files. None: the user's own, unless it is in a bag (`lathe_rc.allowed_code`).
 
     Raises:
-        InputError: one line for the first thing that is wrong.
+        InputError: the input is invalid; one line for the first error.
 
     Example:
         >>> import lathe_rc

@@ -10,7 +10,7 @@ Most stages compute by a step, which a program of many stages can call if it is 
 
 It computes the block that begins at sample ``first``, from its sample ``start`` on, until the end of the block
 (`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
-Inputs are the arrays of float64 of all fields of all input ports in their order, flags are those of uint8, or an empty
+Inputs are the arrays of float64 of all fields of all input ports in their order, flags the arrays of uint8, or an empty
 one if there are none, and outputs are the arrays of all fields of all output ports.
 """
 
@@ -44,7 +44,7 @@ class Input:
     Attributes:
         topic: relative name, before remapping.
         type: message type.
-        fields: those that the stage reads.
+        fields: fields that the stage reads.
         delay: 0 for a forward edge: block k is complete before the stage computes block k. Otherwise a feedback
             edge: at sample n the stage sees sample n - delay, and zeros before sample ``delay``.
     """
@@ -88,7 +88,7 @@ DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
 _NOTHING = np.empty(0)
-_NO_FLAGS = np.empty(0, np.uint8)  # stands for the flags of a step without any, so that it may have the same code
+_NO_FLAGS = np.empty(0, np.uint8)  # flags of a step without any, so that the call is the same
 
 
 class WiredCell(Protocol):
@@ -129,7 +129,7 @@ class Stage(ABC):
 
 
     Attributes:
-        inputs, outputs: the ports; the arrays handed to `advance` stand in their order.
+        inputs, outputs: the ports, in the order of the arrays passed to `advance`.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
         unheard: sparse topics without a reader; their messages need not be made.
         foreign: type of each topic that the node receives from outside the cell, by name before remapping.
@@ -169,15 +169,15 @@ class Stage(ABC):
     step: ClassVar[Step | None] = None
     learns: ClassVar[bool] = False  #: whether a run tells its stability margin
     rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
-    _sensors: Sequence[Sensor] = ()  # whose noise the step needs
+    _sensors: Sequence[Sensor] = ()  # sensors whose noise the step needs
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        # Messages name a stage of another package by its class.
+        # Messages name a third-party stage by its class.
         if not hasattr(cls, "kind") and not is_ours(cls.__module__):
             cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
-            cls.step = None  # what it inherits computes something else
+            cls.step = None  # an inherited step computes something else
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
@@ -191,7 +191,7 @@ class Stage(ABC):
         self._native: CompiledStep | None = None
         self._room: Samples | None = None
         self._scheduled: list[tuple[int, str]] = []
-        self._remarks: list[str] = []  # events that came of the one that is carried out
+        self._remarks: list[str] = []  # events caused by the current event
 
     def warnings(self, seconds: float) -> list[str]:
         """Return the warnings about the parameters, one line each, for a run of ``seconds``; inf for an endless run."""
@@ -226,7 +226,7 @@ class Stage(ABC):
             InputError: an event or fault is invalid.
         """
         self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
-        # An event by revolutions needs the angle, even where the step does not: one more input, which it never sees.
+        # An event by revolutions needs the angle, even where the step does not: an additional input outside the step.
         if inputs and self.angle_input is None and any(trigger.kind == "revolution" for trigger in self._triggers):
             self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
@@ -485,7 +485,7 @@ class Stage(ABC):
         start = -first % period
         if start >= samples:
             return []
-        # Copies: the block's own arrays are used again.
+        # Copies: the block's own arrays are reused.
         given = {what: signals[name][start::period].copy() for what, name in joint._asdict().items() if name}
         topic, found = f"{self.name}/joint_states", []
         for k in range(given["position"].size):
@@ -537,12 +537,12 @@ class Stage(ABC):
         """Return the step with its current memory as a function of addresses."""
         if self._native is None:
             assert self.step is not None, "a stage without a step has its own `process`"
-            # Numba's own refusal of a memory says nothing that the author of a stage could use.
+            # Numba's own error for an invalid memory does not help the author of a stage.
             if not is_ours(type(self).__module__) and (why := explain_unfit(self.memory)):
                 raise InputError(f"{self.name}: memory of a compiled step: {why}")
             self._native = CompiledStep(self.step, self.memory, *self.field_types)
         else:
-            # The same words at the same address: a program that has taken the address goes on with it.
+            # The same words at the same address: a program keeps using the address.
             self._native.update(self.memory)
         return self._native
 
@@ -575,7 +575,7 @@ class Stage(ABC):
         The step continues from there. Stages whose steps stop override this.
 
         Raises:
-            LatheError: the stage cannot go on.
+            LatheError: the stage cannot continue.
         """
         raise NotImplementedError(reason)
 
@@ -586,11 +586,11 @@ class Stage(ABC):
     def process(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """Compute the samples from ``first`` by the step, without events and faults (see `advance`)."""
         samples = next(iter(outputs[0].values())).size
-        # Tables of noise and clipped samples, and the room of a step, hold so many samples.
+        # Limit of the tables of noise and clipped samples, and of the scratch memory of a step.
         if samples > messages.MAX_BLOCK:
             pieces = [(k, min(k + messages.MAX_BLOCK, samples)) for k in range(0, samples, messages.MAX_BLOCK)]
             return [said for k, m in pieces for said in self.process(first + k, cut(inputs, k, m), cut(outputs, k, m))]
-        # Not strict: an input for events alone is not handed over.
+        # Not strict: an input for events alone is not passed on.
         fields = [part[name] for port, part in zip(self.inputs, inputs, strict=False) for name in port.fields]
         fields += [array for part in outputs for array in part.values()]
         self.prepare(first, samples)

@@ -51,7 +51,7 @@ class Start:
     """
 
     def __init__(self, stage: Stage) -> None:
-        self._seen: dict[int, Any] = {id(stage.room): stage.room}  # by address; what is for the step alone stays
+        self._seen: dict[int, Any] = {id(stage.room): stage.room}  # by address; the step's scratch memory is skipped
         self._back: list[Callable[[], object]] = []
         self._look(stage)
 
@@ -69,7 +69,7 @@ class Start:
         self._seen[id(part)] = part
         parts: Iterable[Any] = ()
         if type(part) is np.ndarray and not part.dtype.hasobject:
-            # Nobody has changed one that is read-only.
+            # A read-only array cannot have changed.
             if part.flags.writeable:
                 self._back.append(partial(np.copyto, part, part.copy()))
         elif isinstance(part, tuple | frozenset) and not hasattr(part, "__dict__"):
@@ -78,7 +78,7 @@ class Start:
             parts = part.values() if type(part) is dict else part
             self._back.append(partial(_refill, part, part.copy()))
         elif isinstance(part, np.random.Generator):
-            # The generator itself must stay: others may hold it.
+            # The generator object must stay: it may be referenced elsewhere.
             bits = part.bit_generator
             self._back.append(partial(setattr, bits, "state", bits.state))
         elif isinstance(part, types.MethodType):
@@ -126,7 +126,7 @@ class StageCache:
 
     def __init__(self) -> None:
         self._stages: dict[str, Stage] = {}
-        self._starts: dict[str, Start | None] = {}  # of those that were asked for again; None: they cannot be set back
+        self._starts: dict[str, Start | None] = {}  # of stages requested again; None: cannot be reset
 
     def take(self, name: str, table: NodeParameters) -> Stage:
         """Return the stage of a node: the cached one if its table is equal, or a new one.
@@ -147,7 +147,7 @@ class StageCache:
             self._starts[name] = None
             with contextlib.suppress(UnknownPartError):
                 if made.is_compiled:
-                    # Now, so that its words are among what is set back.
+                    # Before taking the start, so that its words are reset as well.
                     made.native()
                 self._starts[name] = Start(made)
         return made

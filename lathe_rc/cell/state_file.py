@@ -22,7 +22,7 @@ from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.files import contents, sealed, unsealed
 
-_MOST = 2**28  # longest such file [B]
+_MOST = 2**28  # largest state file [B]
 _TABLE, _ARRAY, _NUMBER, _KIND, _ENUM = "table", "array", "number", "kind", "enum"
 _NUMBERS = "biuf"  # kinds of elements
 _Name = tuple[str, str]
@@ -144,7 +144,7 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     try:
         _check_owner(path)
         stream, state = io.BytesIO(unsealed(contents(path, _MOST))), dict[str, Any]()
-        # Each part by a reader of its own: the names of one are unknown to the next.
+        # Each part has its own reader: the names of one are unknown to the next.
         while stream.tell() < stream.getbuffer().nbytes:
             state |= _Reader(stream, table, frozenset(classes)).load()
     except LatheError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """CDR encoding and decoding of blocks, at the rate that a cell needs.
 
-rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, are the same bytes but for a
+rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, have equal bytes except for a
 few numbers and the samples. So for each length of block one message is encoded by rosbags, the places of the
-numbers are found by changing them, and from then on only those places are written or read. Whatever
+numbers are found by changing them, and from then on only those offsets are written or read. A message that
 does not match the layout is decoded by rosbags and analysed again; no CDR code is hand-written. CDR leaves open
 padding content, byte order, and padding of the encapsulation, and a publisher may set a
 frame: such a block is re-encoded by rosbags, 10 to 50 µs, and then read like our own.
@@ -22,8 +22,8 @@ from lathe_rc.cell.block import Block
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
-_SHIFT = 4  # CDR aligns to what follows its first four bytes: with so many before, to memory as well
-# What differs from block to block, but for the samples: the stamp, and what follows the texts of a BlockInfo.
+_SHIFT = 4  # CDR aligns relative to the end of its 4-byte header: this many bytes in front align it in memory as well
+# Numbers that differ between blocks: the stamp, and the fields after the strings of a BlockInfo.
 _STAMP = struct.Struct("<iI")  # sec, nanosec
 _INFO = struct.Struct("<QI?3xQ")  # first_index, step_ns, last, companions
 NUMBERS = ("sec", "nanosec", "first_index", "step_ns", "last", "companions")  #: what differs, by name
@@ -75,7 +75,7 @@ class Layout:
         edges = np.flatnonzero(np.diff(filled.astype(np.int8), prepend=0) == 1)
         for (name, dtype), start in zip(messages.sample_fields(msgtype).items(), edges, strict=True):
             self.fields[name] = dtype, int(start)
-        # Everything else is the same in each block: texts, lengths, padding.
+        # Everything else is constant across blocks: strings, lengths, padding.
         bounds = np.flatnonzero(np.diff(changing.astype(np.int8), prepend=1, append=1))
         self.constant = [(int(a), int(b), self.template[a:b]) for a, b in zip(bounds[::2], bounds[1::2], strict=True)]
 
@@ -249,14 +249,14 @@ class Decoder:
         while start < len(places):
             begin, length = int(begins[start]), int(lengths[start])
             first = self.decode(data := whole[begin : begin + length])
-            if self.message is not data:  # encoded otherwise: its samples stand elsewhere
+            if self.message is not data:  # encoded differently: its samples have other offsets
                 yield first
                 start += 1
                 continue
             assert self._layout is not None, "that has been learned"
             other = np.flatnonzero(lengths[start:] != length)
             stop = start + int(other[0]) if other.size else len(places)
-            # A record at each byte of the whole, none of them copied: indexing takes those that begin a block.
+            # A strided view with a record at each byte, without a copy: indexing selects the starts of blocks.
             anywhere: Samples = np.ndarray(len(whole) - length + 1, f"V{length}", whole, strides=(1,))
             records = anywhere[begins[start:stop]].view(self._layout.dtype)
             count = self._following(records, first)

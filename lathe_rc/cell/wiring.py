@@ -125,7 +125,7 @@ def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[d
 
 @lru_cache
 def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
-    # Shared by all cells of a batch that are wired alike; `Engine.begin` compares it by identity.
+    # Shared by all cells of a batch with equal wiring; `Engine.begin` compares it by identity.
     return _wire(stages, {})
 
 
@@ -156,20 +156,20 @@ class Cell:
         stage: factory of the stage for a name and table.
 
     Attributes:
-        unknown: see above.
-        unchecked: what `check` could not check since it depends on them, or since a law or drive of others does not
-            tell what is needed; one line each.
-        warnings: doubts about parameters that can be meant, and what makes the form worse than the laws can do, with
-            its cure; one line each. `check` finds them.
+        unknown: members known only by their topics, by name.
+        unchecked: omissions of `check`, caused by unknown members, or by third-party laws or drives that do not provide
+            the necessary data; one line each.
+        warnings: unusual but valid parameters, and avoidable causes of form error, with
+            a remedy; one line each. Set by `check`.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
-            below 1 the error of each cycle is smaller than that of the one before. `check` finds it.
+            below 1 the error decreases from cycle to cycle. Set by `check`.
         stages: by node name, in the order of the forward edges.
         wiring: see `Wiring`.
-        dense: publisher of each topic that carries a block a block, by relative topic.
-        sparse: the same for topics that carry messages at chosen samples.
+        dense: publisher of each topic with one block per block, by relative topic.
+        sparse: publisher of each topic that carries messages at chosen samples, by relative topic.
 
     Raises:
-        InputError: a topic without or with two publishers, types that do not match, a loop without a delay.
+        InputError: a topic has no or two publishers, types do not match, or a loop has no delay.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class Cell:
     def replace(self, stage: Stage) -> None:
         """Replace the stage of the same name, which has equal ports."""
         self.stages[stage.name] = stage
-        # The cached master may be the stage that was there before.
+        # The cached master may be the replaced stage.
         self.__dict__.pop("master", None)
 
     @cached_property
@@ -286,7 +286,7 @@ class Cell:
         """Check the cell before a start and report violations with figures; `unchecked` lists the omitted checks.
 
         Args:
-            cures: look for parameters with which learning would converge, which takes half a second at most.
+            cures: whether to search for parameters with which learning would converge, which takes up to 0.5 s.
 
         Raises:
             InputError: a block longer than a feedback delay, a profile that a drive cannot follow, a flank of the tool

@@ -70,8 +70,8 @@ def broken() -> LatheError:
 class AddressTable:
     """Layout of the address table of a step: positions of the addresses of its arrays.
 
-    First the number of inputs of float64; then the inputs of uint8, of which one without an address stands for none;
-    then the outputs; and last those inputs of float64, so that all else has the same places however many there are.
+    First the number of inputs of float64; then the inputs of uint8, where a zero address represents no input;
+    then the outputs; and last the inputs of float64, so that their number does not affect the other positions.
 
     Args:
         inputs, outputs: element types of the arrays of all fields of all ports.
@@ -183,7 +183,7 @@ class Entry:
             raise InputError(_cause(str(error))) from error
 
 
-_entry = cache(Entry)  # made once for all that are alike
+_entry = cache(Entry)  # shared by all equal arguments
 
 
 def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
@@ -192,7 +192,7 @@ def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
         return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))
 
-    # Another package's step gets a tuple, which it may unpack; ours are compiled once for any number of inputs.
+    # A third-party step gets a tuple, which it may unpack; built-in ones are compiled once for any number of inputs.
     read = f"ports(fields + {8 * table.first}, word(fields, 0), samples)"
     return _MODULE.format(
         step=f"{step.__module__}.{step.__qualname__}",
@@ -224,7 +224,7 @@ def _source(module: str) -> str:
 def is_kept(name: str) -> bool:
     """Return whether the compiled code of a module is in the cache of this machine, undamaged."""
     files = list(cache_folder().glob(f"*/{name}.*"))
-    # To read them checks them: a damaged file is removed, and compiled anew.
+    # Reading verifies the files: a damaged file is removed and compiled again.
     return any(path.suffix == ".nbi" for path in files) and None not in [read_kept(path) for path in files]
 
 

@@ -174,7 +174,7 @@ class Struct:
         # A struct without members needs an address as well.
         self.words = np.frombuffer(bytearray(pack.pack(*words)) or bytearray(8), np.int64)
         self._floats = self.words.view(np.float64)
-        self._value = value  # keeps the arrays
+        self._value = value  # keeps the arrays alive
 
     def update(self, value: tuple[Any, ...]) -> None:
         """Update the words of the members that have been replaced by other objects of the same types."""
@@ -184,7 +184,7 @@ class Struct:
     def _update(self, kind: StructView, begin: int, value: tuple[Any, ...], known: tuple[Any, ...]) -> None:
         for (member, place), part, before in zip(kind.members.values(), value, known, strict=True):
             at = begin + place
-            # A stage makes a new tuple each time, mostly of the same arrays: then nothing has to be written.
+            # A stage creates a new tuple each time, mostly of the same arrays: then nothing has to be written.
             if part is before:
                 continue
             if isinstance(member, StructView):

@@ -8,7 +8,7 @@ the cut `loaded_drive`; `cutting_process`.
 Laws of the tool: `law` and `learner` (common parts), `learning_controller` with `learning_parameters` and
 `learning_step`, `form_law` (common part), `disturbance_controller`, `compound_controller`, `resonant_controller`.
 Feed: `feed_drive`, `servo` and `trajectory` (common parts), `position_controller`, `force_controller`, `decoupler`.
-Safety: `supervisor`, `obedience`, `command_limits`. What stages are made of: `tables`, `sampled`.
+Safety: `supervisor`, `obedience`, `command_limits`. Building blocks of stages: `tables`, `sampled`.
 """
 
 from lathe_rc.cell.stage import Stage
@@ -17,7 +17,7 @@ from lathe_rc.extensions import Registry
 #: kinds of ours that give a cell its time
 MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle")
 
-# A module is imported when a cell has such a stage: all of them take as long as the samples of a hundred revolutions.
+# Modules are imported on demand: importing all of them takes as long as the samples of a hundred revolutions.
 _OWN = {
     "spindle_encoder": "spindle_encoder:SpindleEncoder",
     "encoder_device": "encoder_device:EncoderDevice",

@@ -12,7 +12,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 
 LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
-_TELL = 0.1  # [s] after which a command that goes on being clipped says how often
+_TELL = 0.1  # [s] interval of reports about a command that remains clipped
 _QUIET = 10e-3  # [s] without a clipped sample until a command is free again
 
 
@@ -46,7 +46,7 @@ class Clipping:
         self._begins = f"{LIMITED}:{self._which}" if which else LIMITED
         self._quiet = round(_QUIET * parameters.sample_rate)
         self._tell = max(round(_TELL * parameters.sample_rate), 1)
-        # Clipped samples so far, and when it was last free; samples until it is free again.
+        # Number of clipped samples, last free sample, and samples until the command counts as free again.
         self._clipped, self._before, self._left = 0, 0, 0
 
     def tell(self, first: int, end: int) -> list[Sparse]:
@@ -54,14 +54,14 @@ class Clipping:
         found: list[Sparse] = []
         if self._flags.size == 1:
             return found
-        # A ring: samples at its end and at its begin may belong together.
+        # A ring buffer: samples at its end and start may be consecutive.
         begin, start = first & (self._flags.size - 1), 0
         clipped = self._flags[begin : begin + end - first]
         if clipped.size < end - first:
             clipped = np.concatenate((clipped, self._flags[: end - first - clipped.size]))
         if not self._left and self._clipped == self._before and not clipped.any():
             return found
-        # Cut at multiples of `_TELL`, so that reports come at the same samples whatever the blocks.
+        # Split at multiples of `_TELL`, so that the samples of the reports do not depend on the blocks.
         while start < clipped.size:
             stop = min(start + self._tell - (first + start) % self._tell, clipped.size)
             found += self._ends(first + start, clipped[start:stop])
@@ -88,7 +88,7 @@ class Clipping:
         while place < samples:
             ahead = np.flatnonzero(clipped[place : place + self._left] if self._left else clipped[place:])
             if self._left and ahead.size:
-                # Still at it: the quiet begins anew after the last of them.
+                # Still clipped: the quiet time restarts after the last clipped sample.
                 after = int(ahead[-1]) + 1
                 count += int(clipped[place : place + after].sum())
                 place, self._left = place + after, self._quiet

@@ -31,7 +31,7 @@ READ = {
     "longitudinal": Input("longitudinal/state", messages.STATE, ("position", "velocity")),
 }
 TURNS = Input("encoder", messages.ENCODER, ("angle_true", "speed_true"))
-_HEIGHTS = 201  # places along a shaft between which its compliance is linear
+_HEIGHTS = 201  # positions along a shaft, with linear interpolation of the compliance
 
 
 class CuttingProcessParameters(NodeParameters):
@@ -202,7 +202,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     n = angle.size
     displacement, cross_position, feed_velocity = memory.room[0, :n], memory.room[1, :n], memory.room[2, :n]
     height = memory.room[3, :n]
-    # What does not move the edge counts as standing still.
+    # A device that does not move the edge counts as standing still.
     displacement[:] = cross_position[:] = height[:] = 0.0
     if memory.tool >= 0:
         height = inputs[memory.tool + 2]

@@ -96,7 +96,7 @@ class DecouplerStage(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         channels = parameters.channels(name)
-        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # what is inverted, and by which lag
+        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # inverted models, and the lag of the inverse
             k1, k2 = compensators(channels, parameters.inverse_lag, parameters.leak)
         self._decoupler = Decoupler(k1 if parameters.k1 else None, k2 if parameters.k2 else None, parameters.step)
         fields = ("command", "set_point", "error")

@@ -112,7 +112,7 @@ class DisturbanceController(FormLaw):
     remedy = "a model nearer to the drive"
 
     def __init__(self, name: str, parameters: DisturbanceControllerParameters) -> None:
-        parameters.make(name)  # refuses what cannot be made, as ours
+        parameters.make(name)  # rejects invalid parameters
         super().__init__(name, parameters)
 
     def start(self) -> Memory:

@@ -80,9 +80,9 @@ class Drive(Stage):
 
     announces = (LIMITED, FREE)
     _commands: Sequence[LimitedCommand] = ()
-    _clippings: Sequence[Clipping] = ()  # of other quantities that are limited
-    _limits: Limits | None = None  # of a drive that carries the whole profile
-    _retraction: OwnRetraction | None = None  # of one that takes the tool out
+    _clippings: Sequence[Clipping] = ()  # of further limited quantities
+    _limits: Limits | None = None  # of a drive that follows the whole profile
+    _retraction: OwnRetraction | None = None  # of a drive that retracts the tool
 
     @abstractmethod
     def responses(self) -> Mapping[str, Response]:

@@ -20,7 +20,7 @@ from lathe_rc.signals.counts import CountedAngle, CsvReader
 TOO_FAST, TOO_SLOW, LATE = "too fast", "too slow", "late"  #: events that come about by themselves
 
 _TURN = 2.0 * np.pi
-_RPM = 30.0 / np.pi  # for 1 rad/s
+_RPM = 30.0 / np.pi  # rpm per rad/s
 
 
 class EncoderDeviceParameters(TimeMasterParameters):
@@ -78,8 +78,8 @@ class EncoderDevice(TimeMaster):
         self.live = parameters.source != "file"
         counts, wraps = parameters.counts_per_revolution, parameters.counter_range
         self.counted = made_of(CountedAngle, parameters, counts=counts, wraps=wraps)
-        self._before: Samples | None = None  # the last angles, for the speed
-        self._speed = self.shared.nominal_speed  # the last one [rad/s]
+        self._before: Samples | None = None  # latest angles, for the speed
+        self._speed = self.shared.nominal_speed  # latest speed [rad/s]
         self._revolution = -1.0
         self._told: set[str] = set()
         self._told_late = 0
@@ -196,7 +196,7 @@ class EncoderDevice(TimeMaster):
         angle = self.counted.take(first, out["angle"].size)
         window, step = self.parameters.speed_window, self.shared.step
         if self._before is None:
-            # Before the first reading the spindle is taken to have turned at its nominal speed.
+            # Before the first reading the spindle is assumed to turn at nominal speed.
             self._before = angle[0] + self.shared.nominal_speed * step * np.arange(-window, 0)
         whole = np.concatenate((self._before, angle))
         out["angle"][:] = out["angle_true"][:] = angle

@@ -247,7 +247,7 @@ class FeedDriveStage(Obedient):
                 model=parameters.transfer(),
                 command_limit=parameters.command_limit or np.inf,
                 speed_limit=parameters.speed_limit or np.inf,
-                resolution=0.0,  # rounds what its own sensor sees, and here the sensor of the stage does
+                resolution=0.0,  # the sensor of the stage rounds instead of the drive's own
                 limits=limits,
                 friction=rubbing,
                 screw=screw,
@@ -259,7 +259,7 @@ class FeedDriveStage(Obedient):
         limit = parameters.command_limit
         self._obedience: Obedience = parameters.obedience(name, speed=self.drive.integrates, limit=limit, settled=0)
         self._safe = False
-        self._said: list[Sparse] = []  # of going safe, to be told with the sample that comes next
+        self._said: list[Sparse] = []  # events of the transition to the safe state, published with the next sample
         axis = parameters.axis
         self.declare(
             inputs=[

@@ -66,7 +66,7 @@ class ForceController(Servo):
         self.pid = parameters.pid(name)
         self.declare(
             inputs=[
-                # The angle itself is not used: the spindle's blocks say which samples are due.
+                # The angle itself is not used: the spindle's blocks determine which samples are due.
                 Input("encoder", messages.ENCODER, ("angle",)),
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
                 *listens(parameters),

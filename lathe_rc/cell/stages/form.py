@@ -161,11 +161,11 @@ def evaluate(
         position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
-    # Equal angles give equal bits: what an ideal encoder measures is looked up once.
+    # Equal angles give bit-identical results: the angle of an ideal encoder is evaluated once.
     if form.alike and equal(angle, angle_true) and equal(position, measured):
         put(expected, reference)
     else:
-        # The height goes into the array of the result, and is copied out of it before that is written.
+        # The result array holds the height first, which is copied before the result is written.
         _place(form, angle, measured, expected)
         deviation_along(form.heights, form.told, angle, expected.copy(), expected)
 

@@ -136,7 +136,7 @@ class FormLaw(Law):
         ratio = followed_ratio(spindle, low, high, _BAD)
         if ratio is None:
             return []
-        # Nearest first, and higher ones before lower ones, which see the encoder less often.
+        # Nearest rates first, and higher before lower ones, which read the encoder less often.
         near = [each for each in _RATES if rate / 2 <= each <= rate * 2]
         rates = sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate))))
         cure = next(

@@ -20,7 +20,7 @@ from lathe_rc.jit import inlined
 from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
-_DIVERGED = 1  # why a step stops
+_DIVERGED = 1  # stop reason of the step
 
 
 class Now(NamedTuple):
@@ -52,8 +52,8 @@ class GuardTable(NamedTuple):
 
     Attributes:
         limit: square of the permitted ratio; 0: guard off.
-        sums: squares of error and form in the revolution at hand, of the error in the one that ended last and in the
-            first one, and what the latter two are compared with [m²].
+        sums: squares of error and form in the current revolution, of the error in the last complete revolution and the
+            first one, and the reference of the latter two [m²].
         whole: number of samples in the current revolution, and its number.
     """
 
@@ -76,7 +76,7 @@ def _grows(guard: GuardTable, angle: float, error: float, form: float) -> bool:
         if number == 0:
             guard.sums[_FIRST] = guard.sums[_ENDED]
         guard.sums[_ALLOWED] = guard.sums[_FORM] / samples
-        # A round part has no form: then the first revolution is the measure.
+        # A round part has no form: then the first revolution is the reference.
         if guard.sums[_ALLOWED] == 0.0:
             guard.sums[_ALLOWED] = guard.sums[_FIRST]
         found = guard.limit > 0.0 and guard.sums[_ENDED] > guard.limit * guard.sums[_ALLOWED]
@@ -125,7 +125,7 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
             learning = memory.learns[0] != 0 and (not who.listens or may_learn(who))
             for k in range(start, stop):
                 n = first + k
-                # Before that the error is 0, and would make the first revolution look good.
+                # Before that the error is 0, which would reduce the error of the first revolution.
                 if n >= memory.delay and _grows(memory.guard, error_angle[k], error[k], form[k]):
                     return k, _DIVERGED
                 sensed = position[k] if memory.senses else 0.0

@@ -27,10 +27,10 @@ from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.errors import DivergedError, InputError
 
-_SAFE = 0.98  # factor of a cycle that a cure leaves at most
-_BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] where a flat Q may end
-# Where its stop band begins, over that, and its ripple: the flattest first. One with a longer kernel may not fit into
-# the memory, which holds fewer points a second the slower the spindle turns.
+_SAFE = 0.98  # largest factor of a cycle after a remedy
+_BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] candidate band edges of a flat Q
+# Start of the stop band relative to the band edge, and ripple: the flattest first. A longer kernel may not fit into
+# the memory, which holds fewer points per second at lower spindle speeds.
 _SHAPES = ((2.0, 1e-6), (3.0, 1e-6), (2.0, 1e-4), (3.0, 1e-4), (2.0, 1e-3), (2.0, 1e-2))
 
 
@@ -252,7 +252,7 @@ class Loop(NamedTuple):
         """Return the largest factor of a cycle with some parameters changed; inf if invalid or not provided."""
         try:
             stage = type(self.stage)(self.stage.name, self.stage.parameters.model_copy(update=dict(values)))
-        except InputError:  # the memory has no room for it
+        except InputError:  # too large for the memory
             return np.inf
         told = [stage.worst(response, speed) for response in self.responses for speed in self.speeds]
         return max((np.inf if worst is None or np.isnan(worst[0]) else worst[0] for worst in told), default=np.inf)

@@ -27,13 +27,13 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import MAX_BLOCK, Signals
 from lathe_rc.plants.linear import discretise, second_order
 
-_SETTLED = 4.0  # lead times until a drive has followed
+_SETTLED = 4.0  # settling time of a drive, in lead times
 _FILE_ACTIONS = ("save", "load")
 _STATUS = "coarse/learning"  # topic
-_MOST = 1024  # entries of a table of margins
-_LEAST_Q = 1e-6  # [s] from which on a wider Q is looked for
-_QS = 30  # that are tried, each a quarter wider than the one before
-# Leads that are tried, in lags: more where a drive rings.
+_MOST = 1024  # largest number of entries in a table of margins
+_LEAST_Q = 1e-6  # [s] smallest Q width from which a wider Q is searched
+_QS = 30  # number of candidates, each 25 % wider than the previous one
+# Candidate leads, in lags: more for a drive that rings.
 _LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
@@ -71,7 +71,7 @@ class LearningController(Learner):
             step=parameters.step,
         )
         self._joined = self._controller.joined
-        # Where the end of a cycle changes what follows, the step stops for it; otherwise it is told later.
+        # The step stops at the end of a cycle only if that affects later samples; otherwise it is reported later.
         self._asks = parameters.identify or parameters.publish_margin or parameters.stop_ratio > 0.0
         self._first_rms = np.nan
         self._controller.table.whole[angle_memory.ASKS] = self._asks
@@ -80,7 +80,7 @@ class LearningController(Learner):
         self._model = Identified(parameters.model_natural_frequency, parameters.model_damping, np.nan)
         self._margins = Margins(parameters)
         delay = parameters.feedback_delay
-        self._cycle_start = delay  # where the first error becomes visible
+        self._cycle_start = delay  # sample of the first visible error
         inputs = [
             Input("encoder", messages.ENCODER, ("angle", "speed")),
             Input("encoder", messages.ENCODER, ("angle",), delay),
@@ -277,7 +277,7 @@ class LearningController(Learner):
         sparse = [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
         self._margin[0] = sparse[0].values["stability_margin"]
         for published in outputs[1:]:
-            # That sample has been written already, with the margin of the cycle before.
+            # That sample has been written already, with the margin of the previous cycle.
             published["stability_margin"][reached - 1] = self._margin[0]
         return sparse
 
@@ -346,7 +346,7 @@ class Margins:
         return {**self.__dict__, "_responses": {}}
 
     def _response(self, model: Identified) -> Response:
-        # Three digits of a model are more than its margin is good for, and a steady one is computed once.
+        # Three digits of a model exceed the accuracy of its margin, and a steady model is computed once.
         key = _three_digits(model.natural_frequency, model.damping)
         if key not in self._models:
             _make_room(self._models)
@@ -379,7 +379,7 @@ class Margins:
         """Return the margin at ``speed`` [rad/s], interpolated between tabulated speeds."""
         speeds = _tabulated(self._parameters.nominal_speed)
         after = bisect_left(speeds, speed)
-        # Beyond the table each speed would be a new entry.
+        # Outside the table each speed would need a new entry.
         if not 0 < after < len(speeds):
             return 1.0 - stage.loop(self._response(model)).supremum(speed)
         below, above = speeds[after - 1], speeds[after]

@@ -154,7 +154,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     def _q_that_fits(self) -> str:
         """Return nearby parameters of a Q filter that fits into the memory, in words."""
-        highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # [rad/s] of a wave that the grid has
+        highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # [rad/s] highest frequency on the grid
         tried: list[dict[str, float]] = []
         for k in range(1, 60):
             if self.q_filter != "fir":

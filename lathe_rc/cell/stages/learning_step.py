@@ -16,8 +16,8 @@ from lathe_rc.jit import inlined, kernel
 from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
-# Places in the state of a step: whether it is inside a piece of a block, where that begins and ends, and whether the
-# angle is lost, and since which sample, if that has not been told yet.
+# Indices into the state of a step: whether it is inside a segment of a block, start and end of that, and whether the
+# angle is lost, and since which sample, if not reported yet.
 _INSIDE, _BEGIN, _END, _LOST, LOST_AT = range(5)
 
 
@@ -36,7 +36,7 @@ class Memory(NamedTuple):
         rates: whether the correction needs the rates of the lead.
         finer: number of finer drives included in the error.
         margin: stability margin of the newest cycle, shape (1,).
-        state: see above.
+        state: state of the step, indexed by the module constants.
     """
 
     control: AngleMemory
@@ -63,7 +63,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
     for k in range(angle.size):
         angle[k] = memory.nominal * (memory.period * (first + k))
     if late:
-        # Multiplied and subtracted in this order: the bits of the angle depend on it.
+        # The order of multiplication and subtraction determines the last bits of the angle.
         angle -= memory.nominal * (memory.period * late)
     return angle
 
@@ -99,7 +99,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     """Compute the command of one block, from the memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
-    # A step that has stopped within a piece comes back with the piece still open, maybe at its very end.
+    # A step that has stopped within a segment resumes with the segment still open, possibly at its end.
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
             stop = piece(who, start, n, flags[0])
@@ -123,7 +123,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 _lose(memory, reached, stop, command)
                 reached, reason = stop, DONE
             elif memory.identifies:
-                command_sent(memory.identifier, first, start, reached, command)  # a piece may be longer than the delay
+                # Before `accumulate`: a segment may be longer than the delay.
+                command_sent(memory.identifier, first, start, reached, command)
                 accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
         for published in range(1, len(outputs)):
             outputs[published][start:reached] = memory.margin[0]

@@ -30,8 +30,8 @@ from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import SensorTable, measure
 
-_CUT = "cut_"  # begins the parameters of the cut
-_COIL = "coil"  # whose limits are told
+_CUT = "cut_"  # prefix of the parameters of the cut
+_COIL = "coil"  # source of limit events
 _COIL_LIMITS = ("current_limit", "voltage_limit", "slew_rate")
 _NO_LIMITS = limiter(CommandLimits(), 1.0, 1)
 _REFERENCE = Input("reference", messages.REFERENCE, ("reference", "height"))
@@ -188,7 +188,7 @@ class Memory(NamedTuple):
     room: Samples
 
 
-# Inputs: angle and speed, form and height, command; from here on what makes the piezo's set point, and the slides.
+# Inputs: angle and speed, form and height, command; then the terms of the piezo's set point, and the slides.
 _MORE = 5
 
 

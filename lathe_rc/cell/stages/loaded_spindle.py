@@ -18,8 +18,8 @@ from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
 
-_TORQUE = "torque"  # whose limit is told
-_MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] by which a run is longer than its law needs, at most
+_TORQUE = "torque"  # source of limit events
+_MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] largest extension of a run beyond its speed law
 
 
 class LoadedSpindleParameters(SpindleEncoderParameters):
@@ -100,13 +100,13 @@ class LoadedSpindleStage(SpindleEncoder):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LoadedSpindleParameters) -> None:
-        # Before the base class, whose constructor asks for loads and lag.
+        # Before the base class, whose constructor uses loads and lag.
         self.spindle = parameters.spindle(name)
         self._largest = parameters.largest_deviation * parameters.nominal_speed
         self._delay = parameters.load_delay
-        self._push = 2.0 * parameters.largest_load / parameters.inertia  # load and motor may push the same way
+        self._push = 2.0 * parameters.largest_load / parameters.inertia  # load and motor may act in the same direction
         super().__init__(name, parameters)
-        self.law = None  # nobody knows in advance what the load will make of it
+        self.law = None  # the effect of the load is not known in advance
         self._clipping = Clipping(name, parameters, _TORQUE, self.spindle.table.limited)
 
     def _loads(self) -> Sequence[Input]:

@@ -70,7 +70,7 @@ class FeedObedientParameters(ObedientParameters):
         return Obedience(name, takeover, settled=settled, hold=rest, retract=rest)
 
 
-_REACTION, _WANTS = 0, 1  # places in the state: the reaction that is obeyed, whether learning is wanted
+_REACTION, _WANTS = 0, 1  # indices into the state: reaction in force, whether learning is requested
 
 
 class ObedienceTable(NamedTuple):
@@ -182,7 +182,7 @@ class Obedience:
         if reaction >= Reaction.FREEZE:
             self._forbidden[0] = math.inf
         elif self._forbidden[0]:
-            # The errors of the way back are nothing to learn from; they come late.
+            # The delayed errors of the return motion must not be learned.
             self._forbidden[0] = self._takeover.remaining + self._settled
         skipped, self._takeover.skipped = self._takeover.skipped, 0.0
         if not skipped:

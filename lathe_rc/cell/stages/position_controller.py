@@ -77,8 +77,8 @@ class PositionControllerParameters(ServoParameters):
 
 
 _NO_PATH = PathTable(np.empty(0), np.empty(0), np.zeros(1, np.int64))
-_PERIODS = 64  # in the log: that end until somebody reads of them, at most
-_TOLD = 1  # why a step stops: the log is full
+_PERIODS = 64  # capacity of the log until it is read
+_TOLD = 1  # stop reason of the step: the log is full
 
 
 class Wanted(NamedTuple):
@@ -242,7 +242,7 @@ class PositionController(Servo):
         self._path = None
         axis, delay = parameters.axis, parameters.feedback_delay
         inputs = [
-            # The angle itself is not used: the spindle's blocks say which samples are due.
+            # The angle itself is not used: the spindle's blocks determine which samples are due.
             Input("encoder", messages.ENCODER, ("angle",)),
             Input(f"{axis}/state", messages.STATE, ("measured_position",), delay),
         ]
@@ -320,5 +320,5 @@ class PositionController(Servo):
             "popov_bound": bound,
             "hyperstable": clearance >= 0.0,
         }
-        # The last sample of the period: the one after it need not be computed yet.
+        # The last sample of the period, as the next one may not be computed yet.
         return Sparse(f"{self.parameters.axis}/periodic", messages.PERIODIC, index - 1, status)

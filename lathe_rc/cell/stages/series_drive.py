@@ -122,7 +122,7 @@ class CoupledDrive(Drive):
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
-        # The machine itself rounds to the resolution of the coarse sensor; here that sensor measures nothing but noise.
+        # The machine itself rounds to the resolution of the coarse sensor; here that sensor only adds noise.
         self._sensors = [Sensor(coarse.noise_rms, 0.0, seed, f"{name}/coarse"), Sensor(0.0, 0.0, seed, f"{name}/fine")]
         if fine:
             self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)

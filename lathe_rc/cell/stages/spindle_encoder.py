@@ -19,7 +19,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.signals.encoder import Encoder, EncoderTable, encode
 from lathe_rc.signals.encoder_errors import EncoderErrors
 
-_SHORT = 0.01  # share of a run by which its tachogram may end before it
+_SHORT = 0.01  # largest fraction of a run not covered by its tachogram
 
 
 class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
@@ -71,7 +71,7 @@ class SpindleEncoder(TimeMaster):
 
     def __init__(self, name: str, parameters: SpindleEncoderParameters) -> None:
         super().__init__(name, parameters)
-        # Two names: a loaded spindle keeps its law to itself.
+        # Two names: a loaded spindle does not publish its law.
         self._law = self.law = parameters.speed_law(name)
         if parameters.revolutions:
             with about(name, f"revolutions = {parameters.revolutions:g}", "nominal_rpm and its deviations"):

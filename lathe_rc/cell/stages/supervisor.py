@@ -126,10 +126,10 @@ _WATCHED = {
     "command": messages.COMMAND,
     "state": messages.STATE,
     "margin": messages.MARGIN,
-}  # types of topics by the last part of their names
+}  # topic types by the last component of their names
 
-_STATE, _REACTION, _TOLD = range(3)  # places in the state of a step
-_ANSWER = 1  # why it stops: the state changes within the block, or there is something to tell
+_STATE, _REACTION, _TOLD = range(3)  # indices into the state of a step
+_ANSWER = 1  # stop reason: the state changes within the block, or a message is due
 
 
 class Memory(NamedTuple):
@@ -191,7 +191,7 @@ class Supervisor(Stage):
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Watcher] = []
         self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)
-        self._told: list[str] = []  # what others than monitors have done to the state since the last sample
+        self._told: list[str] = []  # state changes not caused by monitors since the last sample
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
         self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
         self._watch_spindle()
@@ -338,7 +338,7 @@ class Supervisor(Stage):
     def perform(self, action: str) -> None:
         """Reset the state; a persistent fault raises its alarm again."""
         if self.reaction is Reaction.NONE:
-            return  # nothing has been found since the start or the last reset
+            return  # no findings since the start or the last reset
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
             self._state[:2] = to, Reaction.NONE
@@ -376,7 +376,7 @@ class Supervisor(Stage):
     @property
     def memory(self) -> Memory:
         """Current memory of the step."""
-        # Monitors in Python have to see each block, so the step stops in each.
+        # Monitors in Python need each block, so the step stops in each.
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
 
@@ -462,7 +462,7 @@ class Supervisor(Stage):
             outlet_topic = remapped(self.shared, topic)
             node = cell.node_of(outlet_topic)
             if node is None:
-                continue  # a series drive passes commands on inside
+                continue  # a series drive passes commands on internally
             source = cell.publisher(outlet_topic, f"whether {node} gets beyond {self.name}.clear_position")
             if source is None:
                 continue
@@ -478,7 +478,7 @@ class Supervisor(Stage):
         """Check that the requested clearance is within the stroke of the drive."""
         clear = self.parameters.clear_position
         node = cell.node_of(remapped(self.shared, f"{self.parameters.drives[0]}/state"))
-        drive = cell.stages.get(node or "")  # what is unknown has been said of the retraction
+        drive = cell.stages.get(node or "")  # unknown members are already reported for the retraction
         for limits in drive.limits().values() if isinstance(drive, Drive) else ():
             if limits.stroke <= clear:
                 raise InputError(

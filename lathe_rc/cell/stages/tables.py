@@ -50,7 +50,7 @@ class ComposedParameters(NodeParameters):
         return table(**values, **{name: getattr(self, name) for name in _SHARED if name in table.model_fields})
 
 
-_SHARED = tuple(ComposedParameters.model_fields)  # one value for all parts
+_SHARED = tuple(ComposedParameters.model_fields)  # one value for all elements
 
 
 def _own(table: type[NodeParameters]) -> list[str]:

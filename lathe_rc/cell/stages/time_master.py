@@ -15,7 +15,7 @@ from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.signals.speed import SpeedLaw
 
-_LEAST_SAMPLES = 4  # of a revolution
+_LEAST_SAMPLES = 4  # per revolution
 
 
 class TimeMasterParameters(NodeParameters):

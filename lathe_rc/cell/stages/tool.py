@@ -190,7 +190,7 @@ class Tool(Stage):
         """Current memory of the step."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
-        # A form has two fields in each of its inputs; a profile node gives three.
+        # A form has two fields in each of its inputs; a profile node has three.
         begin = 3 if self.form is None else 2 * len(self.form.inputs)
         return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
 

@@ -107,12 +107,12 @@ class Trajectory:
             fill_reference(first, self._step, set_point)
             return
         if self._kind == "steps" and first * self._step >= self._times[-1]:
-            set_point.fill(self._values[-1])  # the last step, for the rest of the run
+            set_point.fill(self._values[-1])  # the last value, for the rest of the run
             return
         time = self._step * np.arange(first, first + set_point.size)
         if self._kind == "csv":
             set_point[:] = np.interp(time, self._times, self._values)
             return
-        # The factor lets a step begin at the sample of its time, not one later for a rounding error.
+        # The factor prevents a step from starting one sample late because of a rounding error.
         place = np.searchsorted(self._times, time * (1 + 1e-12), side="right")
         set_point[:] = np.where(place > 0, self._values[place - 1], 0.0)

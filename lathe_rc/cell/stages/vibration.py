@@ -65,7 +65,7 @@ class Vibration(Stage):
     def __init__(self, name: str, parameters: VibrationParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        # Two vibrations of a cell differ by their names; the 1 keeps each apart from its own sensor.
+        # Random seeds of vibrations differ by their names; the 1 separates each from its own sensor.
         random = np.random.default_rng(np.random.SeedSequence([parameters.seed, zlib.crc32(name.encode()), 1]))
         phase = parameters.line_phase or [0.0] * len(parameters.line_amplitude)
         with about(name, "line_amplitude", "line_frequency", "line_phase"):
@@ -84,7 +84,7 @@ class Vibration(Stage):
                 )
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
-            # The angle itself is not used: the spindle's blocks say which samples are due.
+            # The angle itself is not used: the spindle's blocks determine which samples are due.
             inputs=[Input("encoder", messages.ENCODER, ("angle",))],
             outputs=[Output("vibration/state", messages.STATE, Joint("position", "velocity"))],
         )
