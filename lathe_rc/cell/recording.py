@@ -118,7 +118,7 @@ class Recording:
         from 1, and ``spindle_angle``, the true angle in it [rad].
 
         Args:
-            topic: with or without the leading slash.
+            topic: topic name, with or without the leading slash.
 
         Returns:
             Where pandas is installed, a ``pandas.DataFrame`` with a copy of the samples, ``time`` as its index, and
@@ -157,7 +157,7 @@ class Recording:
         """Plot desired form, form error over angle, form error by revolution (see `lathe_rc.drawing.form.draw`).
 
         Args:
-            title: of the figure.
+            title: title of the figure.
             beside: name and recording of another run of the same part, whose errors are drawn as well.
 
         Raises:

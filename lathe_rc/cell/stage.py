@@ -2,14 +2,14 @@
 """Stages: computation of output block k from input block k.
 
 A stage's output depends on its parameters, its state and its declared inputs alone; the length of the blocks
-does not change the results. Hosts (the offline engine, a ROS node) feed it in order, independently of its kind.
+does not change the results. Hosts (the offline engine, a ROS node) feed it in order, without knowledge of its function.
 
 Most stages compute by a step, which a program of many stages can call if it is compiled (`lathe_rc.cell.program`):
 
     reached, reason = step(memory, first, start, inputs, flags, outputs)
 
-It computes the block that begins at sample ``first``, from its sample ``start`` on, until the end of the block
-(`DONE`) or until Python has to do something (any other reason, see `Stage.serve`), and is called again from there.
+It computes the block that begins at sample ``first``, from its sample ``start`` to the end of the block
+(`DONE`), or until Python code is needed (any other reason, see `Stage.serve`), and is called again from there.
 Inputs are the arrays of float64 of all fields of all input ports in their order, flags the arrays of uint8, or an empty
 one if there are none, and outputs are the arrays of all fields of all output ports.
 """
@@ -126,12 +126,12 @@ class Stage(ABC):
 
     Args:
         name: node name without namespace.
-
+        parameters: parameter table of the node.
 
     Attributes:
         inputs, outputs: the ports, in the order of the arrays passed to `advance`.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
-        unheard: sparse topics without a reader; their messages need not be made.
+        unheard: sparse topics without a reader; their messages need not be created.
         foreign: type of each topic that the node receives from outside the cell, by name before remapping.
         tells: whether the stage generates events by itself, known only to `process`.
         own_inputs: number of inputs of `process`; one more may provide the spindle angle for the events.

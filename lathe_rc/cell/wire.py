@@ -2,11 +2,11 @@
 """CDR encoding and decoding of blocks, at the rate that a cell needs.
 
 rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, have equal bytes except for a
-few numbers and the samples. So for each length of block one message is encoded by rosbags, the places of the
-numbers are found by changing them, and from then on only those offsets are written or read. A message that
-does not match the layout is decoded by rosbags and analysed again; no CDR code is hand-written. CDR leaves open
-padding content, byte order, and padding of the encapsulation, and a publisher may set a
-frame: such a block is re-encoded by rosbags, 10 to 50 µs, and then read like our own.
+few numbers and the samples. So for each length of block one message is encoded by rosbags, the offsets of the numbers
+are found by changing them, and from then on only those offsets are written or read. A message that does not match the
+layout is decoded by rosbags and analysed again; no CDR code is hand-written. CDR leaves open padding content, byte
+order, and padding of the encapsulation, and a publisher may set a frame: such a block is re-encoded by rosbags, 10 to
+50 µs, and then read like our own.
 """
 
 import struct
@@ -164,7 +164,7 @@ class Encoder:
 
         Args:
             first: index of its first sample.
-            signals: its samples, arrays of shape (n,) by field.
+            signals: samples of the block, arrays of shape (n,) by field.
             last: whether the run ends with this block.
             companions: see BlockInfo.msg.
 

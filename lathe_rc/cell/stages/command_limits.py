@@ -35,7 +35,7 @@ class Clipping:
 
     Args:
         node: name of the commanding node.
-        parameters: its table.
+        parameters: parameter table of the node.
         which: name of the command; empty if the node has one.
         flags: whether sample n was clipped, at n modulo the length, a power of two; length 1: no limit.
     """
@@ -114,7 +114,7 @@ class LimitedCommand(Clipping):
 
     Args:
         node: name of the commanding node.
-        parameters: its table.
+        parameters: parameter table of the node.
         which: name of the command; empty if the node has one.
 
     Attributes:

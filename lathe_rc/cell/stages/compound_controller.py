@@ -65,7 +65,7 @@ class CompoundController(FormLaw):
     """Law that feeds the form forward, with a PID on the error.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "compound_controller"

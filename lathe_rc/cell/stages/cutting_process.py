@@ -287,7 +287,7 @@ class CuttingProcessStage(CutStage):
     """Cutting process with rigid drives (see `lathe_rc.plants.cutting`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "cutting_process"
@@ -305,7 +305,7 @@ class CuttingProcessStage(CutStage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the cutting process."""
         parameters = self.parameters
         places, place = dict.fromkeys(READ, -1), 2
         for name in parameters.moved_by:

@@ -85,7 +85,7 @@ class DecouplerStage(Stage):
     """Decoupler between force and position loop (see `lathe_rc.control.decoupler`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "decoupler"
@@ -113,6 +113,6 @@ class DecouplerStage(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the decoupler."""
         made = self._decoupler
         return Memory(made.k1, made.state1, made.k2, made.state2)

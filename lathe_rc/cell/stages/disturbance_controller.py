@@ -100,7 +100,7 @@ class DisturbanceController(FormLaw):
     """Law that feeds the form forward, learns the disturbance and observes the rest.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "disturbance_controller"

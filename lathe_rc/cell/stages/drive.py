@@ -39,7 +39,7 @@ class OwnRetraction:
     """Command of a drive with an autonomous retraction.
 
     Args:
-        parameters: its table.
+        parameters: parameter table of the node.
         stroke: largest displacement of the drive to each side [m], beyond which commands are out of reach.
     """
 

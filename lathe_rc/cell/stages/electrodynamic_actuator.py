@@ -63,7 +63,7 @@ class ElectrodynamicActuator(SingleDrive):
 
     @property
     def machine(self) -> CoarseTable:
-        """Table of the machine, for the step."""
+        """Parameter and state table of the machine, used by the step."""
         return self.drive.table
 
     def responses(self) -> Mapping[str, Response]:

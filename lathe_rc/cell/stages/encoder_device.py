@@ -64,7 +64,7 @@ class EncoderDevice(TimeMaster):
     """Time master that follows the counts of a real encoder (see `lathe_rc.signals.counts`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         counted: angle from the counts.
     """
 

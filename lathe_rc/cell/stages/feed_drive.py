@@ -225,7 +225,7 @@ class FeedDriveStage(Obedient):
     """Feed drive of a slide (see `lathe_rc.plants.feed`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         drive: machine of the drive.
     """
 
@@ -281,7 +281,7 @@ class FeedDriveStage(Obedient):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the feed drive."""
         parameters = self.parameters
         return Memory(
             drive=self.drive.whole,

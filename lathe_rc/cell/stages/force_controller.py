@@ -52,7 +52,7 @@ class ForceController(Servo):
     """PID of the cutting force on the longitudinal feed (see `lathe_rc.control.pid`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         pid: PID controller.
     """
 
@@ -76,5 +76,5 @@ class ForceController(Servo):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the force controller."""
         return Memory(self.trajectory.course, self.pid.table, self.pid.state, self.listener)

@@ -175,7 +175,7 @@ class Form:
 
     Args:
         node: name of the node.
-        parameters: its table.
+        parameters: parameter table of the node.
 
     Attributes:
         surface: table of the form of the part.
@@ -228,7 +228,7 @@ class ProfileStage(Stage):
     """Stage that evaluates the form at the spindle angle and the height.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         form: form of the part.
     """
 
@@ -251,5 +251,5 @@ class ProfileStage(Stage):
 
     @property
     def memory(self) -> FormTable:
-        """Current memory of the step."""
+        """Current memory of the step of the profile stage."""
         return self.form.table

@@ -3,8 +3,8 @@
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
-for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle and the drive one of time, so that this is
-right at any speed. Angle, speed and dΩ/dt are those of `lathe_rc.control.angle_filter`.
+for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle and the drive one of time, so that the formula
+holds at any speed. Angle, speed and dΩ/dt come from `lathe_rc.control.angle_filter`.
 """
 
 import math
@@ -97,7 +97,7 @@ class FormLaw(Law):
     """Base class of laws with a known form.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         form: form that the drive must follow.
 
     Raises:

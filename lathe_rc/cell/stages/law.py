@@ -147,7 +147,7 @@ class Law(Sampled, Learner):
     change arrays of the memory and nothing else, and depends on the memory and on `Now` alone.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         law: memory of the law.
         senses: whether it reads the measured position of the commanded drive.
 
@@ -242,7 +242,7 @@ class Law(Sampled, Learner):
 
     @property
     def memory(self) -> LawMemory:
-        """Current memory of the step."""
+        """Current memory of the step of the control law."""
         delay, period = self.parameters.feedback_delay, self.parameters.step
         return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
 

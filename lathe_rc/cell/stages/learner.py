@@ -56,7 +56,7 @@ class Learner(Obedient):
     """Controller that learns a drive.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     parameters: LawParameters
@@ -70,7 +70,7 @@ class Learner(Obedient):
 
         Args:
             drive: response of the drive's position to its command.
-            speed: of the spindle [rad/s].
+            speed: speed of the spindle [rad/s].
 
         Returns:
             None if the controller does not provide it.
@@ -106,10 +106,10 @@ class Learner(Obedient):
         """Return the longest feedback delay [sample] that the cycle allows.
 
         Args:
-            speed: largest of the spindle [rad/s].
-            acceleration: largest of the spindle [rad/s²].
-            count: angle of one encoder count [rad]: the measured angle is late by up to that; 0 if ideal.
-            speed_window: time over which the encoder measures its speed [s]: one count more in it is a larger lead.
+            speed: largest speed of the spindle [rad/s].
+            acceleration: largest acceleration of the spindle [rad/s²].
+            count: angle of one encoder count [rad], the largest lag of the measured angle; 0 for an ideal encoder.
+            speed_window: averaging time of the encoder's speed [s]; one more count in it increases the lead.
 
         Returns:
             None if the controller does not provide it.
@@ -240,7 +240,7 @@ class Loop(NamedTuple):
 
     Attributes:
         stage: stage of the controller.
-        responses: of the drives.
+        responses: responses of the drives.
         speeds: speeds at which the loop is evaluated [rad/s].
     """
 

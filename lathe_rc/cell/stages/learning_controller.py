@@ -41,7 +41,7 @@ class LearningController(Learner):
     """Repetitive controller of one drive (see `lathe_rc.control.repetitive`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "learning_controller"
@@ -236,7 +236,7 @@ class LearningController(Learner):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the learning controller."""
         parameters = self.parameters
         return Memory(
             control=self._controller.table,
@@ -332,7 +332,7 @@ class Margins:
     """Stability margins 1 - sup|Q - γZ| of a drive model, tabulated on demand: one costs as much as a cycle of samples.
 
     Args:
-        parameters: of the stage.
+        parameters: parameters of the stage.
     """
 
     def __init__(self, parameters: LearningControllerParameters) -> None:

@@ -242,7 +242,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
     """Electrodynamic drive under the cutting force (see `lathe_rc.plants.tool_drive`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "loaded_drive"
@@ -286,7 +286,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the loaded drive."""
         cut = self._cut
         return Memory(
             retraction=self._retraction.table,

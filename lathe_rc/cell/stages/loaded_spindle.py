@@ -129,7 +129,7 @@ class LoadedSpindleStage(SpindleEncoder):
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """Current memory of the step."""
+        """Current memory of the step of the loaded spindle."""
         return Memory(self._encoder.table, self.spindle.table, self.room)
 
     def serve(

@@ -233,7 +233,7 @@ class PiezoActuator(Drive):
     """Fine piezo drive (see `lathe_rc.plants.piezo`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         drive: machine of the drive.
         set_point: set point of the drive.
     """
@@ -261,5 +261,5 @@ class PiezoActuator(Drive):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the piezo drive."""
         return Memory(self.set_point.signs, self._commands[0].table, self.drive.table, self._sensors[0].table)

@@ -52,7 +52,7 @@ class SingleDrive(Drive):
     """Drive that moves the tool alone, with limited command, measured position, and retraction.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     parameters: PlantParameters
@@ -77,7 +77,7 @@ class SingleDrive(Drive):
 
     @property
     def memory(self) -> PlantMemory:
-        """Current memory of the step."""
+        """Current memory of the step of the drive."""
         return PlantMemory(self._retraction.table, self._commands[0].table, self.machine, self._sensors[0].table)
 
 
@@ -150,7 +150,7 @@ class Plant(Sampled, SingleDrive):
 
     @property
     def machine(self) -> Any:
-        """Table of the machine, for the step."""
+        """Memory of the user-defined drive, used by the step."""
         return self.plant
 
     def responses(self) -> Mapping[str, Response]:

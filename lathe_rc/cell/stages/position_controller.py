@@ -228,7 +228,7 @@ class PositionController(Servo):
     """Position loop of a slide: `lathe_rc.control.pid`, `sampled_link` or `periodic`.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         law: controller of the position.
     """
 
@@ -285,7 +285,7 @@ class PositionController(Servo):
 
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
-        """Current memory of the step."""
+        """Current memory of the step of the position controller."""
         path = self._path.table if self._path else _NO_PATH
         edge = 2 if self.parameters.measures == "edge" else 0
         height = (3 if edge else 2) if self._path else 0

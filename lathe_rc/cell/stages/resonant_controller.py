@@ -5,8 +5,8 @@
     da_k/dt = 2g·e·cos(kφ + θ_k)/|Wi(jkΩ)|,  db_k/dt = 2g·e·sin(kφ + θ_k)/|Wi(jkΩ)|,    θ_k = arg Wi(jkΩ)
 
 with the error e of ``feedback_delay`` samples ago and the angle of that sample. In the angle each order is an internal
-model of its own that holds whatever the speed does. u_form is the form through the inverse of the drive, as
-`lathe_rc.cell.stages.form_law` has it.
+model of its own that is valid at any speed. u_form is the form through the inverse of the drive, as
+defined in `lathe_rc.cell.stages.form_law`.
 
 Source: Guo, Bodson (doi 10.1002/acs.1117): equivalence with an internal model at any rate of change of the frequency.
 """
@@ -78,7 +78,7 @@ class ResonantController(FormLaw):
     """Law that cancels the harmonics of the error, order by order.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "resonant_controller"

@@ -139,7 +139,7 @@ class SeriesDriveStage(CoupledDrive):
     """Piezo and tool on the coarse carriage, in air (see `lathe_rc.plants.tool_drive`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
     """
 
     kind = "series_drive"
@@ -166,7 +166,7 @@ class SeriesDriveStage(CoupledDrive):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the series drive."""
         limits, limits_fine = (command.table for command in self._commands)
         sensors = (sensor.table for sensor in self._sensors)
         return Memory(self._retraction.table, limits, limits_fine, self._set_point.signs, self.drive.table, *sensors)

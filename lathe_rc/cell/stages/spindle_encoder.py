@@ -60,7 +60,7 @@ class SpindleEncoder(TimeMaster):
     """Spindle that follows a speed law, with its encoder (see `lathe_rc.signals.encoder`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         law: speed law; None if a load changes it.
     """
 
@@ -133,5 +133,5 @@ class SpindleEncoder(TimeMaster):
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """Current memory of the step."""
+        """Current memory of the step of the spindle encoder."""
         return self._encoder.table

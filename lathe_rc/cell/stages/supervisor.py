@@ -176,7 +176,7 @@ class Supervisor(Stage):
     """Supervisor with its monitors (see `lathe_rc.safety`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         monitors: active monitors.
     """
 
@@ -375,7 +375,7 @@ class Supervisor(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the supervisor."""
         # Monitors in Python need each block, so the step stops in each.
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)

@@ -55,7 +55,7 @@ class TimeMaster(Stage):
     """Stage that provides time and angle to all others, and reads no other stage.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         samples: length of the run [sample]; None: endless, or not known yet.
         live: whether readings arrive in real time while the cell runs, which excludes offline runs.
         law: speed law of the spindle; None: not known in advance.

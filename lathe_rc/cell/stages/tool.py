@@ -129,7 +129,7 @@ class Tool(Stage):
     """Tool position as the sum of the motions (paper 001, Fig. 1a), compared with the desired form.
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         form: form of the part; None if a profile node provides it.
     """
 
@@ -187,7 +187,7 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the tool stage."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
         # A form has two fields in each of its inputs; a profile node has three.

@@ -54,7 +54,7 @@ class Trajectory:
 
     Args:
         node: name of the node.
-        parameters: its table.
+        parameters: parameter table of the node.
 
     Attributes:
         course: samples for `follow`.

@@ -54,7 +54,7 @@ class Vibration(Stage):
     """Source of vibration between tool and part (see `lathe_rc.signals.vibration`).
 
     Attributes:
-        parameters: its table.
+        parameters: parameter table of the node.
         lines: amplitude [m], frequency [rad/s] and phase [rad] of each line, shape (3, n).
     """
 
@@ -91,5 +91,5 @@ class Vibration(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step."""
+        """Current memory of the step of the vibration source."""
         return Memory(self.lines, self.parameters.step, self._sensors[0].table)
