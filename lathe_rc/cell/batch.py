@@ -204,5 +204,5 @@ class Topics(Collector):
         self.heard = topics
 
     def kept(self) -> Recording:
-        """Return the recording of the topics."""
+        """Return the recording of the kept topics."""
         return self.recording()

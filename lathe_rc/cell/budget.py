@@ -107,7 +107,7 @@ class _Keep:
             self._kept[name][first : first + samples] = dense[topic][of]
 
     def kept(self) -> _Tail:
-        """Return the last complete revolutions."""
+        """Return the last complete revolutions of the run."""
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)

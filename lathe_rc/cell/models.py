@@ -101,7 +101,7 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
 
 
 def of_drives(node: str, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
-    """Return the model of a node as if the scenario gave none: values by parameter.
+    """Return the default model of a node, ignoring values given in the scenario, by parameter.
 
     Raises:
         InputError: see `resolved`.

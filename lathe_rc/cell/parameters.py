@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter tables: each parameter once, with type, default, range, unit and description.
+"""Parameter tables: definition of each parameter with type, default, range, unit and description.
 
 ROS descriptors, validation, help and the documentation are generated from these tables.
 """

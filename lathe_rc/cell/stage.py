@@ -39,7 +39,7 @@ from lathe_rc.signals.noise import Sensor
 
 @dataclass(frozen=True)
 class Input:
-    """Samples that a stage reads.
+    """Input port of a stage: the samples that the stage reads from a topic.
 
     Attributes:
         topic: relative name, before remapping.
@@ -303,7 +303,7 @@ class Stage(ABC):
 
     @property
     def waiting(self) -> list[str]:
-        """Return the events that have not taken effect yet, without the ends of faults."""
+        """Return the events that have not taken effect yet, excluding the ends of faults."""
         triggers = [trigger.text for trigger in self._triggers if not trigger.ends]
         return triggers + [f"sample {index}: {action}" for index, action in self._scheduled]
 
@@ -359,7 +359,7 @@ class Stage(ABC):
     def advance(
         self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals], *, last: bool = False
     ) -> list[Sparse]:
-        """Compute one block.
+        """Compute one block of samples.
 
         Args:
             first: index of the first sample.

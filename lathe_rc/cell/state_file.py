@@ -57,7 +57,7 @@ def _dtype(text: object) -> np.dtype[Any]:
 
 
 class _Reader(pickle.Unpickler):
-    """Restricted unpickler for a file's content, the node's parameters, and class names; without names any class."""
+    """Restricted unpickler of a state file that allows only given classes; without them it records all classes."""
 
     def __init__(self, stream: io.BytesIO, table: Table, classes: frozenset[_Name] | None) -> None:
         super().__init__(stream)
@@ -127,7 +127,7 @@ def _check_owner(path: Path) -> None:
 
 
 def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -> dict[str, Any]:
-    """Read a state.
+    """Read the state of a node from a file.
 
     Args:
         path: path of the file.

@@ -204,7 +204,7 @@ class Decoder:
         self.message = b""
 
     def prepare(self) -> None:
-        """Let rosbags build its codec of the type ahead of the first block."""
+        """Create the rosbags codec of the type ahead of the first block."""
         messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
 
     def decode(self, data: bytes) -> Block:

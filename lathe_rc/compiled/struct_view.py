@@ -155,7 +155,7 @@ def _words_of(member: types.Type) -> int:
 
 
 class Struct:
-    """NamedTuple laid out in words.
+    """NamedTuple laid out in words at an address.
 
     Args:
         value: see `explain_unfit`.

@@ -74,7 +74,7 @@ class CompoundController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """Return the memory before the first sample."""
+        """Return the memory of the law before the first sample."""
         parameters = self.parameters
         step = parameters.step
         return Memory(

@@ -116,7 +116,7 @@ class DisturbanceController(FormLaw):
         super().__init__(name, parameters)
 
     def start(self) -> Memory:
-        """Return the memory before the first sample."""
+        """Return the memory of the law before the first sample."""
         parameters = self.parameters
         late = parameters.feedback_delay * parameters.step
         return Memory(self.make_filter(), self.form, parameters.make(self.name), parameters.model_delay, late)

@@ -3,7 +3,7 @@
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
-for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle and the drive one of time, so that the formula
+for a drive e^{-pτ}/(1 + a1·p + a2·p²). The form is a function of the angle and the drive one of time, so the formula
 holds at any speed. Angle, speed and dΩ/dt come from `lathe_rc.control.angle_filter`.
 """
 

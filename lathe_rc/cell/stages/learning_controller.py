@@ -132,7 +132,7 @@ class LearningController(Learner):
         )
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float]:
-        """Return sup|Q - γZ|, and the waves per revolution where it is."""
+        """Return sup|Q - γZ|, and the waves per revolution where it occurs."""
         return self.loop(drive).worst(speed)
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:

@@ -96,7 +96,7 @@ def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Compute the command of one block, from the memory over the angle."""
+    """Compute the command of one block from the repetitive memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
     # A step that has stopped within a segment resumes with the segment still open, possibly at its end.

@@ -73,7 +73,7 @@ class SingleDrive(Drive):
     @property
     @abstractmethod
     def machine(self) -> Any:
-        """Memory of the drive itself."""
+        """Memory of the drive itself, without limits and sensor."""
 
     @property
     def memory(self) -> PlantMemory:

@@ -87,7 +87,7 @@ class ResonantController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """Return the memory before the first sample."""
+        """Return the memory of the law before the first sample."""
         parameters = self.parameters
         return Memory(
             self.make_forward(),

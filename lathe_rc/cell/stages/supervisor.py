@@ -133,7 +133,7 @@ _ANSWER = 1  # stop reason: the state changes within the block, or a message is 
 
 
 class Memory(NamedTuple):
-    """Memory of the step.
+    """Memory of the step of the supervisor.
 
     Attributes:
         watch: the monitors.
@@ -370,7 +370,7 @@ class Supervisor(Stage):
 
     @property
     def reaction(self) -> Reaction:
-        """Reaction in force."""
+        """Supervisor reaction in force."""
         return Reaction(self._state[_REACTION])
 
     @property

@@ -18,7 +18,7 @@ from lathe_rc.signals.table import read_table
 
 
 class TrajectoryParameters(NodeParameters):
-    """Set point over time."""
+    """Parameters of a set point over time."""
 
     trajectory: Literal["steps", "csv", "paper_002"] = parameter(
         "steps", "steps: set_point; csv: trajectory_file; paper_002: r(t) of its eq. 17"

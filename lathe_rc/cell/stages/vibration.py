@@ -42,7 +42,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Sum the lines of one block, and measure them."""
+    """Sum and measure the vibration lines of one block."""
     position, velocity, effort, measured_position = outputs
     vibration.evaluate(first, memory.period, memory.lines, position, velocity)
     effort[:] = 0.0
