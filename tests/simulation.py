@@ -70,10 +70,10 @@ class Network:
 
     def __init__(self, cell: "Simulation") -> None:
         self._cell = cell
-        self._history: dict[tuple[str, str], deque[object]] = {}  # of the newest messages, by process and topic
+        self._history: dict[tuple[str, str], deque[object]] = {}  # newest messages by process and topic
         self._matched: set[tuple[str, str, str]] = set()  # writing process, reading process, topic
         self._newest: dict[tuple[str, str, str], float] = {}  # arrival of the last message
-        self._cut: dict[frozenset[str], float] = {}  # pairs of processes that do not hear each other, until when
+        self._cut: dict[frozenset[str], float] = {}  # end of the interruption by pair of processes
 
     def advertise(self, writer: str, topic: str, depth: int) -> None:
         self._history.setdefault((writer, topic), deque(maxlen=depth))
@@ -132,7 +132,7 @@ class Process:
         self.cell, self.design, self.pid = cell, design, pid
         self.identity = f"{design.name} {pid}"
         self.stopped = False
-        self.free_at, self.cost = 0.0, 0.0  # until when it computes, and how long a message takes it [s]
+        self.free_at, self.cost = 0.0, 0.0  # end of the computation, and its time per message [s]
         self._inbox: deque[Callable[[], None]] = deque()
         self._waits = False
         self.strangers = 0
@@ -151,8 +151,8 @@ class Process:
         self.orders = {name: BlockOrder(name, cell.run_id) for name, _ in design.inputs}
         self.taken: dict[str, list[int]] = {name: [] for name, _ in design.inputs}
         self.last: dict[str, int | None] = dict.fromkeys(self.taken)  # index of the last block
-        self.held: dict[str, int] = {}  # index of the block from which on the newest stands for all others
-        self._pace: BlockOrder | None = None  # of the time master, where no input holds it back
+        self.held: dict[str, int] = {}  # index of the block from which the newest is held
+        self._pace: BlockOrder | None = None  # of the time master, if no input limits the member
         self._early: list[tuple[str, Block]] = []
         is_master = design.name == cell.master
         own = Announcement(
@@ -354,7 +354,7 @@ class Process:
             case actions.Lose():
                 self._lose(action)
             case actions.Leave(patience):
-                # It waits until the others have its messages; or none of them is needed any more.
+                # Wait until the others have received its messages, or leave at once if these are not needed.
                 acknowledged = net.acknowledged(self.identity) if patience else now
                 self.cell.at(min(acknowledged, now + patience), self._left)
 
@@ -501,17 +501,17 @@ class Simulation:
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._number = 0
         self.processes: dict[str, Process] = {}
-        self.gone: list[Process] = []  # that have ended in order
-        self.dead: list[Process] = []  # that were killed
-        self.killed: dict[str, float] = {}  # members that have left otherwise, and when
-        self.since: dict[str, float] = {}  # when a process was stopped
+        self.gone: list[Process] = []  # processes that have ended in order
+        self.dead: list[Process] = []  # killed processes
+        self.killed: dict[str, float] = {}  # time at which members have left otherwise
+        self.since: dict[str, float] = {}  # time at which a process was stopped
         self.files: dict[str, deque[Any]] = {}
         self.reports: list[tuple[float, str, str, Any]] = []
         self.network = Network(self)
         self._pids = 100
-        self.slow_match = 0.05  # [s] that discovery takes at most
-        self.at_block: dict[int, list[Callable[[], None]]] = {}  # disturbances, by blocks that the master has released
-        self.culprits: set[str] = set()  # members to which something was done that may end the run
+        self.slow_match = 0.05  # [s] longest time of discovery
+        self.at_block: dict[int, list[Callable[[], None]]] = {}  # disturbances, by number of released blocks
+        self.culprits: set[str] = set()  # members with a disturbance that may end the run
         self.plan: list[str] = []
         self.overrun = ""
 
@@ -574,7 +574,7 @@ class Simulation:
             process.blocks
             for process in self.processes.values()
             if process.design.name in master.protocol.completed
-            and not (process.design.restarts or process.namesake)  # one that goes on for another computes blocks again
+            and not (process.design.restarts or process.namesake)  # a restarted process computes blocks again
         ]
         slowest = min(counted, default=master.blocks)
         if master.blocks - slowest > self.window:
@@ -681,7 +681,7 @@ class Schedule:
     def _process(self, design: Design) -> Process | None:
         return self.cell.process_of(design.name)
 
-    # ---- disturbances; each gets a member, a time [s] and another member
+    # ---- disturbances: each takes a member, a time [s] and another member
 
     def _stop(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
@@ -760,7 +760,7 @@ class Schedule:
 
     def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
-            self.cell.killed[design.name] = self.cell.now  # the run may begin before the others hear of it
+            self.cell.killed[design.name] = self.cell.now  # the run may begin before the others receive it
             process.protocol.clean_up()
             process._perform_all()
             self.cell.network.forget(process.identity)

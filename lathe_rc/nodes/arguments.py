@@ -14,7 +14,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import InputError, LatheError
 
-ROS = "--ros-args"  #: what follows is for ROS
+ROS = "--ros-args"  #: the arguments after it are for ROS
 _TAKEN = f"allowed: --help, or {ROS} and what ROS takes: --params-file FILE, -p PARAM:=VALUE, -r OLD:=NEW"
 
 _LONGEST_END = 20  # [s] that destructors may take
@@ -84,7 +84,7 @@ def _show(program: str, name: str, table: type[Table]) -> None:
     for column in ("name", "default", "allowed", "description"):
         parameters.add_column(column, overflow="fold")
     for row in table.rows().values():
-        # as Text: rich would take the unit in brackets for markup
+        # as Text: rich would parse the unit in brackets as markup
         default = Text(json.dumps(row.default, ensure_ascii=False))
         parameters.add_row(row.name, default, Text(row.allowed()), Text(row.doc))
     Console().print(parameters)

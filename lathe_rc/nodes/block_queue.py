@@ -77,7 +77,7 @@ class BlockQueue(BlockOrder):
             for each in run.blocks(self._size):
                 self.accept(each)
             return
-        # What else is checked cannot differ from block to block of a node in this process.
+        # The other checked fields cannot differ between blocks of a node in this process.
         self._append(run.block, len(run.companions))
 
     @property
@@ -103,7 +103,7 @@ class BlockQueue(BlockOrder):
         missing = self.missing(block.source, block.first_index, block.samples)
         if missing is None:
             return None
-        if missing:  # a free-running cell goes on with the last sample held, and counts
+        if missing:  # a free-running cell holds the last sample, and counts the lost blocks
             for held in self._held(self._last(), self.end, block.first_index):
                 self.blocks.append(held)
                 self.received += 1

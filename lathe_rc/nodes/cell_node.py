@@ -40,8 +40,8 @@ from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
 
-_TICK = 0.02  # [s] between looks at the graph while members join
-_IDLE_TICK = 0.1  # [s] between looks at the others
+_TICK = 0.02  # [s] between polls of the graph while members join
+_IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
 _MOST_PUT_OFF = 8  # times the blocks in flight of each topic, while a node is deactivated
@@ -155,8 +155,8 @@ class CellNode(LifecycleNode):
         self.role: Role | None = None
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
-        self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came while deactivated
-        self._early: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals that came before it was ready
+        self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received while deactivated
+        self._early: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received before the node was ready
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -266,7 +266,7 @@ class CellNode(LifecycleNode):
         add = self.create_publisher
         self._host = {
             "members": add(Member, "members", latched_qos(1)),
-            "progress": add(ProgressMessage, "progress", latched_qos(1)),  # a node that was away needs the newest
+            "progress": add(ProgressMessage, "progress", latched_qos(1)),  # a late reader needs the newest one
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
         if self.protocol.own.stage in MASTERS:
@@ -313,7 +313,7 @@ class CellNode(LifecycleNode):
         member = from_ros(message, Announcement)
         known = self.protocol.members.get(member.name)
         if known and known.process != member.process:
-            self._look()  # the process before may have ended
+            self._look()  # the previous process may have ended
         self.protocol.hear_member(member, time.monotonic())
 
     def _on_cell_state(self, message: Any) -> None:
@@ -425,7 +425,7 @@ class CellNode(LifecycleNode):
                 self._perform_by_role(self.role, action)
 
     def _log(self, level: str, text: str) -> None:
-        if level == "error":  # rclpy refuses another level from the same line
+        if level == "error":  # rclpy rejects different levels from one line
             self.get_logger().error(text)
         elif level == "warning":
             self.get_logger().warning(text)
@@ -510,7 +510,7 @@ class CellNode(LifecycleNode):
             elif self._is_early():
                 self._early.append((callback, message))
                 if len(self._early) > _EARLY * signal_depth(self.table) * (len(self.inlets) + 1):
-                    self._early.popleft()  # of a flood from outside
+                    self._early.popleft()  # a flood of foreign messages
             else:
                 self._take_up(self._early)
                 callback(message)

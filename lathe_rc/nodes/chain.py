@@ -37,7 +37,7 @@ class Chain:
             inputs = []
             for place, (topic, port) in enumerate(role.inputs.ports):
                 tape = topic if topic in self._inside else f"{role.node.full_name} {place}"
-                delay = port.delay if topic in self._inside else 0  # what comes from outside is late already
+                delay = port.delay if topic in self._inside else 0  # inputs from outside are delayed already
                 delays = topics.setdefault(tape, (port.type, {}))[1]
                 delays |= {name: max(delays.get(name, 0), delay) for name in port.fields}
                 delays_inside.append(delay)
@@ -118,7 +118,7 @@ def form(role: StageRole, cell: Cell | None = None) -> None:
     try:
         cell = cell or Cell(*node.announced(master.members))
     except InputError:
-        return  # no cell can be made of them, as the time master says: each stage computes alone
+        return  # the members form no valid cell, as the time master reports: each stage computes alone
     here = {name: mates[node.namespace + name] for name in cell.stages if node.namespace + name in mates}
     for group in _groups(cell, here):
         if len(group) > 1:
@@ -131,7 +131,7 @@ def _groups(cell: Cell, here: Mapping[str, object]) -> list[list[str]]:
     The feedback inputs of members of unknown kind are not known: such members are placed after every group.
     """
     groups: list[list[str]] = [[]]
-    beyond: set[str] = set()  # stages elsewhere that compute after some of the group at hand
+    beyond: set[str] = set()  # stages elsewhere that depend on the current group
     for name, stage in cell.stages.items():
         reads = {cell.dense[remapped(stage.shared, port.topic)].node for port in stage.inputs if not port.delay}
         if name in here:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 RANGE, PROFILES = "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"
 _LOOPBACK, _NETWORK = (str(Path(__file__).with_name(name)) for name in ("fastdds.xml", "fastdds_network.xml"))
-#: with one of them the user chooses the transport
+#: variables by which the user chooses the transport
 _CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS_STATIC_PEERS")
 
 
@@ -21,7 +21,7 @@ def settings(environ: Mapping[str, str]) -> dict[str, str]:
     longer receive each other's messages. ``FASTDDS_BUILTIN_TRANSPORTS=DEFAULT`` switches it on.
     """
     profiles, reach = environ.get(PROFILES, _LOOPBACK), environ.get(RANGE, "LOCALHOST")
-    found = {RANGE: reach, PROFILES: profiles, "SKIP_DEFAULT_XML_FILE": "1"}  # one in the folder may be anybody's
+    found = {RANGE: reach, PROFILES: profiles, "SKIP_DEFAULT_XML_FILE": "1"}  # the working directory's may be foreign
     if profiles not in (_LOOPBACK, _NETWORK):
         return found
     if reach == "LOCALHOST" and not any(name in environ for name in _CHOICES):

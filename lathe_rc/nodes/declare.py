@@ -92,7 +92,7 @@ def declare(node: Node, table: type[NodeParameters]) -> NodeParameters:
     given = overrides(node)
     values = table.read(node.get_name(), {name: value for name, value in given.items() if value is not None})
     for name in given:
-        if not node.describe_parameter(name).read_only:  # it was given, and is not declared yet
+        if not node.describe_parameter(name).read_only:  # given as an override, and not declared yet
             node.undeclare_parameter(name)
     for name, row in table.rows().items():
         if not node.has_parameter(name):

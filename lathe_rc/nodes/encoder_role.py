@@ -17,7 +17,7 @@ from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.signals.counts import LineReader, Reading
 
-_POLL = 0.5e-3  # [s] between looks at a line
+_POLL = 0.5e-3  # [s] between polls of a line
 
 
 def _place(joints: Any, name: str) -> int | None:
@@ -47,10 +47,10 @@ class EncoderRole(SpindleRole):
         device = self._device = cast("EncoderDeviceParameters", node.table)
         self._scale = device.counts_per_revolution / (2.0 * np.pi) if device.position == "angle" else 1.0
         self._line = LineReader.open(Path(device.device), device.baud_rate) if device.source == "line" else None
-        self._came = 0.0  # when the newest reading has come, monotonic [s]
+        self._came = 0.0  # arrival of the newest reading, monotonic [s]
         self._listens = self._lost = False
-        self._unusable = 0  # joint states that say nothing of the spindle
-        self._other = ""  # the last of them
+        self._unusable = 0  # joint states without a spindle position
+        self._other = ""  # description of the last unusable one
 
     def finish(self) -> None:
         """Close the encoder's line (implements `Role`)."""
@@ -140,7 +140,7 @@ class EncoderRole(SpindleRole):
         self.leads.know_end(self.stage.samples)
         there, end = self.stage.available - self.samples, self.leads.end
         if end is None or self.stage.available < end:
-            there -= there % self.table.block_size  # the last block alone may be shorter
+            there -= there % self.table.block_size  # only the last block may be shorter
         return min(samples, there)
 
     def fall_behind(self, late: float) -> None:

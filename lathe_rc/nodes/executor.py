@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from lathe_rc.nodes.cell_node import CellNode
 
-_MOST = 64  # of one topic or service at a time: a flood keeps nobody from its neighbours
+_MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
 
 
 class Events:
@@ -22,7 +22,7 @@ class Events:
     one.
 
     Args:
-        nodes: of this process.
+        nodes: nodes of this process.
     """
 
     def __init__(self, nodes: Sequence[CellNode]) -> None:
@@ -37,7 +37,7 @@ class Events:
 
     def spin(self, wait: float) -> None:
         """Wait for the next event, at most ``wait`` [s], and call its callback."""
-        # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and sees signals.
+        # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and reacts to signals.
         self._executor.spin_once(timeout_sec=wait)
         if any(node.discarded for node in self._nodes):
             self._executor.shutdown()
@@ -62,7 +62,7 @@ def drain_missed_messages(node: Node) -> None:
                     break
                 subscription.callback(found[0])
     for service in [*node.services]:
-        kind: Any = service.srv_type  # rclpy does not say that it has requests and responses
+        kind: Any = service.srv_type  # rclpy's type hints lack its requests and responses
         with service.handle:
             for _ in range(_MOST):
                 request, header = service.handle.service_take_request(kind.Request)

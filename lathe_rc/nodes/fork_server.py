@@ -27,15 +27,15 @@ from typing import Any
 from lathe_rc.nodes.report import VARIABLE
 
 _NODES = "lathe_rc.nodes.process"
-_MOST = 2**18  # [B] of a request; the environment is the most of it
-_FAREWELL = 10.0  # [s] for processes to end by themselves when nobody asks any more
+_MOST = 2**18  # [B] size of a request, mainly the environment
+_FAREWELL = 10.0  # [s] for processes to end after the launcher has gone
 
 
 def _load(nodes: dict[str, Any]) -> None:
     """Import the modules of all nodes, and preload the kernels that some nodes use."""
-    with contextlib.suppress(ImportError):  # a process that needs it says so
+    with contextlib.suppress(ImportError):  # a process that needs the module reports the error
         importlib.import_module(_NODES).preload(nodes)
-    gc.freeze()  # the collector leaves alone what forked processes share with this one
+    gc.freeze()  # the collector skips objects shared with forked processes
 
 
 def _become(request: dict[str, Any], report: int, log: int) -> int:
@@ -50,7 +50,7 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
     if request["command"]:
         os.set_inheritable(report, True)  # noqa: FBT003 - it has no other form
         os.execvpe(request["command"][0], request["command"], os.environ)
-    sys.path[:] = request["path"]  # modules of others are found where who asks finds them
+    sys.path[:] = request["path"]  # third-party modules are found as by the launcher
     process = importlib.import_module(_NODES)
     try:
         return int(process.run(*process.split(request["arguments"])))
@@ -60,7 +60,7 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
 
 def _reap_children(line: socket.socket, children: dict[int, int]) -> None:
     """Wait for the child processes after the launcher has gone; kill the remaining ones."""
-    line.close()  # it is readable without end
+    line.close()  # a closed connection stays readable forever
     end = time.monotonic() + _FAREWELL
     while children and (readable := select.select([*children], [], [], max(end - time.monotonic(), 0.0))[0]):
         for process in readable:
@@ -82,7 +82,7 @@ def serve(line: socket.socket) -> int:
             pid = children.pop(process)
             os.close(process)
             code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-            with contextlib.suppress(BrokenPipeError):  # then the line says so below
+            with contextlib.suppress(BrokenPipeError):  # the closed connection is detected below
                 line.send(json.dumps([pid, code]).encode())
         if line.fileno() not in readable:
             continue
@@ -110,7 +110,7 @@ def serve(line: socket.socket) -> int:
 
 def main() -> None:
     """Serve requests at the socket whose descriptor is the command-line argument."""
-    gc.disable()  # a process of a cell enables it: to collect while all is being imported takes a tenth longer
+    gc.disable()  # cell processes enable it; collecting during the imports takes 10 % longer
     with socket.socket(fileno=int(sys.argv[1])) as line:
         sys.exit(serve(line))
 

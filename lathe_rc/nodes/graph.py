@@ -20,7 +20,7 @@ from lathe_rc.errors import InputError, shown
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.protocol import Announcement, MemberProtocol
 
-_NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # what the graph calls a node whose name has not come
+_NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # name in the graph of a node whose name is not known yet
 
 Announced = tuple[dict[str, NodeParameters], dict[str, Unknown]]
 

@@ -16,7 +16,7 @@ class Inputs:
 
     Args:
         ports: fully qualified topic and port of each input.
-        parameters: of the node.
+        parameters: parameters of the node.
         together: largest number of blocks computed in one step.
 
     Attributes:
@@ -84,7 +84,7 @@ class Inputs:
         if end <= first:
             return None
         for queue in self._feedback:
-            # It may not be needed for a long time yet, but what piles up unread DDS gives up some day.
+            # The block may be needed much later, but unread messages would pile up until DDS drops them.
             if in_cell and self._window and queue.received + self._window < blocks:
                 return None
         if self.reach is not None:
@@ -142,7 +142,7 @@ class Inputs:
         self._shared = []
 
     def pass_over(self, inside: Collection[str], first: int) -> None:
-        """Load or drop queued blocks of the chain's topics ``inside`` up to ``first``, as a stage without a chain does."""
+        """Load or drop queued blocks of the chain's topics ``inside`` up to ``first``, as a stage alone would do."""
         for topic in self.buffers.keys() & inside:
             queue, buffer = self.queues[topic], self.buffers[topic]
             if buffer.delay:

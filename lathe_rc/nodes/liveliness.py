@@ -39,7 +39,7 @@ def _is_stopped(pid: int) -> bool:
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     except OSError:
-        return False  # it has ended
+        return False  # the process has ended
     return stat.rpartition(") ")[2][:1] in ("T", "t")
 
 
@@ -88,7 +88,7 @@ class Watch:
                 self._processes[member.name] = os.pidfd_open(member.pid)
             except ProcessLookupError:
                 self._processes[member.name] = os.open(os.devnull, os.O_RDONLY)  # always readable: it has ended
-            except (OSError, OverflowError) as error:  # no process has such a number, or none may be watched
+            except (OSError, OverflowError) as error:  # no such process, or no permission to monitor it
                 self._node.get_logger().warning(f"{member.name}: its process {member.pid} is not watched ({error})")
 
     def close(self) -> None:

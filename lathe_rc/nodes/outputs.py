@@ -14,7 +14,7 @@ from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import message_class, signal_qos
 
-_OUTSIDE_PERIOD = 0.1  # [s] between looks for readers in other processes
+_OUTSIDE_PERIOD = 0.1  # [s] between checks for readers in other processes
 
 Memory = tuple[Signals, Samples | None]  #: arrays of one output, and the record array that they are views of
 
@@ -58,7 +58,7 @@ class Outputs:
 
     def tick(self, now: float) -> None:
         """Check for readers in other processes; a check per message would cost as much as a small stage."""
-        if self._node.protocol.ready and now >= self._outside_due:  # the cell's own readers are there
+        if self._node.protocol.ready and now >= self._outside_due:  # the cell's own readers are matched
             self._outside_due = now + _OUTSIDE_PERIOD
             outlets = self._node.outlets.items()
             self._outside = {topic for topic, outlet in outlets if outlet.get_subscription_count()}

@@ -43,13 +43,13 @@ from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.nodes.stage_role import StageRole
 
-_MESSAGES = (  # what nodes send and offer, rclpy's own services among it
+_MESSAGES = (  # message and service types of the nodes, rclpy's own services included
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),
     *("lifecycle_msgs.srv", "diagnostic_msgs.msg", "rosgraph_msgs.msg", "type_description_interfaces.srv"),
 )
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29  # from <linux/prctl.h>
 _LONGEST_BURST = 0.02  # [s] of taking messages until nodes compute
-_LONGEST_WAIT = 0.1  # [s] until signals and the harness are looked at again
+_LONGEST_WAIT = 0.1  # [s] between checks of signals and the harness
 
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
@@ -145,9 +145,9 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
         events.spin(min(max(wait, 0.0), _LONGEST_WAIT))
-        # Take what else has arrived before computing: a burst in makes a burst out, and neighbours wake up once
-        # for all of it. Waking them is the dearest part of a hop.
-        # A flood must not keep anybody from signals and from its neighbours.
+        # Take all messages that have arrived before computing: a burst of inputs becomes a burst of outputs, and
+        # neighbours wake up once for all of it. The wake-up is the most expensive part of a hop.
+        # A flood must not block signals and neighbours.
         handled, end = -1, time.monotonic() + _LONGEST_BURST
         while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
             events.spin(0.0)
@@ -159,10 +159,10 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
 def _tune(name: str) -> None:
     """Set the process name and the timer slack that a cell needs; works without privileges."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
-    # Waits end when they should, not up to 50 µs later: the executor's empty looks are waits as well.
+    # Waits end on time, not up to 50 µs later: the executor's polls are waits as well.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if THROUGHPUT in os.environ:
-        # A process that has been woken does not push the one that woke it off its core, so bursts get longer.
+        # A woken process does not preempt the process that woke it, so bursts get longer.
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
@@ -181,10 +181,10 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     """
     for file in arguments.parameter_files(args):
         if allowed_code.bag_around(file.parent) is not None:
-            scenarios.load(file)  # it is data, and refused if it names code or files elsewhere
+            scenarios.load(file)  # bag data, rejected if it names code or files elsewhere
     allowed_code.user_names(cache(partial(arguments.texts, args)))
-    faulthandler.enable()  # a crash of a library leaves where it happened in the log
-    faulthandler.register(signal.SIGUSR1)  # and the harness can ask where a silent process is
+    faulthandler.enable()  # a crash in a library leaves a traceback in the log
+    faulthandler.register(signal.SIGUSR1)  # and the harness can request a traceback of a silent process
     _tune(members[0][0])
     reporter = Reporter()
     dds.settle()
@@ -203,8 +203,8 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
             declare.refuse_lost(nodes[-1], args)
         _start(nodes, exchange)
         gc.collect()
-        gc.freeze()  # the collector skips existing objects: it would walk through them again and again between blocks
-        gc.enable()  # a fork server has none
+        gc.freeze()  # the collector skips existing objects: it would traverse them repeatedly between blocks
+        gc.enable()  # the fork server has disabled it
         _loop(nodes, reporter, stop)
         if stop.signal:
             for node in nodes:
@@ -219,7 +219,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
             node.finish()
             if node.refused_messages.senders:
                 reporter("refused", node.get_name(), senders=node.refused_messages.senders)
-        # The nodes are not destroyed: Fast DDS may wait for itself for ever while others are leaving, too.
+        # The nodes are not destroyed: Fast DDS may deadlock while other participants are leaving, too.
         rclpy.try_shutdown()
 
 
@@ -236,11 +236,11 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
             if isinstance(found, type):
                 check_for_type_support(found)
     for name, (kind, values) in nodes.items():
-        with contextlib.suppress(Exception):  # the node itself says what is wrong
+        with contextlib.suppress(Exception):  # the node itself reports the error
             if kind in STAGES.own and not names_others(STAGES[kind].Parameters, values):
                 compile_kernels(STAGES[kind](name, TABLES[kind].read(name, values)))
                 for row in TABLES[kind].rows().values():
-                    row.allowed()  # looks once for what installed packages offer
+                    row.allowed()  # scans the plug-ins of installed packages once
 
 
 def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:

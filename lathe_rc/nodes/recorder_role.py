@@ -71,12 +71,12 @@ class RecorderRole:
         self._depth = signal_depth(self.table)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
-        self._processes: dict[str, int] = {}  # of the members that another process may go on for
-        self._joints: dict[str, tuple[int, set[int]]] = {}  # period, and samples of those that wait, by topic
-        self._newest: dict[str, bytes] = {}  # message of each topic that comes from another process
+        self._processes: dict[str, int] = {}  # process number of the members that can be restarted
+        self._joints: dict[str, tuple[int, set[int]]] = {}  # period, and samples of waiting messages, by topic
+        self._newest: dict[str, bytes] = {}  # newest message of each topic from another process
         self._encoders = _Encoders()
         self._merger: Merger | None = None
-        self._ended: set[str] = set()  # topics whose last block has come
+        self._ended: set[str] = set()  # topics whose last block has arrived
         self._blocks = self._samples = 0
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
@@ -314,7 +314,7 @@ class RecorderRole:
             message = messages.decode(msgtype, data)
         except ValueError as error:
             raise ForeignMessage(topic, "", "", str(error)) from None
-        # Messages that are not of lathe_rc do not say who sent them.
+        # Messages of types outside lathe_rc do not name their sender.
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
@@ -322,7 +322,7 @@ class RecorderRole:
         begin = self._merger.samples if self._merger else 0
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
         if sample < begin and source in self._processes:
-            return  # from another process that goes on in the place of the first
+            return  # repeated by a process that resumes in place of the first
         if rest or not begin <= sample < end:
             raise ForeignMessage(topic, source, run_id, f"expected a time of samples {begin} to {end - 1}")
         if msgtype == messages.JOINTS and self._merger is not None:

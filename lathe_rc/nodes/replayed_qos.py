@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
 
-DEPTH = 512  #: of the queues: so many may be under way before readers must have acknowledged
+DEPTH = 512  #: of the queues: largest number of unacknowledged messages
 
 
 def _offers(recorded: Sequence[Qos]) -> set[tuple[bool, bool]]:

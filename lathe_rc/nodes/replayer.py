@@ -41,15 +41,15 @@ from lathe_rc.nodes import arguments, replayed_qos, standalone_node
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.nodes.replayed_qos import DEPTH
 
-_ACKNOWLEDGED = 30.0  # [s] for a reader to take what was sent to it
+_ACKNOWLEDGED = 30.0  # [s] for a reader to acknowledge its messages
 _CLOCK, _STATE = "/clock", "/cell_state"
-_CLOCK_END = 2**31 * 10**9  # [ns] that it cannot tell any more
-# [ns] of wall time until a message must have been acknowledged if others are to follow: a reader that puts messages in
-# the order of their publication need not wait much longer for one that is late
+_CLOCK_END = 2**31 * 10**9  # [ns] first time beyond the range of a ROS time
+# [ns] of wall time within which a message must be acknowledged before others follow: a reader that sorts messages by
+# their publication then need not wait much longer for a late one
 _PROMPT = 100_000_000
-_SETBACK = 1_000_000_000  # [ns] by which the computer's clock may be set back without harm
-_LONG = 10.0  # [s] of wall time until the next message that are announced
-_LOOK = 0.05  # [s] of wall time between looks at services and signals
+_SETBACK = 1_000_000_000  # [ns] by which the system clock may be set back without harm
+_LONG = 10.0  # [s] of wall time until the next message, from which on the wait is reported
+_LOOK = 0.05  # [s] of wall time between polls of services and signals
 
 
 class Replayer:
@@ -106,9 +106,9 @@ class Replayer:
         ):
             node.create_service(Trigger, f"~/{name}", self._service(paused))
         self._members: dict[str, Node] = {}
-        self._master, self._window = "", 0  # of a cell: the topic whose blocks count, and how many may be under way
+        self._master, self._window = "", 0  # of a cell: topic whose blocks count, and blocks in flight
         self._blocks = self._recorded = 0
-        # Reliable and with a queue, unlike other clocks: readers may want every time.
+        # Reliable and with a queue, unlike other clocks: readers may need every time.
         self._publishers: dict[str, Publisher] = {_CLOCK: node.create_publisher(Clock, _CLOCK, QoSProfile(depth=DEPTH))}
         self._waiting: dict[str, int] = {_CLOCK: 0}  # messages of a topic that may not have been acknowledged
         self._sent_ns = self._settled_ns = 0  # wall time of the newest message, and when all were acknowledged
@@ -177,7 +177,7 @@ class Replayer:
 
         self._node.create_subscription(Member, "/members", heard, latched_qos(256))
         self._node.create_subscription(Progress, "/progress", progressed, latched_qos(256))
-        # The recorder puts the scenario's files into its bag as well, so they stay as long as the replayer.
+        # The recorder copies the scenario's files into its bag as well, so they exist as long as the replayer.
         self._folder = tempfile.TemporaryDirectory(prefix=REPLAYED_FILES)
         scenario = provenance.scenario_of(self._source.about, Path(self._folder.name))
         cell = Cell(scenario.nodes)

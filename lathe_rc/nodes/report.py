@@ -12,7 +12,7 @@ import socket
 import time
 
 VARIABLE = "LATHE_REPORT_FD"
-THROUGHPUT = "LATHE_THROUGHPUT"  #: set where the cell is to run as fast as it can, not at a pace
+THROUGHPUT = "LATHE_THROUGHPUT"  #: set if the cell runs as fast as possible, without a pace
 
 
 class Reporter:
@@ -30,7 +30,7 @@ class Reporter:
         try:
             self._socket.sendall(line.encode() + b"\n")
         except OSError:
-            # The harness is gone; orphaned() says so and the process ends in order.
+            # The harness is gone; the process ends in order because of `orphaned`.
             self._socket.close()
 
     @property

@@ -40,9 +40,9 @@ _QOS = QoSProfile(
 )
 _BACKLOG = 2**25  # [B]: some seconds of a cell
 _BURST = 16  # messages
-_NICE = 10  # showing is less urgent than the cell
-_PERIOD = 0.02  # [s] between looks at what has come; of the graph as well, as members of a cell do that wait for peers
-_BUSY = 0.5  # [s] between looks at the graph while a run is heard
+_NICE = 10  # the view is less urgent than the cell
+_PERIOD = 0.02  # [s] between polls of messages; also of the graph, like members that wait for peers
+_BUSY = 0.5  # [s] between polls of the graph while messages of a run arrive
 
 
 class RerunBridge:
@@ -50,7 +50,7 @@ class RerunBridge:
 
     Args:
         node: node in the namespace of the cell.
-        parameters: what to show, and where.
+        parameters: data to show, and its destination.
         output: destination of the view.
     """
 
@@ -78,7 +78,7 @@ class RerunBridge:
         """
         shower = threading.Thread(target=self._show)
         shower.start()
-        os.nice(_NICE)  # of this thread alone; those of DDS keep theirs, and so lose less
+        os.nice(_NICE)  # only this thread; the DDS threads keep their priority, and so lose fewer messages
         due = 0.0
         try:
             while not (self._stop or self._output.ended or (self._parameters.once and self._live.shown)):
@@ -132,7 +132,7 @@ class RerunBridge:
 
     def _show(self) -> None:
         """Show the received messages; main function of the second thread."""
-        os.nice(_NICE)  # and of those that Rerun starts from this one
+        os.nice(_NICE)  # also for the threads that Rerun starts from this one
         try:
             for message in self._backlog:
                 if message:

@@ -53,7 +53,7 @@ class Restart:
                 f"{role.node.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''"
             )
         self.keep_at = 0
-        # The newest states: after how many blocks, the state, and events that were asked for since.
+        # The newest states: number of blocks, state, and events scheduled since.
         self._states: deque[tuple[int, bytes, list[tuple[str, int]]]] = deque()
 
     def begin(self, *, joins: bool) -> None:

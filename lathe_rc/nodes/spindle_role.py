@@ -21,9 +21,9 @@ from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMasterProtocol, actions
 
-_LOOK = 0.02  # [s] between looks at the members
+_LOOK = 0.02  # [s] between checks of the members
 _BURST = 64  # blocks released before other work gets its turn
-_JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is judged [s], and the part of it that may be lost
+_JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is evaluated [s], and its largest loss
 
 
 class SpindleRole(StageRole):
@@ -163,7 +163,7 @@ class SpindleRole(StageRole):
             if not leads.may_release or self.blocks == leads.blocks_in_run or leads.credit <= 0:
                 return
             if time.monotonic() - begun > _LOOK:
-                break  # a window may hold many blocks: meanwhile deaths shall be noticed
+                break  # a window may hold many blocks: deaths must be noticed meanwhile
             if not (samples := self.possible()):
                 return
             if self.pace.block and not self._is_due(-(-samples // size)):
@@ -216,12 +216,12 @@ class SpindleRole(StageRole):
 
     def work(self) -> None:
         """Process the progress of members in this process, deferred because the reported block may be in progress."""
-        for _ in range(len(self._reported)):  # their reports on the blocks that this releases have their turn later
+        for _ in range(len(self._reported)):  # reports on blocks released here are processed later
             report = self._reported.popleft()
-            self.node.due = self.node.due or bool(self._reported)  # an error leaves the rest for the next turn
+            self.node.due = self.node.due or bool(self._reported)  # after an error the rest follows in the next turn
             self.node.attempt(partial(self.leads.hear_progress, report, time.monotonic()))
         if self.inputs.ports and self.chain is None:
-            self.release()  # blocks of the cut may let others go
+            self.release()  # feedback blocks may allow further releases
 
     def tick(self, now: float) -> float:
         """Release blocks that are due; return the time of the next call (implements `Role`)."""

@@ -21,7 +21,7 @@ from lathe_rc.nodes.restart import Restart
 from lathe_rc.protocol import Announcement, MemberProtocol
 from lathe_rc.protocol.actions import Action
 
-_TOGETHER = 2  # parts of the window: so much is computed in one go, and members still work side by side
+_TOGETHER = 2  # steps per window, so that members still work in parallel
 
 
 class Chain(Protocol):
@@ -61,7 +61,7 @@ class StageRole:
         self.node = node
         with explain_overflow({node.get_name(): node.table}):
             self.stage = STAGES[node.kind](node.get_name(), node.table)
-        compile_kernels(self.stage)  # the first block then takes no longer than the next
+        compile_kernels(self.stage)  # so that the first block takes no longer than the next
         self.blocks = self.samples = 0
         self.started = False
         self.chain: Chain | None = None
@@ -234,7 +234,7 @@ class StageRole:
     def work(self) -> None:
         """Compute every block whose inputs have arrived (implements `Role`)."""
         if self.node.protocol.master is not None and not self.node.protocol.ready:
-            return  # blocks may wait there for a latecomer
+            return  # blocks may wait in the queues until the node is ready
         if not self.started and any(queue.blocks for queue in self.inputs.forward):
             self.node.exchange.form(self, None)
         if self.chain is not None:

@@ -78,7 +78,7 @@ def run(
         The exit code.
     """
     try:
-        # What the replayed system told on /rosout must not be mixed with what this node tells.
+        # Replayed messages on /rosout must not be mixed with this node's own.
         with standalone_node(kind, table, values, args, rosout=False) as (node, parameters):
             work(node, parameters)
     except LatheError as error:

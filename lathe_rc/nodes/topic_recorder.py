@@ -26,11 +26,11 @@ from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
 _CLOCK = "/clock"
-_OWN = {"/rosout", "/parameter_events"}  # of ROS itself, this node's among them
-_LOOK = 0.05  # [s] of wall time between looks at the graph and at signals
-_LOOKS = 60  # after which publishers that were there before have been discovered: 3 s, unless it is kept from looking
-_SILENCE = 10.0  # [s] without a message after which no one published before is under way any more
-_AT_ONCE = 10_000  # messages of a topic that are taken before the others have their turn
+_OWN = {"/rosout", "/parameter_events"}  # topics of ROS itself, also published by this node
+_LOOK = 0.05  # [s] of wall time between polls of the graph and of signals
+_LOOKS = 60  # polls until earlier publishers have been discovered: 3 s, unless polling is delayed
+_SILENCE = 10.0  # [s] without a message after which no earlier message is in transit any more
+_AT_ONCE = 10_000  # messages taken from a topic before the next topic
 
 
 class TopicRecorder:
@@ -52,7 +52,7 @@ class TopicRecorder:
             raise InputError(f"{KIND}.all: {', '.join(parameters.topics)} are named; give one or the other")
         if parameters.sim_time and _CLOCK in parameters.topics:
             raise InputError(f"{KIND}.topics: {_CLOCK} tells the log times; record it with the wall time")
-        chunks = RecorderParameters()  # as the cell's recorder has them
+        chunks = RecorderParameters()  # as in the cell's recorder
         self._writer = BagWriter(
             Path(parameters.bag), compression=chunks.compression, chunk_size=chunks.chunk_size, about={}
         )
@@ -61,7 +61,7 @@ class TopicRecorder:
         )
         self._inlets: dict[str, Subscription] = {}
         self._continuity: dict[str, Continuity] = {}
-        self._refused: dict[str, str] = {}  # topic -> why it is not recorded
+        self._refused: dict[str, str] = {}  # topic -> reason why it is not recorded
         self._present: set[str] = set()  # topics that may have begun before the recording
         self._looks = 0
         self._executor = SingleThreadedExecutor()
@@ -69,7 +69,7 @@ class TopicRecorder:
         self._newest = self._flushed = time.monotonic()
         self._taken = 0
         self.written = 0
-        self.stopped = threading.Event()  #: set from outside to end it
+        self.stopped = threading.Event()  #: set from outside to end the recording
 
     # ---- topics -------------------------------------------------------------------------------------
 
@@ -113,7 +113,7 @@ class TopicRecorder:
     def _subscribe(self, topic: str, types: Sequence[str]) -> None:
         publishers = self._node.get_publishers_info_by_topic(topic)
         if not publishers:
-            return  # gone again
+            return  # the topic has gone again
         if len(types) != 1:
             raise InputError(f"{topic} has several types: {', '.join(sorted(types))}")
         (msgtype,) = types
@@ -133,7 +133,7 @@ class TopicRecorder:
         self._inlets[topic] = self._node.create_subscription(
             kind,
             topic,
-            cast("Any", partial(self._take, topic)),  # its types know of no callback with the message's info
+            cast("Any", partial(self._take, topic)),  # rclpy's type hints lack callbacks with message info
             publisher_info.asked(publishers),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: self._mismatch(topic)),
@@ -158,7 +158,7 @@ class TopicRecorder:
                 raise InputError(f"{topic}: {error}") from None
             self._order.add_clock(source_ns, sequence, clock.sec * 10**9 + clock.nanosec)
         else:
-            # DDS fills up to a multiple of four what it sends in one piece; large messages come as they were.
+            # DDS pads messages sent in one fragment to a multiple of 4 bytes; large messages arrive unpadded.
             self._order.add(topic, source_ns, sequence, data + bytes(-len(data) % 4))
 
     def _take_all(self) -> bool:
@@ -183,7 +183,7 @@ class TopicRecorder:
     def _step(self) -> int:
         """Wait briefly for messages, take and write them; return their number."""
         before = self._taken
-        # The executor wakes up for one message; the rest of a burst is taken without it, ten times as fast.
+        # The executor wakes up for one message; the rest of a burst is taken without the executor, ten times as fast.
         self._executor.spin_once(timeout_sec=_LOOK)
         seen_ns = self._order.newest_ns
         emptied = self._take_all()
@@ -247,7 +247,7 @@ class TopicRecorder:
 
 def _work(node: Node, parameters: TopicRecorderParameters) -> None:
     recorder = TopicRecorder(node, parameters)
-    # ROS would end its context at once, with messages still to be taken.
+    # ROS would end its context at once, before the remaining messages are taken.
     uninstall_signal_handlers()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: recorder.stopped.set())

@@ -17,13 +17,13 @@ from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.actions import Action
 from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
 
-SILENCE = 0.08  #: [s] after which a node is silent that DDS does not hear, and that completes nothing
-GIVEN_UP = 2.0  #: [s] of silence after which a time master is lost in a cell that does not wait
+SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node counts as silent
+GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
 PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
-_LAST_ANSWER = 1.0  # [s] until the caller of a shutdown has its answer: DDS does not say when
-_MOST_MEMBERS = 256  # announced names that are kept
-_WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until it is reported; the last again and again
+_LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
+_MOST_MEMBERS = 256  # largest number of announced names
+_WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
 class MemberProtocol:
@@ -68,7 +68,7 @@ class MemberProtocol:
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
         self._former_peers: tuple[str, ...] = ()
-        self._newest_state: CellState | None = None  # of a time master that has not been heard yet
+        self._newest_state: CellState | None = None  # from a time master that is not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
         self.failure: LatheError | None = None
@@ -80,7 +80,7 @@ class MemberProtocol:
         self._started = self._beginning = self._leaving = False
         self.progress_step = max(1, window // 4)
         self._reported_blocks = 0
-        self._moved = 0.0  # when this member has last completed a block
+        self._moved = 0.0  # time of the last block that this member completed
         self._master_stalls = False
         self._repeat_due = 0.0
         self._leave_due = self._wait_report_due = math.inf
@@ -156,7 +156,7 @@ class MemberProtocol:
         if self.safe:
             return MemberState.SAFE
         if self.ready and self.master is not None and self.own.name in self.master.members:
-            return MemberState.READY  # for a time master that names others alone this one is an observer
+            return MemberState.READY  # an observer, for a time master that does not name it
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
     def hear_member(self, member: Announcement, now: float) -> None:
@@ -166,7 +166,7 @@ class MemberProtocol:
             ForeignMessage: the sender is no member of this cell.
         """
         if member.name == self.own.name and member.process == self.own.process:
-            return  # this one
+            return  # this member itself
         self._check(member)
         if member.name == self.own.name:
             self._meet_namesake(member)
@@ -382,7 +382,7 @@ class MemberProtocol:
         if self.master is None:
             self._newest_state = state
         elif state.session and state.session != self.master.session:
-            self._newest_state = state  # of a process that has not announced itself yet, or of a stranger
+            self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
         if self.failure:
@@ -424,7 +424,7 @@ class MemberProtocol:
         self.look_after_others(now)
         waits = self.phase != Phase.RUNNING or self.failure or not self.ready
         if (self.master is not None or self.own.members) and waits and now >= self._repeat_due:
-            self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have pushed the last one out
+            self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have displaced the last one
             self.announce()
         if now >= self._wait_report_due:
             self._wait_report_due = now + next(self._wait_report_after)
@@ -442,7 +442,7 @@ class MemberProtocol:
         silent = 0.0 if waits else now - self.silent.get(name, math.inf)
         ended = name in self.ended
         if self.failure:
-            # A master that comes back in between shall hear why the members are gone.
+            # A time master that returns meanwhile must learn why the members are gone.
             self.done = self.done or ended or silent > 2.0 * GIVEN_UP
         elif (ended or silent > GIVEN_UP) and self.over:
             self.leave()
@@ -467,14 +467,14 @@ class MemberProtocol:
         """Report once that the time master stalls the cell, since it cannot report this itself."""
         silent = self.phase == Phase.RUNNING and name in self.silent
         if silent and not self._master_stalls:
-            if now - self._moved < SILENCE:  # blocks that were on their way are still being computed
+            if now - self._moved < SILENCE:  # blocks in flight are still being computed
                 return
             self._tell_stall(name, self._reported_blocks)
         self._master_stalls = silent
 
     def _tell_stall(self, name: str, blocks: int) -> None:
         """Report that a member is silent, with the number of blocks that it has completed."""
-        # In this order: to log for the first time takes some 70 ms.
+        # Report first: the first log message takes some 70 ms.
         self._report("stall", member=name, blocks=blocks)
         self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
 

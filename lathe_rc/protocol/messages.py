@@ -10,7 +10,7 @@ from enum import IntEnum
 
 from lathe_rc.errors import LatheError
 
-_LONGEST = 256  # characters of a name that is quoted
+_LONGEST = 256  # characters of a quoted name
 
 
 class MemberState(IntEnum):

@@ -12,7 +12,7 @@ from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol, given_up
 from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
 
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
-_GONE = 0.2  # [s] for messages to be acknowledged, if a dead member never will
+_GONE = 0.2  # [s] to wait for acknowledgements after a member has died
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class TimeMasterProtocol(MemberProtocol):
         if name not in self.completed:
             return
         if progress.blocks <= self.completed[name]:
-            if self.restarts(name):  # it computes once more: that is no silence
+            if self.restarts(name):  # a restarted member computes blocks again: that is no silence
                 self._heard = self._members_moved[name] = now
             return
         if progress.blocks > self.blocks:
@@ -252,7 +252,7 @@ class TimeMasterProtocol(MemberProtocol):
             self._heard = now
             self._report("back", member=name)
         if any(now >= until for until in self._dead.values()):
-            # Those that others were waited for as well: they could not join any more.
+            # All dead members, restartable ones included: these could not join any more.
             self._lose(dict.fromkeys(self._dead, "died"), now)
         elif not self._dead:
             self._look_at_the_silent(now)
@@ -265,7 +265,7 @@ class TimeMasterProtocol(MemberProtocol):
         stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
         stands = (self.unsafe or self.credit <= 0) and now - self._heard > SILENCE
         if stands:
-            # Waiting members lag as much as the stalled one: those come first that DDS does not hear any more.
+            # Waiting members lag as much as the stalled one: members without DDS liveliness are named first.
             self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
         elif stopped:
             self._name_the_silent(frozenset(stopped) | self._stalled)
@@ -337,7 +337,7 @@ class TimeMasterProtocol(MemberProtocol):
         if not again:
             if self.end != self.samples:
                 self._set_end(self.samples + self._reactions.safe_samples)
-            # After the first time all know what to do, and need only hear of the lost.
+            # After the first safe state all members only need the names of further lost members.
             self.unsafe = frozenset(self.completed)
         self._say(Phase.SAFE, self.samples, self._why)
         assert self.end is not None, "a safe state has an end"

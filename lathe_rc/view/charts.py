@@ -27,10 +27,10 @@ Rows = list[dict[str, Any]]
 Column = Samples | Sequence[float | str | None] | float | str | bool | None
 
 _HERE = Path(__file__).parent
-_PAPER = 900  # [px] width of a picture, about that of the page
+_PAPER = 900  # [px] width of an image, about that of the page
 _GUIDE: Spec = {"labelColor": "--soft", "titleColor": "--ink", "gridColor": "--line", "domainColor": "--soft"}
 _GUIDE |= {"tickColor": "--soft", "labelFontSize": 11, "titleFontSize": 11}
-#: Looks of all figures; names that begin with -- are colours of the page, see page.css.
+#: Style of all figures; names that begin with -- are colours of the page, see page.css.
 LOOK: Spec = {
     "background": None,
     "font": "system-ui, sans-serif",
@@ -131,7 +131,7 @@ class Charts:
         if own.get("renderer") == "canvas":
             kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
         else:
-            ids: dict[str, str] = {}  # Vega counts them through all figures of a process
+            ids: dict[str, str] = {}  # Vega numbers them across all figures of a process
             svg = re.sub(
                 r'(?<= id=")clip\d+|(?<=url\(#)clip\d+',
                 lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),

@@ -241,7 +241,7 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
     """
     charts = Charts()
     template = page_template(Path(__file__).with_name("report.html.j2"), printable=printable)
-    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers: they are shown as they are
+    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers: they are shown unchanged
         cycles = {f"{topic}: {field}": found for (topic, field), found in data.curves.cycles.items() if found.size}
         forms = [_form(form, cycles, len(data.forms), charts) for form in data.forms]
         signals = list(_signals(data, charts))
@@ -305,7 +305,7 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
     text = render(data, name_of(bag), command, made_of)
     try:
         with replacing(page) as file:
-            file.write(text.encode("utf-8", "replace"))  # texts of a bag may hold lone surrogates
+            file.write(text.encode("utf-8", "replace"))  # strings of a bag may contain lone surrogates
     except OSError as error:
         raise LatheError(f"{page}: cannot be written ({error.strerror})") from None
     return data

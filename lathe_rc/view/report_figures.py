@@ -14,24 +14,24 @@ from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
 
-_FIELDS = 40_000  # of all maps of a page
+_FIELDS = 40_000  # in all maps of a page
 _ACROSS = 256  # fields of a map in a revolution
-_LINEAR = 8.0  # of the symmetrical logarithm: so much of its colours are for what is left at the end
+_LINEAR = 8.0  # parameter of the symmetric logarithm: larger values give the remaining error more colours
 _SQUARE = 460  # [px] the largest polar figure
-_INSIDE = 1.2  # radius of the desired form in a polar figure, by the largest deviation
+_INSIDE = 1.2  # radius of the desired form in a polar figure, relative to the largest deviation
 _POINTS = 720  # of a polar figure
-_OTHERS = 4  # controllers whose cycles are drawn
-_LAST, _FIRST, _BEST, _GREY, _COLOURS = 0, 1, 2, 5, 6  # places in the page's colours, and how many it has
+_OTHERS = 4  # largest number of controllers with plotted cycles
+_LAST, _FIRST, _BEST, _GREY, _COLOURS = 0, 1, 2, 5, 6  # indices of the page's colours, and their number
 _LONGEST_LABEL = 60  # characters
-_LONGEST_LENGTH = 1e3  # that is drawn [m]
-_MOST_VALUE = 1e12  # of other signals
-_FLOOR = 1e-3  # size of a form error that a figure takes for the least [µm]
-_ALMOST = 1e-9  # of their size, by which numbers differ that count as two
+_LONGEST_LENGTH = 1e3  # largest drawn length [m]
+_MOST_VALUE = 1e12  # largest value of other signals
+_FLOOR = 1e-3  # smallest form error that a figure resolves [µm]
+_ALMOST = 1e-9  # relative difference from which two numbers count as different
 
-#: Dragging marks what is to be enlarged.
+#: Dragging selects the range to enlarge.
 _BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
 _LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolOpacity": 1, "symbolStrokeWidth": 3}
-_LEGEND["columnPadding"] = 24  # where a reader's letters are wider than those that the picture was measured with
+_LEGEND["columnPadding"] = 24  # a reader's font may be wider than the font used for the layout
 _GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 260, "columns": 0, "titleLimit": 300}
 
 
@@ -89,7 +89,7 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
     """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis of a direction."""
-    # The page holds one number a field; Vega computes the places. Written out, they would make it five times as large.
+    # The page holds one number per field; Vega computes the positions, which would make the page 5 times as large.
     place = "(datum.k - 1)"
     return _rectangles(
         340,
@@ -276,7 +276,7 @@ def spectrum(form: Form) -> Spec:
 # --- curves
 
 
-_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, place of its colour, and whether it is dots
+_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, index of its colour, drawn as dots
 _Scaled = Callable[[Samples], Samples]
 
 
@@ -397,7 +397,7 @@ def timing(host: Host, step: float) -> list[Spec]:
     pace = _clipped(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))
-    if high - low <= least:  # paces that are all but the same need a range that can be cut into bins
+    if high - low <= least:  # nearly equal paces need a range that can be divided into bins
         low, high = low - 0.5 - least, high + 0.5 + least
     counts, edges = np.histogram(pace, bins=min(30, max(5, pace.size // 3)), range=(low, high))
     found = [_histogram("pace", counts, edges, ("simulated by wall time [s/s]", "reports"), _GREY, log=False)]

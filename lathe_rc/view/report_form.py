@@ -19,10 +19,10 @@ from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_series import Envelope, MeanRows
 
 ACROSS = 512  #: angles of the map
-CUTOFF = 50.0  #: of the filters for roundness and roughness [UPR], as of `lathe measure`
-_MARGIN = 64  # samples on each side that a spline needs to be the one through the whole run, to a bit or two
+CUTOFF = 50.0  #: of the filters for roundness and roughness [UPR], as in `lathe measure`
+_MARGIN = 64  # samples on each side for which a spline agrees with that of the whole run to a bit or two
 _AT_ONCE = 16  # revolutions
-_ALONG = 8  # revolutions that the surface along the part is made of
+_ALONG = 8  # revolutions in the surface along the part
 _LONGEST = 2**22  # samples of one revolution
 _TURN = 2.0 * np.pi
 
@@ -65,7 +65,7 @@ class Form:
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of every revolution, and those before the first
-        # Angle, form error and height (0 without a nose radius) from a margin before the next revolution on.
+        # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
         self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
@@ -83,7 +83,7 @@ class Form:
         if self.refused:
             return
         angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
-        if first and not self._held.size and not self._done:  # a snapshot begins in the midst of a revolution
+        if first and not self._held.size and not self._done:  # a snapshot begins in mid-revolution
             self._done = self._before = int(np.ceil(angle[0] / _TURN))
         height = tool["height"] if self._nose_radius else np.zeros(samples)
         new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
@@ -119,11 +119,11 @@ class Form:
         finite = np.isfinite(self._held).all(axis=0)
         broken = not finite.all()
         if broken:
-            # Nothing can follow: the revolutions before it are measured up to their very end.
+            # No samples can follow: the revolutions before are measured up to their end.
             margin, self._held = 0, self._held[:, : np.argmin(finite)]
         try:
             self._check()
-            with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples; they show in the numbers
+            with np.errstate(over="ignore", invalid="ignore"):  # for absurd samples; the numbers show them
                 while self._measure_some(margin):
                     pass
         except InputError as error:
@@ -158,8 +158,8 @@ class Form:
         whole = int(np.count_nonzero(edges[1:] + margin < angle.size)) if margin else _AT_ONCE
         if not whole:
             return False
-        # The spline through a revolution depends on the samples beyond its end: with them the numbers are those of the
-        # whole run, however it is cut.
+        # The spline through a revolution depends on the samples beyond its end: with them the numbers agree with those
+        # of the whole run, whatever the chunks.
         stop = int(edges[whole]) + _MARGIN
         found = measure(angle[:stop], error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
         whole = min(whole, found.form.rms.size)

@@ -26,10 +26,10 @@ from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
 
-_MOST_OF_A_TYPE = 4  # topics that have figures
+_MOST_OF_A_TYPE = 4  # topics with figures
 _MOST_EVENTS = 100
 _PIECE = 65536  # samples
-#: Fields that are drawn against time, and those against cycles, by message type.
+#: Fields plotted over time, and fields plotted over cycles, by message type.
 _CURVES = ((messages.ENCODER, "speed_true"), (messages.CUT, "force"), (messages.CUT, "wear"))
 _CYCLES = ((messages.LEARNING, "rms_error"), (messages.PERIODIC, "max_error"))
 
@@ -225,7 +225,7 @@ def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
         tally.count, tally.size, tally.last_ns = tally.count + 1, tally.size + len(data), log_ns
         if topic in feeder.types:
             feeder.add(topic, log_ns, data)
-            newest[topic] = data  # decoded at the end alone: the feeder has decoded it already
+            newest[topic] = data  # decoded only at the end: the feeder has decoded it already
         elif tally.type in HOST_TYPES:
             gathered.host.add(tally.type, data)
     left = feeder.finish()

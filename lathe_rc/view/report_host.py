@@ -95,7 +95,7 @@ class Host:
             self.left_out += 1
             return
         node = self.nodes.setdefault(status.name, Node())
-        # ROS has it as a byte: an int for rosbags, bytes of length 1 for rclpy.
+        # A byte in ROS: an int in rosbags, bytes of length 1 in rclpy.
         level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
         node.reports += 1
         node.level = max(node.level, level)
@@ -108,7 +108,7 @@ class Host:
     def _compare_reports(self, name: str, wall: float, values: dict[str, str]) -> None:
         """Compute the pace from two consecutive reports of the time master."""
         if "schedule slipped [s]" not in values:
-            return  # of another node
+            return  # report of another node
         try:
             blocks, samples = (float(values[key]) for key in ("blocks", "samples"))
             durations = [Durations.parse(values.get(key, "")) for key in (LATENESS, LATENCY)]
@@ -117,7 +117,7 @@ class Host:
         self.lateness[name], self.latency[name] = durations
         began, done, turned = self._marks.get(name, (wall, 0.0, 0.0))
         self._marks[name] = wall, blocks, samples
-        if done and wall > began and blocks > done:  # it was running all that time
+        if done and wall > began and blocks > done:  # the cell was running in the whole interval
             pace = (samples - turned) / (wall - began)
             if math.isfinite(pace):
                 self.pace.append(pace)

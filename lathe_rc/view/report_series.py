@@ -32,7 +32,7 @@ class _Groups:
             for ufunc, empty, kept in self._how:
                 kept[: self._capacity // 2] = ufunc(kept[::2], kept[1::2])
                 kept[self._capacity // 2 :] = empty
-        # One call of reduceat for all new values: where the group changes a segment begins.
+        # One call of reduceat for all new values: a segment begins at each change of group.
         place = np.arange(first, self.size) // self.group
         edges = np.flatnonzero(np.diff(place, prepend=-1))
         groups = place[edges]

@@ -21,11 +21,11 @@ from lathe_rc.view.report_gather import EventKind, Gathered
 
 GOOD, BAD, WARN = "good", "bad", "warn"
 
-_FEWEST = 4  # revolutions of which is said how they go on
-_CHANGE = 0.05  # of the form error over the last revolutions, below which it stays as it is
-_VARIES = 0.005  # deviation of the speed from which on it is said to vary
-_SOME = 0.1  # share of the power from which on a part is named
-_MOST = 6  # kinds of things that went wrong
+_FEWEST = 4  # smallest number of revolutions with a trend
+_CHANGE = 0.05  # change of the form error over the last revolutions below which it counts as constant
+_VARIES = 0.005  # smallest deviation of a speed that counts as varying
+_SOME = 0.1  # smallest share of the power that is reported
+_MOST = 6  # kinds of incidents
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
         if kind.text.startswith(LIMITED):
             node = kind.topic.strip("/").removesuffix("/events")
             limits.append(Finding(f"{node} came to the limits of its command, {_when(data, kind)}.", WARN))
-    if form and not incidents and not growth:  # else the form error is what those have made of it
+    if form and not incidents and not growth:  # else incidents or growth determine the form error
         limits += _form(data, form)
     verdict = _verdict(data, form)
     if growth:
@@ -127,7 +127,7 @@ def _form(data: Gathered, form: Form) -> Iterator[Finding]:
         return
     yield from _trend(rms, form)
     count = len(profiles)
-    # The mean of so many revolutions still holds 1/count of the power that changes; the factor takes that out.
+    # The mean of count revolutions still contains 1/count of the variable power; the factor corrects this.
     mean = profiles.mean(axis=0)
     share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
     amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from lathe_rc.view.rerun_scene import Scene
 
 _PIECE = 65536  # samples
-_END_NS = 1_000_000_000  # before the end of a bag, where its last blocks are looked for
-_POINTS = 300_000  # of a curve: a long bag gets fewer in a second
+_END_NS = 1_000_000_000  # before the end of a bag, range of the search for its last blocks
+_POINTS = 300_000  # of a curve: a long bag gets fewer per second
 
 
 def _block(source: Source, topic: str, *, last: bool = False) -> Block | None:
@@ -78,7 +78,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
         LatheError: the bag is incomplete, or the recording cannot be written.
     """
     scene = _scene(recording, bag, rate)
-    # Pieces of whole windows: the points of the curves then do not depend on where the bag is cut.
+    # Chunks of complete windows: the points of the curves then do not depend on the chunks.
     header = stream.feed(bag, [scene], piece=max(scene.window, _PIECE // scene.window * scene.window))
     scene.close()
     return header.samples
@@ -99,7 +99,7 @@ def write(bag: Path, output: Path, *, rate: float = RERUN_RATE) -> int:
     if not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}")
     recording = rr.RecordingStream("lathe_rc", recording_id=name_of(bag))
-    # Rerun writes as it goes: under another name, so that a failure leaves an older file as it was.
+    # Rerun writes continuously: under another name, so that a failure leaves an existing file unchanged.
     beside = output.with_name(f".{output.name}.{os.getpid()}")
     try:
         recording.save(beside)

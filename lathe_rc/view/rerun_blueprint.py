@@ -12,7 +12,7 @@ from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, S
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
-_COLOURS = ("blue", "orange", "green")  # as words, of the first curves of a plot
+_COLOURS = ("blue", "orange", "green")  # names of the colours of a plot's first curves
 
 
 def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary) -> list[rrb.VisibleTimeRange]:
@@ -23,8 +23,8 @@ def _until_cursor(time: rrb.TimeRangeBoundary, revolution: rrb.TimeRangeBoundary
 
 
 _EVER = rrb.TimeRangeBoundary.infinite()
-_SO_FAR = _until_cursor(_EVER, _EVER)  # rings that have been turned stay
-_LATEST = _until_cursor(  # a plot takes its scale from that
+_SO_FAR = _until_cursor(_EVER, _EVER)  # finished rings stay visible
+_LATEST = _until_cursor(  # this range sets the scale of a plot
     rrb.TimeRangeBoundary.cursor_relative(seconds=-_LATEST_S),
     rrb.TimeRangeBoundary.cursor_relative(seq=-_LATEST_REVOLUTIONS),
 )
@@ -119,7 +119,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
     first = [plots.pop(plot) for plot in (ERROR, POSITION) if plot in plots]
     rows: list[rrb.View | rrb.Container] = [*first]
     tabs: list[rrb.View] = list(plots.values())
-    if live or said & {*LOGGED}:  # live, what had to be left out stands there
+    if live or said & {*LOGGED}:  # the live view reports dropped chunks there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     import rerun as rr
 
 Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
-Open = Callable[[str], tuple["rr.RecordingStream", Path | None]]  # a recording by name, and the file that it goes to
+Open = Callable[[str], tuple["rr.RecordingStream", Path | None]]  # a recording by name, and its file
 
-PIECE = 0.1  #: length of a piece, about [s] of simulated time
+PIECE = 0.1  #: approximate length of a chunk [s] of simulated time
 
 
 class Backlog:
@@ -89,20 +89,20 @@ class RunOrder:
         self._run: str | None = None
         self._before: str | None = None
         self._ends: dict[str, int] = {}  # sample after the newest of each topic, in this run
-        self._old: dict[str, int] = {}  # and in the one before
+        self._old: dict[str, int] = {}  # and in the previous run
 
     def place(self, topic: str, run: str, first: int, end: int) -> Literal["same", "new", "old"]:
         """Return the run that a topic's samples belong to: the current one, a new one, or the previous one."""
         newest = max(self._ends.values(), default=0)
         if run == self._run and first >= self._ends.get(topic, 0):
-            # The same name twice in a row: a topic that is first heard may still belong to the run before, if it goes
-            # on from there and is ahead of all topics of this one.
+            # The same run id twice in a row: the first samples of a topic may still belong to the previous run, if they
+            # continue it there and are ahead of all topics of this run.
             again = run == self._before and topic not in self._ends
             if again and newest < first and first >= self._old.get(topic, first + 1):
                 return "old"
             self._ends[topic] = end
             return "same"
-        if run == self._before != self._run and first >= self._old.get(topic, 0):  # a late topic of the run before
+        if run == self._before != self._run and first >= self._old.get(topic, 0):  # a late topic of the previous run
             return "old"
         self._run, self._before = run, self._run
         self._ends, self._old = {topic: end}, self._ends
@@ -229,7 +229,7 @@ class Live:
         self._order = RunOrder()
         self._decoders: dict[str, Decoder] = {}
         self._run: _RunView | None = None
-        self._over = False  # the run that goes on is; what still comes of it is passed over
+        self._over = False  # the current run has ended; further samples of it are ignored
         self._early: list[Sparse] = []  # before the first block
 
     def take(self, topic: str, msgtype: str, data: bytes) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
 _HOST = "127.0.0.1"
-_START = 30.0  # [s] for a viewer to come up
+_START = 30.0  # [s] for a viewer to start
 _POLL = 0.05  # [s] between attempts to reach it
 
 
@@ -32,7 +32,7 @@ def require() -> None:
         LatheError: Rerun is not installed.
     """
     extras.require("rerun_bindings")
-    os.environ.setdefault("RUST_LOG", "off")  # what goes wrong is told by the command
+    os.environ.setdefault("RUST_LOG", "off")  # the command reports errors itself
 
 
 def _free_port() -> int:
@@ -95,7 +95,7 @@ def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
         InputError: no display for a window.
     """
     data = _free_port()
-    options = ["--bind", _HOST, "--port", str(data)]  # by itself, Rerun listens on all interfaces
+    options = ["--bind", _HOST, "--port", str(data)]  # by default, Rerun listens on all interfaces
     if kind == "serve":
         page = f"http://{_HOST}:{port}/?url={quote(f'rerun+http://{_HOST}:{data}/proxy', safe='')}"
         return Viewer([*options, "--serve-web", "--web-viewer-port", str(port)], data, f"{page}  (Ctrl-C ends it)")

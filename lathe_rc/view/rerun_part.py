@@ -18,17 +18,17 @@ Array = npt.NDArray[np.float64]
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
-COLOURS: Final = "turbo"  #: Rerun has it under the same name
+COLOURS: Final = "turbo"  #: Rerun uses the same name
 LOG_RANGE = (-1.5, 2.5)  #: of the colours: log10 of |form error| in µm
 RADIUS = 50.0  #: of the part [mm]
-LENGTH = 110.0  #: of the part, if it is known how much will be turned [mm]
-_PITCH = 0.5  # between revolutions, if it is not [mm]
-_DEEPEST = 0.4 * RADIUS  # that a deviation is drawn [mm]
-_SWING = 0.24 * RADIUS  # what the deviations of a part should come to [mm]
-_LEAST = 10e-6  # that deviations are taken to come to [m]
-_STEP = 2  # of the angles, every how many-th has a vertex
+LENGTH = 110.0  #: of the part, if the extent of the run is known [mm]
+_PITCH = 0.5  # between revolutions, if it is unknown [mm]
+_DEEPEST = 0.4 * RADIUS  # largest drawn deviation [mm]
+_SWING = 0.24 * RADIUS  # intended range of the drawn deviations [mm]
+_LEAST = 10e-6  # lower limit of the deviations' range [m]
+_STEP = 2  # one vertex per this many angles
 _VERTICES = ANGLES // _STEP
-_SMALLEST = 1e-9  # form error that is told from 0 [m]
+_SMALLEST = 1e-9  # form error that differs from 0 [m]
 
 
 def log_um(error: Array) -> Array:

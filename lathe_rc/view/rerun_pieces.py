@@ -15,9 +15,9 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.rerun_signals import drawn_fields
 
-_AHEAD = 4  # pieces that wait for the topics that are late
+_AHEAD = 4  # chunks that wait for late topics
 
-_Cuts = list[tuple[int, Signals]]  # first sample and signals of the blocks of a topic in a piece, as they came
+_Cuts = list[tuple[int, Signals]]  # first sample and signals of a topic's blocks in a chunk, in order of arrival
 
 
 def _length(signals: Mapping[str, Samples]) -> int:
@@ -47,14 +47,14 @@ class Pieces:
     """
 
     def __init__(self, types: Mapping[str, str], size: int, sink: Sink) -> None:
-        self._fields: dict[str, set[str]] = {}  # that are drawn, by topic
+        self._fields: dict[str, set[str]] = {}  # plotted fields by topic
         self._size, self._sink = size, sink
         self._waiting: defaultdict[int, defaultdict[str, _Cuts]] = defaultdict(lambda: defaultdict(list))
         self._ends: dict[str, int] = {}  # sample after the newest of each topic
         self._sparse: list[Sparse] = []
         self._next = 0
         self._begun = False
-        self._late: set[str] = set()  # topics that pieces have been handed on without, uncounted
+        self._late: set[str] = set()  # topics missing in chunks passed on before, not counted in lost
         self.first = self.lost = 0
         self.learn(types)
 
@@ -76,7 +76,7 @@ class Pieces:
         topic, size = full(topic), self._size
         if topic not in self._fields:
             return
-        if topic not in self._ends and not self._begun:  # begin no earlier than with the piece after its first sample
+        if topic not in self._ends and not self._begun:  # begin with the chunk after its first sample, or later
             self._next = max(self._next, -(-first // size))
             self.first = self._next * size
             for piece in [piece for piece in self._waiting if piece < self._next]:
@@ -90,7 +90,7 @@ class Pieces:
             span = slice(begin - first, min(end, (piece + 1) * size) - first)
             self._waiting[piece][topic].append((begin, {name: signals[name][span] for name in self._fields[topic]}))
         self._ends[topic] = end
-        # Hand on what nothing more can come for, and what has waited long enough.
+        # Pass on complete chunks, and chunks that have waited long enough.
         complete = min(self._ends.get(each, 0) for each in self._fields) // size
         while self._waiting and ((oldest := min(self._waiting)) < complete or len(self._waiting) > _AHEAD):
             self._emit(oldest)
@@ -113,7 +113,7 @@ class Pieces:
         joined = {topic: _join(begin, cuts) for topic, cuts in self._waiting.pop(piece).items()}
         samples = max((_length(signals) for signals in joined.values() if signals), default=0)
         dense = {topic: signals for topic, signals in joined.items() if signals and _length(signals) == samples}
-        cut = samples < self._size and not (closing and not self._waiting)  # only the last may be short
+        cut = samples < self._size and not (closing and not self._waiting)  # only the last chunk may be short
         self.lost += piece - self._next + (cut or len(dense) < len(self._fields))
         self._next, self._begun = piece + 1, True
         if samples:

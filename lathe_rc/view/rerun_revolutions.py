@@ -13,9 +13,9 @@ from lathe_rc.errors import LatheError
 
 Array = npt.NDArray[np.float64]
 
-ANGLES = 360  #: parts of a revolution
+ANGLES = 360  #: sectors of a revolution
 HIGHEST = 50  #: of the harmonics [UPR]
-_FEWEST = 4.0  # samples a revolution; no spindle turns faster between two of them
+_FEWEST = 4.0  # samples per revolution at the highest plausible speed
 _LONGEST = 2**22  # samples of one revolution
 
 
@@ -44,7 +44,7 @@ class Revolution:
     def harmonics(self) -> Array:
         """Return the amplitudes of the form error by undulations per revolution [m], shape (HIGHEST + 1,)."""
         amplitude = undulations(self.error[None], HIGHEST).amplitude[0]
-        # A mean over a part of the circle weakens an undulation by the sine cardinal of what it covers of it.
+        # A mean over a sector attenuates an undulation by the sinc of the covered part of its period.
         return np.asarray(amplitude / np.sinc(np.arange(HIGHEST + 1) / ANGLES))
 
 
@@ -73,12 +73,12 @@ class Revolutions:
     """
 
     def __init__(self) -> None:
-        # Angle [revolution], error, reference and height of the revolution under way, shape (4, n); the angle that a
-        # sample stands for ends with the next one.
+        # Angle [revolution], error, reference and height of the current revolution, shape (4, n); a sample covers the
+        # angle up to the next one.
         self._held = np.empty((4, 0))
         self._next = 0  # index of the sample after it
         self._step = 0.0  # to the last sample [revolution]
-        self._entire: bool | None = None  # whether the first samples of the revolution are there; None: not known yet
+        self._entire: bool | None = None  # the revolution's first samples are present; None: not known yet
 
     def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[Revolution]:
         """Add consecutive samples and return complete revolutions; a gap before them drops the current revolution.
@@ -110,13 +110,13 @@ class Revolutions:
             return
         self._step = float(step[-1])
         if self._entire is None:
-            # Its first sample is less than a step behind its beginning; half a step more for a speed that varies.
+            # Its first sample is less than one step after its beginning; another half step allows for varying speed.
             self._entire = bool(turns[0] % 1.0 <= 1.5 * step[0])
         begins = [0] * self._entire + (np.flatnonzero(np.diff(np.floor(turns))) + 1).tolist()
         for a, b in pairwise(begins):
             yield from _measured(held[:, a:b], step[a:b], start + b)
         self._entire = bool(begins) and turns.size - begins[-1] <= _LONGEST
-        self._held = held[:, begins[-1] if self._entire else -1 :]  # one sample at least, for the step to the next
+        self._held = held[:, begins[-1] if self._entire else -1 :]  # at least one sample, for the step to the next
 
     def finish(self) -> Iterator[Revolution]:
         """Return the last revolution, if fewer than two of its samples are missing."""

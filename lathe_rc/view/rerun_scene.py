@@ -24,11 +24,11 @@ from lathe_rc.view.rerun_blueprint import blueprint
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
 
-_POSES = 250.0  # of part and tool in a second
+_POSES = 250.0  # poses of part and tool per second
 _ROWS = 512  # of the map
-_BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their place
+_BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their position
 _FLUSH, _EVER = 30.0, 1e9  # [s] for a viewer to take the rest of a live recording, and for a file
-_GROWTH = 8  # the map is sent again when it has this part more rows
+_GROWTH = 8  # the map is sent again when it has grown by 1/8
 # Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
 
@@ -76,7 +76,7 @@ class Scene:
         self._revolutions = Revolutions()
         self._ring: parts.Ring | None = None
         self._rows: list[npt.NDArray[np.float16]] = []
-        self._every = 1  # how many-th revolution has a row and a ring
+        self._every = 1  # one row and one ring per this many revolutions
         self._sent = 0  # rows
         self._newest: Revolution | None = None
         self.points = self.revolutions = 0
@@ -254,7 +254,7 @@ class Scene:
     def _add_row(self, revolution: Revolution) -> None:
         """Add a row to the map; when the map is full, every second row is dropped."""
         self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the scale of colours
-        # Each map is sent whole: after a part more rows, so that all of them together stay a multiple of the last.
+        # Each map is sent completely: only after a relative growth, so that their total size is a multiple of the last.
         if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
             self._send_map(revolution)
         if len(self._rows) == _ROWS:

@@ -32,7 +32,7 @@ class Curve:
 
 ERROR, POSITION, DRIVE = "tool error", "tool position", "drives"
 FORCE, SPEED, SLIDE, SERVO = "force", "spindle speed", "slides", "servo"
-PLOTS = {ERROR: "µm", POSITION: "µm", FORCE: "N", SPEED: "1/min", DRIVE: "µm", SLIDE: "mm"}  #: and their units
+PLOTS = {ERROR: "µm", POSITION: "µm", FORCE: "N", SPEED: "1/min", DRIVE: "µm", SLIDE: "mm"}  #: unit of each plot
 PLOTS |= {SERVO: "own units"}
 
 _RPM = 60.0 / (2.0 * np.pi)
@@ -49,7 +49,7 @@ _CURVES: dict[str, dict[str, Curve]] = {
     messages.CUT: {"force": Curve(FORCE, "true", 1.0), "measured_force": Curve(FORCE, "measured", 1.0)},
     messages.SERVO: {"command": Curve(SERVO, "command", 1.0), "error": Curve(SERVO, "error", 1.0)},
 }  # by message type and field
-_SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # of a state that a servo command belongs to
+_SLIDE = {"position": Curve(SLIDE, "actual", 1e3)}  # for a state with a servo command
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ CYCLES = {
 _PART = {
     messages.ENCODER: {"angle_true"},
     messages.TOOL: {"error", "reference", "height"},
-}  # for the picture of the part
+}  # for the view of the part
 
 
 def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
@@ -114,7 +114,7 @@ def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
     """
     if window <= 2 or not values.size:
         return np.arange(values.size)
-    # Copies of the last value: argmin and argmax give the first of equal ones, and so never a place beyond the end.
+    # Padding repeats the last value: argmin and argmax return the first of equal values, so never a padded index.
     rows = np.pad(values, (0, -values.size % window), mode="edge").reshape(-1, window)
     ends = np.sort([rows.argmin(axis=1), rows.argmax(axis=1)], axis=0)
     keep = np.stack([np.ones(len(rows), dtype=bool), ends[0] != ends[1]], axis=1)
@@ -123,10 +123,10 @@ def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
 
 # --- bands
 
-STATES = "states"  #: where the bands are in the view
+STATES = "states"  #: entity path of the bands in the view
 #: Colours of the supervisor's states.
 STATE_COLOURS = {"nominal": 0x2E7D4FFF, "degraded": 0xB8860BFF, "retracting": 0xD2622AFF, "safe": 0xB3262EFF}
-_FAULT, _REPAIR = "fault ", "repair "  # how the events of faults begin
+_FAULT, _REPAIR = "fault ", "repair "  # prefixes of fault events
 
 
 def supervisor(topic: str) -> str:
