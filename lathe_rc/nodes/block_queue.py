@@ -53,9 +53,9 @@ class BlockQueue(BlockOrder):
         """Check and queue an encoded block; return None for a repeat, or if a held block (see `hold`) replaces it.
 
         Raises:
-            ForeignMessage: another source or run, or no block at all.
-            LatheError: another step, another time than that of its samples, a gap, a repeat, arrays of different
-                lengths, or far more blocks waiting than the window allows.
+            ForeignMessage: the block has another source or run id, or the message is not a block.
+            LatheError: wrong step, time stamp that does not match the samples, gap, repeat, arrays of different
+                lengths, or far more waiting blocks than the window allows.
         """
         if self.held_from is not None:
             return None

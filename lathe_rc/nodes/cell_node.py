@@ -549,7 +549,7 @@ class CellNode(LifecycleNode):
         """Subscribe to a signal topic, over DDS or inside this process.
 
         Args:
-            topic: fully qualified.
+            topic: fully qualified name.
             msgtype: message type.
             callback: called with the encoded message from DDS.
             inside: called instead with the `lathe_rc.nodes.exchange.Delivery` of a node of this process.

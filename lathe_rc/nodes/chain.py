@@ -4,7 +4,7 @@
 A stage alone computes as far as its inputs allow and hands the blocks over: in a loop with a feedback of one block, one
 block at a time. A chain computes like the offline engine, as far as the window and the other processes allow, and each
 stage then publishes its blocks. Between two steps of a chain every stage has the state that it would have alone, queues
-and delay buffers included. So after an error the chain is dissolved, and each stage goes on alone.
+and delay buffers included. So the chain can be dissolved after an error, and each stage goes on alone.
 """
 
 from collections.abc import Mapping, Sequence

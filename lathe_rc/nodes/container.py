@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Executable: nodes in one process, NAME[:STAGE]... [--ros-args ...]; for the harness and the launch file."""
+"""Executable: nodes in one process, NAME[:STAGE]... [--ros-args ...]; used by the harness and the launch file."""
 
 import sys
 from typing import NoReturn

@@ -14,8 +14,8 @@ _CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", "ROS_STATIC_PEERS")
 def settings(environ: Mapping[str, str]) -> dict[str, str]:
     """Return the environment variables that restrict DDS to this machine over loopback UDP, unless overridden.
 
-    With the range LOCALHOST, rmw_fastrtps adds shared memory whatever the profile and ``FASTDDS_BUILTIN_TRANSPORTS``
-    say. So the profile limits the range instead, to the loopback interface.
+    With the range LOCALHOST, rmw_fastrtps adds shared memory, whatever the profile and ``FASTDDS_BUILTIN_TRANSPORTS``.
+    So the profile limits the range instead, to the loopback interface.
 
     Fast DDS's shared memory is not used because a killed process may leave it locked: other members then block, or no
     longer receive each other's messages. ``FASTDDS_BUILTIN_TRANSPORTS=DEFAULT`` switches it on.

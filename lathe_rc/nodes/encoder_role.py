@@ -23,7 +23,7 @@ _POLL = 0.5e-3  # [s] between polls of a line
 def _place(joints: Any, name: str) -> int | None:
     """Return the index of a joint in a joint state's positions, of the first joint without a name; None if it has none.
 
-    Several nodes may publish on one topic, as the grippers of a robot do, and a driver may publish velocities alone.
+    Several nodes may publish on one topic, like the grippers of a robot, and a driver may publish velocities only.
     """
     if name and name not in joints.name:
         return None

@@ -49,7 +49,7 @@ class Exchange:
 
     Attributes:
         master: callback for the Progress of a node, if the time master is in this process.
-        stages: roles with a stage that are active and have not computed yet, see `lathe_rc.nodes.chain`.
+        stages: active roles whose stage has not computed yet (see `lathe_rc.nodes.chain`).
         form: function that forms chains of a stage and the waiting stages of its cell; takes the role and the cell.
     """
 

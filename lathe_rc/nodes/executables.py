@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Executables of ``ros2 run lathe_rc NAME``: one for each kind of cell node and for each standalone node.
 
-``python -m lathe_rc.nodes.executables NAME ...`` is the same without an installation.
+``python -m lathe_rc.nodes.executables NAME ...`` does the same without an installation.
 """
 
 import importlib.util

@@ -16,10 +16,9 @@ _MOST = 64  # messages of one topic or service at a time: a flood must not starv
 class Events:
     """Event executor of the nodes of a process.
 
-    EventsExecutor must not lose a publisher, subscription or service while it spins: an event of one that has come,
-    and that it has not handed over yet, it then drops without the interpreter's lock, which crashes the process
-    (rclpy's issue 1644). So discarded entities of a node are kept until the whole executor is replaced by a new
-    one.
+    No publisher, subscription or service may be removed from EventsExecutor while it spins: the executor then drops
+    the entity's pending events without holding the interpreter's lock, which crashes the process
+    (rclpy's issue 1644). So discarded entities of a node are kept until the whole executor is replaced by a new one.
 
     Args:
         nodes: nodes of this process.
@@ -50,10 +49,10 @@ class Events:
 def drain_missed_messages(node: Node) -> None:
     """Process messages and requests of a node for which no event was raised; call this periodically.
 
-    When EventsExecutor takes up a subscription or a service, rmw_fastrtps first counts the messages that have come and
-    then sets the callback that announces others (since its pull request 657). A message in between raises no event,
-    and from then on each event takes the previous message: the newest one waits for the next event. A cell that misses
-    the last message before the start blocks forever.
+    When EventsExecutor adds a subscription or a service, rmw_fastrtps first counts the waiting messages and then sets
+    the callback for new ones (since its pull request 657). A message in between raises no event, and from then on each
+    event takes the previous message: the newest one waits for the next event. A cell that misses the last message
+    before the start blocks forever.
     """
     for subscription in [*node.subscriptions]:
         with subscription.handle:

@@ -5,11 +5,11 @@ It imports the modules of the nodes once, and forks itself for each process of a
 new interpreter takes a second for the same imports. It takes part in no ROS domain itself. On request, the forked
 process is replaced by a command: a separate interpreter.
 
-`lathe_rc.process_launcher` asks for processes over a socket. The answers are pairs: the number of a process and None,
-with its pidfd, when it has started; the number and the exit code when it has ended.
+`lathe_rc.process_launcher` requests processes over a socket. The responses are pairs: process number and None, with the
+pidfd, when the process has started; process number and exit code when it has ended.
 
-The libraries of ROS 2 run two threads from their import on, which wait for a tracing session of LTTng. They hold no
-lock meanwhile; forked processes run without these threads, and so without LTTng.
+The libraries of ROS 2 start two threads on import, which wait for a tracing session of LTTng. They hold no lock
+meanwhile; forked processes run without these threads, and so without LTTng.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Liveliness of other nodes: DDS liveliness, and the state of their processes on this machine.
 
-DDS asserts a node's liveliness from a thread of its own, whatever the node computes. It cannot tell a process that has
-died from one that is stopped; where the process is on this machine, the operating system can.
+DDS asserts a node's liveliness from a separate thread, whatever the node computes. It cannot distinguish a dead process
+from a stopped one; for processes on this machine, the operating system can.
 
 Fast DDS may report a silent writer as alive: if an assertion arrives at the moment at which the lease expires, the
 lease timer is not restarted, and only a further assertion would restart it. So a stopped process on this machine

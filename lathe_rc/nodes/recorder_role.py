@@ -114,7 +114,7 @@ class RecorderRole:
         """Do nothing after a failure (implements `Role`)."""
 
     def activate(self) -> None:
-        """Subscribe to the host topics; the signal topics follow when the members have announced them."""
+        """Create the snapshot service and subscribe to the host topics; signal topics follow when announced."""
         self.node.create_service(Trigger, "~/snapshot", self._on_snapshot)
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.node.topic(topic)

@@ -56,7 +56,7 @@ class Replayer:
     """Publisher of the messages of a bag, in the order of their log times.
 
     Args:
-        node: carries the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and /clock.
+        node: node with the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and the topic /clock.
         parameters: topics, speed and options of the replay.
         source: the bag.
 
@@ -250,7 +250,7 @@ class Replayer:
         yield from self._source.messages(self._topics, start_ns=self._start_ns, stop_ns=self._stop_ns)
 
     def _latched(self) -> Iterator[Message]:
-        """Return the latched messages from before the start, up to the publishers' depth, as late readers got them."""
+        """Yield the latched messages from before the start, up to the publishers' depth, as for a late reader."""
         kept: dict[str, deque[Message]] = {}
         for topic in sorted(self._topics):
             recorded = self._source.topics[topic].qos

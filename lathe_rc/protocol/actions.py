@@ -76,7 +76,7 @@ class Lose(NamedTuple):
 
 
 class Log(NamedTuple):
-    """Write a line to the log; ``level``: info, warning or error."""
+    """Write a line to the log at a ``level``: info, warning or error."""
 
     level: str
     text: str

@@ -18,7 +18,7 @@ class BlockOrder:
         source: the only node whose blocks are accepted; while empty, no block is accepted if there is a run id;
             otherwise the first sender becomes the source.
         open: the first sample of the blocks is not known yet.
-        end: index after the newest sample, with which the next block has to begin unless it is `open`.
+        end: index after the newest sample; the next block has to begin there unless the order is `open`.
         received: number of blocks so far, lost blocks included.
         lost: number of lost blocks; always 0 unless the cell is free-running.
         ended: the last block has arrived.

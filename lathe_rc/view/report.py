@@ -279,9 +279,9 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
     """Write the report of a bag; an existing report of the same name is replaced atomically.
 
     Args:
-        bag: the bag.
-        page: the HTML file.
-        with_budget: add the budget of the form error, by runs of the bag's scenario.
+        bag: path of the bag.
+        page: path of the HTML file.
+        with_budget: add the budget of the form error, from runs of the bag's scenario.
 
     Raises:
         InputError: not a bag, or the page cannot be created; with a budget, the bag has no scenario for an offline run.

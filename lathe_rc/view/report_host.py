@@ -46,7 +46,7 @@ class Host:
         errors: lines for failures.
         unreadable: number of messages that could not be decoded.
         left_out: number of nodes, states and errors beyond the limits.
-        pace: samples by wall time [1/s], between two reports of the time master.
+        pace: samples per wall time between two reports of the time master [1/s].
         lateness, latency: lateness and latency of blocks in the last report of each time master, by its name.
     """
 

@@ -48,7 +48,7 @@ class Envelope(_Groups):
     """Smallest and largest value of groups of neighbours; values that are not finite are omitted.
 
     Args:
-        capacity: groups that are kept, even.
+        capacity: largest number of groups, even.
     """
 
     def __init__(self, capacity: int = 1024) -> None:

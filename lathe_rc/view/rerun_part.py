@@ -2,7 +2,7 @@
 """Shapes and colours of the three-dimensional view: rings of the part, the tool, and the colour scale.
 
 The axes are those of a lathe: Z along the spindle, X from it to the tool. Lengths are in millimetres; the part is
-drawn with a radius of its own, since a recording does not hold it.
+drawn with a fixed radius, since a recording does not contain the true one.
 """
 
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ class Pieces:
         Args:
             topic: topic name; unknown topics are ignored.
             first: index of the first sample.
-            signals: by field, shape (samples,).
+            signals: signals by field, shape (samples,).
         """
         topic, size = full(topic), self._size
         if topic not in self._fields:

@@ -24,7 +24,7 @@ class Revolution:
     """Form of the part in one complete revolution.
 
     Attributes:
-        number: from 1.
+        number: number of the revolution, starting at 1.
         end: index of the first sample after it.
         error: form error, mean of the samples in each of `ANGLES` sectors [m], shape (ANGLES,).
         radius: radius deviation of the part, desired form minus form error [m], shape (ANGLES,).

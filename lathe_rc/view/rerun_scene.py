@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun scene of a run: part, tool, signals and learning progress, logged in columns, chunk by chunk.
 
-Timelines are ``time``, simulated time from sample 0, and ``revolution``, from 1. Memory does not grow with the run.
+The timelines are ``time``, the simulated time since sample 0, and ``revolution``, counted from 1. Memory does not grow
+with the run.
 """
 
 import contextlib

@@ -106,7 +106,7 @@ def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
     A curve through these samples keeps their original times and loses no peak.
 
     Args:
-        values: shape (n,).
+        values: samples of a signal, shape (n,).
         window: length [sample]; 1 or 2 keeps all samples.
 
     Returns:
