@@ -413,8 +413,8 @@ class CellNode(LifecycleNode):
                 self._host["cell_state"].publish(CellStateMessage(**asdict(state)))
             case actions.Tell(progress):
                 self._tell(progress)
-            case actions.Follow(member):
-                self.watch.follow(member)
+            case actions.Follow(member, by_liveliness):
+                self.watch.follow(member, by_liveliness=by_liveliness)
             case actions.Log(level, text):
                 self._log(level, text)
             case actions.Report(event, values):

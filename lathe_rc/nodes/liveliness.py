@@ -68,11 +68,11 @@ class Watch:
         self._unheard: set[str] = set()  # by DDS
         self.silent: dict[str, float] = {}
 
-    def follow(self, member: Announcement) -> None:
+    def follow(self, member: Announcement, *, by_liveliness: bool = True) -> None:
         """Monitor a member; after an announcement from another process, monitor that process."""
         if (member.pid == os.getpid() and member.host == self._host) or self._pids.get(member.name) == member.pid:
             return
-        if member.name not in self._pids:
+        if by_liveliness and member.name not in self._pids:
             self._node.create_subscription(
                 Empty,
                 f"{member.name}/{ALIVE}",

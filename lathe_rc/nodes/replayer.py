@@ -208,6 +208,8 @@ class Replayer:
         self._topics &= set(self._publishers)
         self._publishers[_STATE] = self._node.create_publisher(CellState, _STATE, latched_qos(1))
         self._waiting[_STATE] = 0
+        # A member becomes ready once it knows that the cell is not running yet.
+        self._publishers[_STATE].publish(CellState(run_id=scenario.shared.run_id, state=CellState.WAITING))
         self._ended = CellState(run_id=scenario.shared.run_id, state=CellState.ENDED)
         self._window = scenario.shared.window
         self._master = f"/{remapped(cell.master.shared, 'encoder')}"

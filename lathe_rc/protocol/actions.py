@@ -32,9 +32,10 @@ class TellTime(NamedTuple):
 
 
 class Follow(NamedTuple):
-    """Monitor a member: the liveliness of its topic ``alive``, and its process."""
+    """Monitor a member: its process and, between time master and members, the ``liveliness`` of its topic ``alive``."""
 
     member: Announcement
+    liveliness: bool
 
 
 class MembersChanged(NamedTuple):

@@ -174,7 +174,7 @@ class MemberProtocol:
         self.members[member.name] = member
         if member.members:
             self._hear_master(member, now)
-        self.actions.append(do.Follow(member))
+        self.actions.append(do.Follow(member, bool(member.members or self.own.members)))
         peers = self.master.members if self.master else ()
         if len(self.members) > _MOST_MEMBERS:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
