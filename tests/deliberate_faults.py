@@ -28,8 +28,8 @@ class Fault(NamedTuple):
 FAULTS = (
     Fault(
         "member",
-        "            return MemberState.READY  # for",
-        "            return MemberState.WIRED  # for",
+        "            return MemberState.READY",
+        "            return MemberState.WIRED",
         "a member is ready and does not say so",
     ),
     Fault(
