@@ -806,7 +806,9 @@ def violations(cell: Simulation) -> list[str]:
         recorders = [p for p in everyone if p.design.records and p.blocks == cell.length]
         if not recorders and not cell.killed:
             found.append("no recorder has every block")
-    causes = [str(process.protocol.failure) for process in everyone if process.protocol.failure]
+    # A new process of a killed member may be too late for the end of the run.
+    failed = [process for process in everyone if process.protocol.failure and process.design.name not in cell.killed]
+    causes = [str(process.protocol.failure) for process in failed]
     if causes and not any(name in text for name in to_blame for text in causes):
         found.append(f"none of {causes} names {sorted(to_blame)}")
     return found
