@@ -145,9 +145,6 @@ FAULTS = (
         "a safe state has no end of its own",
     ),
     Fault(
-        "time_master", "        self._say(Phase.ENDED, self.samples, self._why)\n", "", "the end of the run is not told"
-    ),
-    Fault(
         "time_master",
         'self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)',
         "self._lose({next(iter(self.completed)): why}, now)",
