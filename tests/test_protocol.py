@@ -9,6 +9,7 @@ from simulation import play
 from lathe_rc import messages
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import (
+    SILENCE,
     Announcement,
     BlockOrder,
     CellState,
@@ -201,6 +202,18 @@ def test_a_member_that_computes_blocks_once_more_is_not_silent(restarts):
     protocol.hear_progress(Progress("", "/c", 2, 8, 5), 0.07)
     protocol.look(0.13, {}, ())
     assert ("stall" in reports(protocol)) == (not restarts)
+
+
+def test_a_silent_time_master_is_named_as_soon_as_the_blocks_in_flight_are_over(tool):
+    """The node looks again at that moment, and not at its next period."""
+    tool.hear_member(SPINDLE, 100.0)
+    tool.hear_cell_state(CellState("", Phase.RUNNING, 0), 100.0)
+    tool.computed(1, 64, 100.05, last=False)
+    tool.look(100.1, {"/spindle": 100.08}, ())
+    assert "stall" not in reports(tool)
+    assert tool.look_due == pytest.approx(100.05 + SILENCE)
+    tool.look(tool.look_due + 1e-6, {"/spindle": 100.08}, ())
+    assert "stall" in reports(tool)
 
 
 def test_the_schedule_makes_up_half_a_window_and_slips_by_more():

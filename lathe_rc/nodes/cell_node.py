@@ -358,6 +358,7 @@ class CellNode(LifecycleNode):
         protocol = self.protocol
         self.watch.look()
         protocol.look(time.monotonic(), self.watch.silent, self.watch.ended())
+        self.next_tick = min(self.next_tick, protocol.look_due)
         if protocol.wants_match:
             protocol.matched(list(graph.unmatched(self, self.inlets, self.outlets, protocol, self.exchange)))
         elif protocol.master is None:

@@ -52,6 +52,7 @@ class MemberProtocol:
         patience: longest wait for acknowledgements [s].
         silent: time since which a member is silent or stopped [s], by name.
         ended: members whose process on this machine has ended.
+        look_due: time at which the next `look` is due, if that is earlier than the node's period [s].
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class MemberProtocol:
         self.patience = PATIENCE
         self.silent: Mapping[str, float] = {}
         self.ended: Collection[str] = ()
+        self.look_due = math.inf
         self._started = self._beginning = self._leaving = False
         self.progress_step = max(1, window // 4)
         self._reported_blocks = 0
@@ -156,7 +158,7 @@ class MemberProtocol:
         if self.safe:
             return MemberState.SAFE
         if self.ready and self.master is not None and self.own.name in self.master.members:
-            return MemberState.READY  # an observer, for a time master that does not name it
+            return MemberState.READY  # a member that the time master does not name is an observer
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
     def hear_member(self, member: Announcement, now: float) -> None:
@@ -257,7 +259,7 @@ class MemberProtocol:
         self.done = True
 
     def members_changed(self, now: float) -> None:
-        """Request an update of the node after a new announcement."""
+        """React to a new announcement; only a time master does."""
 
     def member_failed(self, member: Announcement, now: float) -> None:
         """Handle the failure of a member; once the cell may be running, the time master decides on the reaction."""
@@ -416,7 +418,7 @@ class MemberProtocol:
             silent: time since which each silent or stopped member has been so [s].
             ended: members whose process on this machine has ended.
         """
-        self.silent, self.ended = silent, ended
+        self.silent, self.ended, self.look_due = silent, ended, math.inf
         if now >= self._leave_due:
             self.leave()
         if not self._started or self.done:
@@ -468,6 +470,7 @@ class MemberProtocol:
         silent = self.phase == Phase.RUNNING and name in self.silent
         if silent and not self._master_stalls:
             if now - self._moved < SILENCE:  # blocks in flight are still being computed
+                self.look_due = self._moved + SILENCE
                 return
             self._tell_stall(name, self._reported_blocks)
         self._master_stalls = silent
