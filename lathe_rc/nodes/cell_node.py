@@ -481,16 +481,8 @@ class CellNode(LifecycleNode):
         def call(message: Any) -> None:
             self.handled += 1
             self.due = True
-            if not self._host or (self.protocol.failure and not always):
-                return
-            try:
-                callback(message)
-            except ForeignMessage as refused:
-                self._refuse(refused)
-            except LatheError as error:
-                self.fail(error)
-            if self.protocol.actions:
-                self._perform_actions()
+            if self._host and (always or not self.protocol.failure):
+                self.attempt(partial(callback, message))
 
         return call
 

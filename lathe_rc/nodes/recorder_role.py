@@ -185,7 +185,7 @@ class RecorderRole:
         if not alone and (self._queues or not self.node.protocol.complete):
             return
         before = len(self._queues) + len(self._sparse)
-        for name in self._peers():
+        for name in self.node.protocol.names:
             member = members[name]
             for topic, msgtype, sparse in zip(member.publishes, member.types, member.sparse, strict=True):
                 if topic not in self._queues and topic not in self._sparse:
@@ -209,11 +209,6 @@ class RecorderRole:
             )
         self.node.describe(subscribes=tuple(self.subscriptions()))
 
-    def _peers(self) -> list[str]:
-        """Return the members; with a spindle that runs alone, all announced nodes."""
-        protocol = self.node.protocol
-        return list(protocol.members if protocol.master is None else protocol.master.members)
-
     def _prepare(self, snapshots: Snapshots, dense: dict[str, tuple[str, str]]) -> None:
         names = [name.removeprefix(self.node.namespace) for name in self.node.protocol.members]
         needed = snapshots.prepare(dense, names)
@@ -221,7 +216,7 @@ class RecorderRole:
 
     def _explain(self) -> None:
         """Store the scenario in the bag, with the parameters that the members announce."""
-        tables, _ = self.node.announced(self._peers())
+        tables, _ = self.node.announced(self.node.protocol.names)
         if tables:
             host = [self.node.topic(topic) for topic in _HOST_TOPICS]
             self._open.tell(provenance.tell(Scenario(self.table.run_id or "cell", tables), host))

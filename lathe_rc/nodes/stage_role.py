@@ -107,7 +107,7 @@ class StageRole:
     def members_changed(self) -> None:
         """Set the expected source of each input from the members' announcements, before its first block."""
         protocol = self.node.protocol
-        peers = protocol.master.members if protocol.master else tuple(protocol.members)
+        peers = protocol.names
         for name in peers:
             member = protocol.members.get(name)
             for topic in member.publishes if member else ():

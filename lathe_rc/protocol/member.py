@@ -281,6 +281,11 @@ class MemberProtocol:
     # ---- until block 0 ------------------------------------------------------------------------------
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the cell's members; without a time master, of all nodes that announced themselves."""
+        return self.master.members if self.master else tuple(self.members)
+
+    @property
     def complete(self) -> bool:
         """Return True if the time master and all members that it names have announced themselves."""
         return self.master is not None and all(name in self.members for name in self.master.members)
