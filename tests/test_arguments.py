@@ -135,3 +135,18 @@ def test_a_parameter_that_something_else_overrules_is_refused(domain, tmp_path, 
     """ROS keeps quiet about it."""
     with pytest.raises(InputError, match=r"^-p (tool:)?feed:=2\.0 does not reach (/left)?/tool, which " + said):
         feed_of(tmp_path, words, file)
+
+
+def test_a_process_whose_exit_hangs_ends_with_its_code():
+    program = (
+        "import ctypes\n"
+        "from lathe_rc.nodes import arguments\n"
+        "class Hanging:\n"
+        "    def __del__(self, pause=ctypes.PyDLL(None).pause):\n"
+        "        pause()  # holds the interpreter, as a destructor of DDS does\n"
+        "hanging = Hanging()\n"
+        "arguments._LONGEST_END = 1\n"
+        "arguments.exit_with(lambda: print('said') or 3)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "said\n")

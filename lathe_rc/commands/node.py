@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands ``lathe node`` and ``lathe container``: nodes in this process, as with ``ros2 run``."""
 
-import sys
 from collections.abc import Sequence
 
 import click
@@ -37,7 +36,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     if kind not in TABLES:
         raise InputError(f"no node {kind!r}; {TABLES.instead(kind)}")
     if not help_or_refusal(f"lathe node {name}", own, TABLES[kind], arguments):
-        sys.exit(_nodes([name, *arguments]))
+        _run([name, *arguments])
 
 
 @click.command(cls=_PassingThrough, context_settings=_PASS_THROUGH)
@@ -45,12 +44,8 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
 @options.allow_code
 def container(arguments: tuple[str, ...]) -> None:
     """Run several nodes in one process: NODE[:STAGE]... [--ros-args ...]."""
-    sys.exit(_nodes(arguments))
+    _run(arguments)
 
 
-def _nodes(arguments: Sequence[str]) -> int:
-    process = load("lathe_rc.nodes.process")
-    try:
-        return int(process.run(*process.split(arguments)))
-    finally:
-        process.arguments.bound_the_end()
+def _run(arguments: Sequence[str]) -> None:
+    load("lathe_rc.nodes.process").run_and_exit(arguments)

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command line of a node's executable: help, and the errors that ROS does not report; imports no ROS."""
 
+import atexit
+import ctypes
 import json
-import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +19,8 @@ from lathe_rc.errors import InputError, LatheError
 ROS = "--ros-args"  #: the arguments after it are for ROS
 _TAKEN = f"allowed: --help, or {ROS} and what ROS takes: --params-file FILE, -p PARAM:=VALUE, -r OLD:=NEW"
 
-_LONGEST_END = 20  # [s] that destructors may take
+_LONGEST_END = 10  # [s] that destructors may take
+_THREAD = 2  # SIGEV_THREAD: a timer calls a function
 
 
 class Rule(NamedTuple):
@@ -113,14 +116,33 @@ def exit_with(work: Callable[[], int]) -> NoReturn:
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         code = error.exit_code
-    bound_the_end()
+    atexit.register(_bound_the_end, code)
     sys.exit(code)
 
 
-def bound_the_end() -> None:
-    """Kill this process by SIGALRM if its exit hangs: about one in some hundred exits of Fast DDS deadlocks."""
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(_LONGEST_END)
+class _Notification(ctypes.Structure):
+    """``struct sigevent`` of glibc with a function: its value, signal, kind, function and attributes."""
+
+    _fields_ = (
+        ("value", ctypes.c_long),
+        ("signal", ctypes.c_int),
+        ("kind", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 40),
+    )
+
+
+def _bound_the_end(code: int) -> None:
+    """Let a timer end this process if its exit hangs: about one in some hundred exits of Fast DDS deadlocks.
+
+    The timer calls ``_exit`` with the exit code in a thread of its own. A handler in Python would need the
+    interpreter, which waits for the destructor that hangs; a signal alone would lose the exit code.
+    """
+    libc = ctypes.CDLL(None)
+    end = ctypes.cast(libc["_exit"], ctypes.c_void_p)
+    timer = ctypes.c_void_p()
+    libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(_Notification(code, 0, _THREAD, end)), ctypes.byref(timer))
+    libc.timer_settime(timer, 0, (ctypes.c_long * 4)(0, 0, _LONGEST_END, 0), None)  # interval and first time: s, ns
 
 
 def rules(words: Sequence[str]) -> Iterator[Rule]:

@@ -15,7 +15,7 @@ def main() -> NoReturn:
         print(f"usage: ros2 run lathe_rc container NAME[:STAGE] ... [{arguments.ROS} ...]")
         print(f"stages: {TABLES.allowed()}; ros2 run lathe_rc STAGE --help lists the parameters of one")
         sys.exit(0)
-    arguments.exit_with(lambda: process.run(*process.split(words)))
+    process.run_and_exit(words)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import signal
 import socket
 import sys
 import time
-from typing import Any
+from typing import Any, NoReturn
 
 from lathe_rc.nodes.report import VARIABLE
 
@@ -38,8 +38,8 @@ def _load(nodes: dict[str, Any]) -> None:
     gc.freeze()  # the collector skips objects shared with forked processes
 
 
-def _become(request: dict[str, Any], report: int, log: int) -> int:
-    """Turn a freshly forked process into a process of a cell; return its exit code."""
+def _become(request: dict[str, Any], report: int, log: int) -> NoReturn:
+    """Turn a freshly forked process into a process of a cell."""
     os.setsid()
     os.chdir(request["folder"])
     os.environ.clear()
@@ -52,10 +52,8 @@ def _become(request: dict[str, Any], report: int, log: int) -> int:
         os.execvpe(request["command"][0], request["command"], os.environ)
     sys.path[:] = request["path"]  # third-party modules are found as by the launcher
     process = importlib.import_module(_NODES)
-    try:
-        return int(process.run(*process.split(request["arguments"])))
-    finally:
-        process.arguments.bound_the_end()
+    process.run_and_exit(request["arguments"])
+    raise AssertionError("a process of a cell exits by itself")
 
 
 def _reap_children(line: socket.socket, children: dict[int, int]) -> None:
@@ -73,7 +71,7 @@ def serve(line: socket.socket) -> int:
     """Fork processes on request until the launcher has gone.
 
     Returns:
-        The exit code, in the server as well as in each forked process.
+        The exit code of the server.
     """
     children: dict[int, int] = {}  # process number by pidfd, which is readable once the process has ended
     while True:
@@ -99,7 +97,7 @@ def serve(line: socket.socket) -> int:
         if not (pid := os.fork()):
             for other in (line.detach(), *children):
                 os.close(other)
-            return _become(request, *descriptors)
+            _become(request, *descriptors)
         process = os.pidfd_open(pid)
         children[process] = pid
         with contextlib.suppress(BrokenPipeError):

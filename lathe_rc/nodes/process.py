@@ -257,6 +257,11 @@ def split(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[str]]:
     return [(name, kind or name) for name, _, kind in parts], rest
 
 
+def run_and_exit(words: Sequence[str]) -> NoReturn:
+    """Run the nodes of a command line (see `split`), and exit."""
+    arguments.exit_with(lambda: run(*split(words)))
+
+
 def main(kind: str) -> NoReturn:
     """Run the executable of one kind of node, and exit."""
     arguments.executable(kind, TABLES[kind], lambda words: run([(kind, kind)], words))
