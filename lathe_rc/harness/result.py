@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part
 from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.cell.latency_histogram import Lateness
@@ -46,6 +47,8 @@ class Result:
             with a remedy, from the check before the start.
         margins: stability margin by learning controller, 1 less the largest factor of a cycle over all frequencies
             and speeds (sup|Q - γZ| of repetitive control) [1]; None for a law without a factor.
+        drive_margins: smallest relative error of the drive's response, at one frequency, with which learning diverges,
+            by learning controller.
         lateness: lateness of the blocks; None if the run had no pace, as offline or with a ``speed_factor`` of 0.
 
     Example:
@@ -74,6 +77,7 @@ class Result:
     unchecked: Sequence[str] = ()
     warnings: Sequence[str] = ()
     margins: Mapping[str, float | None] = field(default_factory=dict)
+    drive_margins: Mapping[str, DriveMargin] = field(default_factory=dict)
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -190,6 +194,7 @@ class Result:
             "unchecked": list(self.unchecked),
             "warnings": list(self.warnings),
             "stability_margin": dict(self.margins),
+            "drive_margin": {name: margin._asdict() for name, margin in self.drive_margins.items()},
             "error_um": {
                 "first": of(0),
                 "last": of(-1),

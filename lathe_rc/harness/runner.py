@@ -83,7 +83,13 @@ def run(
 
         refuse_existing(place)
     result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
-    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
+    result = replace(
+        result,
+        unchecked=cell.unchecked,
+        warnings=cell.warnings,
+        margins=cell.margins,
+        drive_margins=cell.drive_margins,
+    )
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
 

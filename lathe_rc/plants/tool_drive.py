@@ -191,7 +191,9 @@ class ToolDrive:
         spring, damper = natural_frequency**2, 2.0 * damping * natural_frequency
         base, tool, mass_of_tool = mass.edge, mass.edge, moving_mass
         count = mass.command.size
-        place = np.arange(count, dtype=np.int64)  # of the carriage in the state; the tool on a piezo comes behind its sensor
+        place = np.arange(
+            count, dtype=np.int64
+        )  # of the carriage in the state; the tool on a piezo comes behind its sensor
         stiff = loss = 0.0
         if piezo:
             place[2:] += 2
