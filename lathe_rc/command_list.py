@@ -14,6 +14,7 @@ COMMANDS = {
     "completion": "Make the shell complete the command line.",
     "container": "Run several nodes in one process.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
+    "design": "Find the learning law of a scenario for a measured drive.",
     "export": "Export a recording as CSV, Parquet or NPZ.",
     "fit": "Fit models to measurements.",
     "measure": "Measure the part that a recorded run has turned.",

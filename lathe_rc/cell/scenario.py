@@ -260,18 +260,25 @@ class Scenario:
                     found[name] = _with_element(target, before, element, given_value)
                 else:
                     found[name] = given_value
-        tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
-        given = "run_id" in values or not self._has_own_run_id
+        tables = dict(self.nodes)
         for node, changed in changes.items():
             tables[node] = self.nodes[node].changed(node, changed)
+        return self._with(tables, given="run_id" in values or not self._has_own_run_id)
+
+    def with_node(self, node: str, table: NodeParameters) -> "Scenario":
+        """Return the same cell with another table of a node, whose kind may differ."""
+        return self._with({**self.nodes, node: table}, given=not self._has_own_run_id)
+
+    def _with(self, tables: Mapping[str, NodeParameters], *, given: bool) -> "Scenario":
+        """Return the cell with other tables; ``given``: whether its run id is set explicitly."""
         # A changed drive changes the models of its controllers, unless these are given.
         tables = models.resolved(tables)
         other = {node: table for node, table in tables.items() if table is not self.nodes[node]}
         if given and (run_id := next(iter(tables.values())).run_id):
             # With a given run id, changed tables are hashed only when the identity is requested.
-            known = {node: told for node, told in fingerprints.items() if node not in other}
+            known = {node: told for node, told in self.fingerprints.items() if node not in other}
             return _agreed(self.name, tables, known, run_id)
-        fingerprints |= {node: _fingerprint(table) for node, table in other.items()}
+        fingerprints = {**self.fingerprints, **{node: _fingerprint(table) for node, table in other.items()}}
         return _agreed(self.name, tables, fingerprints, _identity(fingerprints))
 
     def to_yaml(self, *, given: bool = False) -> str:
