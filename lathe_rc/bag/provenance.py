@@ -31,6 +31,7 @@ FILE = "lathe_rc.file."  #: prefix of NODE.PARAM: content of the file that the p
 ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are any
 HELD = "lathe_rc.held"  #: by topic of a lost node, the sample from which its last value was repeated
 RECOVERED = "lathe_rc.recovered"  #: report of a recovery, with the losses
+COPIED = "lathe_rc.copied"  #: number of messages copied from each of other bags
 _MOST_FILE = 2**19  # longest such file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # displayed characters of a hash
