@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of ``lathe`` by name, with their summaries; the module of a command is imported on demand."""
+"""Names and summaries of the ``lathe`` commands; a command's module is imported on demand."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -30,8 +30,8 @@ COMMANDS = {
     "sweep": "Compute many variations of a scenario into a table.",
     "tune": "Search the parameters of a scenario that meet goals best.",
     "view": "Show a bag in Rerun.",
-}  #: their summaries
-_BESIDES = {"container": "node"}  # commands in the module of another command
+}  #: summaries of the commands, by name
+_BESIDES = {"container": "node"}  # commands defined in another command's module
 
 
 def imported(name: str) -> "click.Command":
