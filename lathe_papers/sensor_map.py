@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effect of encoder and position-sensor errors on a law that does not know the speed, against the variable lead.
+"""Effect of encoder and position-sensor errors on a law that does not know the speed, compared with the variable lead.
 
 The cell of `lathe_papers.speed_deviation` runs with a frozen memory, with the variable lead of paper 000 (eq. 20) and
 with ``disturbance_controller``, for combinations of encoder counts, noise, frequency of the deviation, harmonic of the
-profile and seed. Some encoder counts give a small-integer ratio of counts per sample; the check before a start warns
-of them.
+profile and seed. Some encoder counts give a small-integer ratio of counts per sample; the pre-start check warns about
+them.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 
 _BEGINS = 3.0  # [s] start of the deviation, after 50 revolutions at constant speed
 _SHOWN = 1.0  # [s] duration of the deviation
-_GOLDEN = 0.6180339887  # fraction of a revolution by which the start of the deviation shifts per seed
+_GOLDEN = 0.6180339887  # shift of the deviation's start from seed to seed, in revolutions
 _PLAIN, _OURS = "speed_deviation", "robust"  # scenarios
 _FREE: Mapping[str, Value] = {  # the study assumes the linear drive, without its limits
     "electrodynamic_actuator.max_velocity": 1e3,
@@ -74,7 +74,7 @@ class SensorMapResult:
         plain: errors of the variable lead.
         ours: errors of ``disturbance_controller``.
         floor: errors of the variable lead at constant speed, shape (counts, noise, harmonics).
-        warned: whether the check before a start warns of the encoder counts, shape (counts,).
+        warned: whether the pre-start check warns about the encoder counts, shape (counts,).
     """
 
     parameters: SensorMapParameters
@@ -129,7 +129,7 @@ class SensorMapResult:
         return Group(*tables, *told)
 
     def draw(self, figure: "Figure") -> None:
-        """Draw one map per harmonic, counts over frequency, at the middle of the given noise levels."""
+        """Draw one map per harmonic, of counts against frequency, at the middle one of the given noise levels."""
         given = self.parameters
         noise = len(given.noise_nm) // 2
         panels = np.atleast_1d(figure.subplots(1, len(given.harmonics), sharey=True))
@@ -157,7 +157,7 @@ class _Largest:
         self._largest = 0.0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Update the largest error with a chunk, from the start of the deviation."""
+        """Update the largest error with a chunk; samples before the start of the deviation are ignored."""
         error = dense[self._tool]["error"][max(self._begins - first, 0) :]
         self._largest = max(self._largest, float(np.abs(error).max(initial=0.0)) * 1e6)
 
@@ -214,7 +214,7 @@ def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapR
 
 
 def _warned(parameters: SensorMapParameters, counts: int) -> bool:
-    """Whether the check before a start warns of an encoder with this number of counts."""
+    """Whether the pre-start check warns about an encoder with this number of counts."""
     cell = Cell(cells.load(_OURS).nodes)
     nominal, law = cell.master.shared.nominal_speed, cell.stages["disturbance_controller"]
     assert isinstance(law, Learner), "it commands the drive"

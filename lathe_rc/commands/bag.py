@@ -25,17 +25,17 @@ from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.names import instead
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)
-_LOSSY = LossyRunError.exit_code  # if messages are missing
+_LOSSY = LossyRunError.exit_code  # exit code if messages are missing
 _SIMULATED = 10**17  # [ns] upper bound of simulated time: three years; the system clock passed it in 1973
 
 
 @click.group()
 def bag() -> None:
-    """Ask bags: what is in them, are they whole; save what is left of a broken one; take the tachogram out."""
+    """Inspect, verify and recover bags, and extract the tachogram."""
 
 
 def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the first and last revolution of the part, if the bag has one; memory use does not grow with the bag."""
+    """Return the numbers of the part's first and last revolution; None without a part. Memory use is bounded."""
     if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
         return None
     ends = part.FirstAndLast(types)
@@ -49,9 +49,9 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @options.as_json
 @click.pass_context
 def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
-    """Topics, rates, span, scenario and the form error of the part.
+    """Show topics, rates, time span, scenario and the form error of the part.
 
-    Of a damaged bag: what can be read of it, and the damage; exit code 3.
+    For a damaged bag, show the readable content and the damage; exit code 3.
     """
     with Source(path, partial=True) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
@@ -133,8 +133,8 @@ def _date(log_ns: int) -> str | None:
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     """Verify sequence, gaps, numbers, checksums and recorded digests.
 
-    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read. Code and files that it names and
-    does not hold get a line each.
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: not a bag, or unreadable. Code and files that the bag names but does not
+    contain are listed, one per line.
     """
     found = check_bag(path)
     summary = {
@@ -166,7 +166,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
 @options.as_json
 @click.pass_context
 def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
-    """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
+    """Copy the intact content of a damaged bag to a new one; exit code 0: no message is missing, 3: some are."""
     target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
     found = recover_bag(path, target)
     summary = {

@@ -40,14 +40,14 @@ def recover(path: Path, target: Path) -> Salvage:
 
     Args:
         path: folder or file of the damaged bag.
-        target: folder of the new bag; must not exist. It is removed again if the recovery fails.
+        target: folder of the new bag; must not exist yet, and is removed if the recovery fails.
 
     Returns:
         The recovered content and the damage found.
 
     Raises:
         InputError: there is nothing to read, or the target exists.
-        LatheError: writing to the disk or reading from it fails.
+        LatheError: reading from or writing to the disk fails.
     """
 
     def about(salvage: Salvage) -> dict[str, str]:
@@ -132,7 +132,7 @@ def _copy(salvages: Sequence[Salvage], writer: BagWriter, choice: Choice) -> Non
 
 
 def mend(path: Path) -> Salvage | None:
-    """Complete a bag in place: add index and metadata for every message that reached the disk.
+    """Complete a bag in place: add an index and metadata for all messages that reached the disk.
 
     Args:
         path: folder of the bag.

@@ -24,7 +24,7 @@ from lathe_rc.signals.profile_table import deviation_along, height_along, tabula
 from lathe_rc.signals.tip_path import TipPath
 
 _OWN = ("harmonics", "piston", "polygon", "csv")
-#: by name, those of other packages: ours have parameters of their own
+#: third-party profiles, by name; built-in profiles have parameters of their own
 PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc.profiles")
 
 
@@ -77,8 +77,8 @@ class FormParameters(NodeParameters):
         """Return the profile of a node.
 
         Raises:
-            InputError: lists differ in length, sizes do not fit, a file cannot be used, or a third-party profile
-                is invalid.
+            InputError: lists differ in length, dimensions do not fit together, a file cannot be used, or a third-party
+                profile is invalid.
         """
         if self.profile not in _OWN:
             make: Callable[..., PartProfile] = PROFILES[self.profile]
@@ -104,7 +104,7 @@ class FormParameters(NodeParameters):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
 
-FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of its parameters
+FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters
 
 
 class FormTable(NamedTuple):
@@ -114,8 +114,8 @@ class FormTable(NamedTuple):
         heights, table: required tool position, see `lathe_rc.signals.profile_table.ProfileTable`.
         told: table of the tool position assumed by the controllers.
         alike: whether both tables are equal.
-        slide: number of the first input of the longitudinal slide, if it determines the height; 0: it does not.
-        feed, start, part: height without a slide, see `lathe_rc.signals.profile_table.height_along`.
+        slide: index of the first input of the longitudinal slide if the slide determines the height, otherwise 0.
+        feed, start, part: parameters of the height without a slide, see `lathe_rc.signals.profile_table.height_along`.
     """
 
     heights: Samples
@@ -130,7 +130,7 @@ class FormTable(NamedTuple):
 
 @kernel
 def equal(one: Samples, other: Samples) -> bool:
-    """Return whether two signals of shape (n,) are equal, sample by sample."""
+    """Return whether two signals of shape (n,) are equal in every sample."""
     differs = False
     for k in range(one.size):
         differs |= one[k] != other[k]
@@ -139,7 +139,7 @@ def equal(one: Samples, other: Samples) -> bool:
 
 @kernel
 def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> None:
-    """Fill the height [m] at an angle [rad] or position of the longitudinal slide [m]."""
+    """Fill the height [m] at an angle [rad] or at a position of the longitudinal slide [m]."""
     if form.slide:
         for k in range(height.size):
             height[k] = form.start + slide[k]
@@ -151,9 +151,9 @@ def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> 
 def evaluate(
     form: FormTable, inputs: tuple[Samples, ...], reference: Samples, expected: Samples, height: Samples
 ) -> None:
-    """Fill the desired displacement, the controllers' estimate of it, and the height [m], each of shape (n,).
+    """Fill the desired displacement, the controllers' estimate of it, and the height [m], shape (n,) each.
 
-    The inputs of the `Form` are the first of ``inputs``.
+    The first of ``inputs`` are those of the `Form`.
     """
     angle, angle_true = inputs[0], inputs[1]
     position, measured = angle_true, angle
@@ -161,11 +161,11 @@ def evaluate(
         position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
-    # Equal angles give bit-identical results: the angle of an ideal encoder is evaluated once.
+    # Equal angles give bit-identical results, so the form is evaluated only once for an ideal encoder.
     if form.alike and equal(angle, angle_true) and equal(position, measured):
         put(expected, reference)
     else:
-        # The result array holds the height first, which is copied before the result is written.
+        # The result array first contains the height, which is copied before the result is written.
         _place(form, angle, measured, expected)
         deviation_along(form.heights, form.told, angle, expected.copy(), expected)
 
@@ -179,13 +179,13 @@ class Form:
 
     Attributes:
         surface: table of the form of the part.
-        profile: table of the path of the drives: the form, or the path of a round tip.
+        profile: table of the path of the drives, which is the form or the path of a round tip.
         inputs: input ports.
         table: table for `evaluate`.
-        doubts: warnings about the form's file, one line each.
+        doubts: warnings about the file of the form, one line each.
 
     Raises:
-        InputError: see `FormParameters.form`; the tip does not fit into the form; or a slide would have to restart.
+        InputError: as for `FormParameters.form`, or the tip does not fit the form, or a slide would have to restart.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
@@ -218,7 +218,7 @@ class Form:
 
 @kernel
 def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Evaluate desired form and height of one block."""
+    """Evaluate the desired form and the height of one block."""
     reference, expected, height = outputs
     evaluate(memory, inputs, reference, expected, height)
     return height.size, DONE
@@ -246,10 +246,10 @@ class ProfileStage(Stage):
         )
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the form's file, one line each."""
+        """Return the warnings about the file of the form, one line each."""
         return self.form.doubts
 
     @property
     def memory(self) -> FormTable:
-        """Current memory of the step of the profile stage."""
+        """Current state of the profile stage's step function."""
         return self.form.table

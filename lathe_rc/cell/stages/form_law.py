@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common part of laws with a known form of the part, fed forward through the inverse of the drive.
+"""Common part of laws that know the form of the part and feed it forward through the inverse of the drive.
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
@@ -32,15 +32,15 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
 
-#: counts per sample at which the error is 2 to 8 times that beside them; at others it is less, see docs/robust.md
+#: counts per sample at which the error is 2 to 8 times as large as nearby; other ratios matter less, see docs/robust.md
 _BAD = frozenset(Fraction(p, m) for p in (1, 2, 3) for m in (1, 2, 3))
-_CLEAR = _BAD | {Fraction(n) for n in (4, 5)} | {Fraction(1, n) for n in (4, 5)}  # a named sample rate is at none of
-#: [Hz] whole kHz whose step is a whole number of ns
+_CLEAR = _BAD | {Fraction(n) for n in (4, 5)} | {Fraction(1, n) for n in (4, 5)}  # a suggested sample rate avoids these
+#: sample rates in whole kHz whose step is a whole number of ns [Hz]
 _RATES = [1000 * kilo for kilo in range(1, 1001) if 1_000_000 % kilo == 0]
 
 
 class FormLawParameters(LawParameters, FormParameters):
-    """Form, encoder and drive model of the law; values not given are those of the cell."""
+    """Form, encoder and drive model of the law; values that are not given are those of the cell."""
 
     asks: ClassVar[tuple[frozenset[str], ...]] = (FORM, frozenset({"encoder_counts"}))
 
@@ -61,7 +61,7 @@ class FormLawParameters(LawParameters, FormParameters):
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     def known(self) -> Mapping[str, Value]:
-        """Empty mapping: the law asks for the form instead of providing it."""
+        """Empty mapping, since the law asks for the form instead of providing it."""
         return {}
 
     @property
@@ -82,7 +82,7 @@ class ForwardTable(NamedTuple):
         spindle: filter of the spindle angle.
         form: form of the part.
         a1, a2, ahead: coefficients and lead time of the model [s, s², s].
-        late: delay of the error [sample].
+        late: delay of the error [samples].
     """
 
     spindle: AngleFilterTable
@@ -101,7 +101,7 @@ class FormLaw(Law):
         form: form that the drive must follow.
 
     Raises:
-        InputError: the height along the part is that of a slide, which cannot be previewed.
+        InputError: a slide determines the height along the part, which therefore cannot be previewed.
     """
 
     parameters: FormLawParameters
@@ -120,7 +120,7 @@ class FormLaw(Law):
         super().__init__(name, parameters)
 
     def make_filter(self) -> AngleFilterTable:
-        """Return the filter of the spindle angle before sample 0."""
+        """Return the filter of the spindle angle in its initial state, before sample 0."""
         return self._filter(self.parameters.step, self.parameters.encoder_counts)
 
     def _filter(self, step: float, counts: int) -> AngleFilterTable:
@@ -130,13 +130,13 @@ class FormLaw(Law):
         )
 
     def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """Return a warning about encoder counts per sample near a ratio of small numbers."""
+        """Return a warning about encoder counts per sample near a ratio of small integers."""
         rate = self.parameters.sample_rate
         spindle = self._filter(1.0 / rate, counts)
         ratio = followed_ratio(spindle, low, high, _BAD)
         if ratio is None:
             return []
-        # Nearest rates first, and higher before lower ones, which read the encoder less often.
+        # Nearest rates first, and higher rates before lower ones, which read the encoder less often.
         near = [each for each in _RATES if rate / 2 <= each <= rate * 2]
         rates = sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate))))
         cure = next(
@@ -155,14 +155,14 @@ class FormLaw(Law):
         return [what]
 
     def make_forward(self) -> ForwardTable:
-        """Return the feed-forward before sample 0."""
+        """Return the feed-forward in its initial state, before sample 0."""
         parameters = self.parameters
         return ForwardTable(
             self.make_filter(), self.form, *parameters.inverse, parameters.model_delay, parameters.feedback_delay
         )
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """Return the largest delay, half a revolution [sample], since delayed and learned errors must not meet."""
+        """Return the largest delay, half a revolution [samples], since delayed and learned errors must not meet."""
         return int(np.pi / (speed * self.parameters.step))
 
 

@@ -51,18 +51,18 @@ class ToolParameters(FormParameters):
     judging = frozenset({"tolerance"})
 
     def known(self) -> Mapping[str, Value]:
-        """Form of the part for laws, unless a profile node provides it."""
+        """Form of the part for control laws, unless a profile node provides it."""
         return super().known() if self.reference == "own" else {}
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the tool.
+    """State of the tool's step function.
 
     Attributes:
         form: form of the part; without a table if a profile node provides it.
-        begin: number of the first input of the drives.
+        begin: index of the first input of the drives.
         drives: number of drives, each with a true and a measured position.
-        cross_slide, deflects: whether cross slide and edge deflection follow the drives.
+        cross_slide, deflects: whether inputs of the cross slide and the edge's deflection follow those of the drives.
     """
 
     form: FormTable
@@ -83,7 +83,7 @@ def add_drive(
     known: Samples,
     error: Samples,
 ) -> None:
-    """Add a drive's motion; all [m] and of shape (n,). The first drive, marked by ``begins``, starts the sum.
+    """Add the motion of a drive; all arrays in m, shape (n,). The first drive (``begins``) starts the sum.
 
     The error is Xd - X of the true signals (paper 000, Fig. 1); the known error is the expected form at the measured
     angle minus the measured motions.
@@ -96,7 +96,7 @@ def add_drive(
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Sum the motions of one block, and compare them with the form."""
+    """Sum the motions of one block, and compare the sum with the form."""
     reference, displacement, error, known, height = outputs
     if memory.form.heights.size:
         evaluate(memory.form, inputs, reference, known, height)
@@ -156,7 +156,7 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the form's file, one line each."""
+        """Return the warnings about the file of the form, one line each."""
         return self.form.doubts if self.form else []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
@@ -187,10 +187,10 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the tool stage."""
+        """Current state of the tool's step function."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
-        # A form has two fields in each of its inputs; a profile node has three.
+        # Each input of a form has two fields; that of a profile node has three.
         begin = 3 if self.form is None else 2 * len(self.form.inputs)
         return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
 
