@@ -73,6 +73,7 @@ setup(
             "lathe = lathe_rc.cli:main",
             *(f"{node} = lathe_rc.nodes.executables:{node}" for node in (*NODES, *ALONE)),
         ],
+        "lathe_rc.stages": ["adrc = lathe_papers.adrc:Adrc"],
         "lathe_rc.studies": [f"{study.replace('_', '-')} = lathe_papers.{study}:STUDY" for study in STUDIES],
     },
     zip_safe=False,

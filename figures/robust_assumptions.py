@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lathe_papers import cells, robust
+from lathe_papers import cells, judge, robust
 from lathe_rc.analysis.learning import Complex
 from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.wiring import Cell
@@ -34,14 +34,14 @@ bases = {
 }
 
 
-def worst(cases: Sequence[robust.Values]) -> robust.Array:
+def worst(cases: Sequence[robust.Values]) -> judge.Array:
     """Largest error of the last ten revolutions [µm] by case and seed."""
     made = [bases[seed].varied({**robust.model(), **case}) for case in cases for seed in SEEDS]
-    judged = cells.kept(made, robust.Judge, untracked)
+    judged = cells.kept(made, judge.Judge, untracked)
     return np.reshape([np.nan if each is None else each.largest[30:40].max() for each in judged], (len(cases), -1))
 
 
-def row(name: str, errors: robust.Array) -> str:
+def row(name: str, errors: judge.Array) -> str:
     """A line of the table."""
     return f"| {name} | {' '.join(f'{error:.2f}' for error in errors)} | {errors.max():.2f} |"
 
@@ -57,7 +57,7 @@ law, drive = cell.stages["controller"], cell.stages["loaded_drive"].responses()[
 frequency, damping, part = MODE
 
 
-def swings(at: robust.Array) -> Complex:
+def swings(at: judge.Array) -> Complex:
     """The drive with a mode of its frame."""
     p = 1j * at
     mode = part / (1.0 + 2.0 * damping * p / frequency + (p / frequency) ** 2)

@@ -11,31 +11,26 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
 from lathe_papers import cells
+from lathe_papers.judge import LAST, Array, Judge, figure_of, finite, worst_of
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.compound_controller import CompoundController
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.stages.resonant_controller import ResonantController
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.messages import Signals
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 Values = Mapping[str, Value]
 
-_TURN = 2.0 * np.pi
-_LAST = 10  # number of evaluated revolutions
 _SPREAD = 0.2  # relative spread of the drives
 TOLD = (1038.0, 0.804, 0.36e-3)  # nominal natural frequency [rad/s], damping and delay [s], assumed by the laws
 _MASS = 1.2  # [kg] moving mass of the nominal drive
@@ -161,8 +156,8 @@ class RobustResult:
             ("revolutions", self.settled),
             ("effort_a", self.effort),
         ):
-            found[name] = {"told": _finite(values[..., 0]), "worst": _finite(_worst(values))}
-        found["margin"] = {"told": _finite(self.margin[:, 0]), "worst": _finite(self.margin.min(axis=-1))}
+            found[name] = {"told": finite(values[..., 0]), "worst": finite(worst_of(values))}
+        found["margin"] = {"told": finite(self.margin[:, 0]), "worst": finite(self.margin.min(axis=-1))}
         return found
 
     def table(self) -> Group:
@@ -172,13 +167,13 @@ class RobustResult:
         seeds = f", worst of {self.seeds} seeds" if self.seeds > 1 else ""
         for title, values in (
             ("Largest form error of the last 10 revolutions [µm], told drive", self.largest[..., 0]),
-            (f"Largest form error of the last 10 revolutions [µm], {worst}", _worst(self.largest)),
+            (f"Largest form error of the last 10 revolutions [µm], {worst}", worst_of(self.largest)),
             ("RMS form error [µm], told drive", self.rms[..., 0]),
-            (f"RMS form error [µm], {worst}", _worst(self.rms)),
-            (f"Revolutions until within ±{self.tolerance:g} µm, {worst}; -: not at all", _worst(self.settled)),
-            (f"Effort: RMS current [A], {worst}", _worst(self.effort)),
+            (f"RMS form error [µm], {worst}", worst_of(self.rms)),
+            (f"Revolutions until within ±{self.tolerance:g} µm, {worst}; -: not at all", worst_of(self.settled)),
+            (f"Effort: RMS current [A], {worst}", worst_of(self.effort)),
         ):
-            rows = [(name, *map(_figure, row)) for name, row in zip(self.conditions, values, strict=True)]
+            rows = [(name, *map(figure_of, row)) for name, row in zip(self.conditions, values, strict=True)]
             tables += [comparison(title + seeds, ("condition", *self.laws), rows), ""]
         rows = [
             (name, *(f"{value:.2f}" for value in row))
@@ -189,10 +184,10 @@ class RobustResult:
     def draw(self, figure: "Figure") -> None:
         """Draw the largest errors by condition, and by revolution under the last condition, for the worst drive."""
         bars, course = figure.subplots(1, 2, width_ratios=(3, 2))
-        worst, width = _worst(self.largest), 0.8 / len(self.laws)
+        largest, width = worst_of(self.largest), 0.8 / len(self.laws)
         for k, (law, colour) in enumerate(zip(self.laws, _COLOURS, strict=True)):
             places = np.arange(len(self.conditions)) + (k - (len(self.laws) - 1) / 2) * width
-            bars.bar(places, worst[:, k], width, color=colour, label=law)
+            bars.bar(places, largest[:, k], width, color=colour, label=law)
             course.semilogy(self.curves[k], color=colour, lw=1.2, label=law)
         bars.set(yscale="log", ylabel="largest form error [µm], worst drive")
         bars.set_xticks(range(len(self.conditions)), self.conditions, rotation=25, ha="right", fontsize=8)
@@ -202,75 +197,6 @@ class RobustResult:
             axes.axhline(self.tolerance, color="black", lw=0.8, ls="--")
             axes.grid(visible=True, alpha=0.3)
             axes.legend(fontsize=7, ncols=2)
-
-
-def _worst(values: Array) -> Array:
-    """Return the largest value over the last axis (drives or seeds); NaN, a stopped run, counts as the worst."""
-    return np.asarray(np.where(np.isnan(values).any(axis=-1), np.nan, values.max(axis=-1)))
-
-
-def _finite(values: Array) -> list[Any]:
-    return [_finite(row) if row.ndim else (float(row) if np.isfinite(row) else None) for row in values]
-
-
-def _figure(value: float) -> str:
-    if not np.isfinite(value):
-        return "-"
-    if value == int(value):
-        return str(int(value))
-    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
-
-
-@dataclass(frozen=True)
-class _Judged:
-    """Evaluated run: largest error by revolution [µm], RMS error of the last revolutions [µm], RMS current [A]."""
-
-    largest: Array
-    rms: float
-    effort: float
-
-    def settled(self, tolerance: float) -> float:
-        """Return the revolution from which the error stays within a tolerance [µm]; inf if it never does."""
-        out = np.flatnonzero(~(self.largest <= tolerance))  # not `>`: NaN is out of tolerance, too
-        first = int(out[-1]) + 1 if out.size else 0
-        return float(first) if first < self.largest.size else np.inf
-
-
-class Judge:
-    """Recorder of the evaluated signals of a run; errors in gaps of the material are excluded.
-
-    Args:
-        cell: running cell.
-        samples: number of samples of the run.
-    """
-
-    heard = ("encoder.angle_true", "tool.error", "coarse/state.effort")
-
-    def __init__(self, cell: Cell, samples: int) -> None:
-        drive: Any = cell.stages["loaded_drive"].shared
-        self._gaps = list(zip(drive.cut_gap_start, drive.cut_gap_width, strict=True))
-        self._angle, self._error, self._current = np.empty((3, samples))
-
-    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Store angle, error and current of a chunk."""
-        part = slice(first, first + samples)
-        self._angle[part] = dense["encoder"]["angle_true"]
-        self._error[part] = dense["tool"]["error"]
-        self._current[part] = dense["coarse/state"]["effort"]
-
-    def kept(self) -> _Judged:
-        """Return error and current of the complete revolutions."""
-        error = np.abs(self._error) * 1e6
-        for start, width in self._gaps:
-            error[np.mod(self._angle - start, _TURN) < width] = 0.0
-        revolution = np.floor(self._angle / _TURN)
-        starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
-        # The run ends within a revolution, whose start only marks the end of the previous one.
-        largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
-        last = error[starts[-1 - _LAST] : starts[-1]]
-        return _Judged(
-            largest, float(np.sqrt(np.mean(last[last > 0.0] ** 2))), float(np.sqrt(np.mean(self._current**2)))
-        )
 
 
 def drives_near(count: int) -> list[tuple[float, float, float, float]]:
@@ -352,7 +278,7 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
             continue
         found = judged.largest[:revolutions]
         curves[place][: found.size] = found
-        largest[place], rms[place] = found[-_LAST:].max(), judged.rms
+        largest[place], rms[place] = found[-LAST:].max(), judged.rms
         settled[place], effort[place] = judged.settled(parameters.tolerance_um), judged.effort
     margin = np.array([[_margin(_cell(bases, conditions[0], law, drive)) for drive in drives] for law in LAWS])
     last = np.where(np.isnan(largest[-1]), np.inf, largest[-1]).reshape(len(LAWS), -1)
@@ -361,10 +287,10 @@ def run(parameters: RobustParameters, track: Track = untracked) -> RobustResult:
         laws=list(LAWS),
         seeds=seeds,
         tolerance=parameters.tolerance_um,
-        largest=_worst(largest),
-        rms=_worst(rms),
-        settled=_worst(settled),
-        effort=_worst(effort),
+        largest=worst_of(largest),
+        rms=worst_of(rms),
+        settled=worst_of(settled),
+        effort=worst_of(effort),
         margin=margin,
         curves=[curves[-1, k].reshape(-1, revolutions)[worst] for k, worst in enumerate(last.argmax(axis=-1))],
     )

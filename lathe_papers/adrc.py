@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active disturbance rejection control (ADRC) with feed-forward of the form, as a law in a package of its own.
+
+An extended state observer of third order estimates position z0, velocity z1 and disturbance z2 of the drive model
+x'' + 2ζωn·x' + ωn²·x = ωn²·u(t - τ) + f from the measured position x, with all poles at -ωo:
+
+    z0' = z1 + 3ωo·(x - z0)
+    z1' = z2 + ωn²·(u - z0) - 2ζωn·z1 + 3ωo²·(x - z0)
+    z2' = ωo³·(x - z0)
+    command = u_form + ((ωc² - ωn²)·(r - z0) + 2·(ωc - ζωn)·(r' - z1) - z2)/ωn²
+
+The position is ``feedback_delay`` samples old, so the observer uses the command u that had reached the drive by then,
+and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through the inverse
+of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at -ωc.
+
+Source: Wu, Chen, Design and analysis of precision active disturbance rejection control for noncircular turning
+process, IEEE Trans. Industrial Electronics 56 (2009), for the structure: observer, feedback of its states, and
+acceleration feed-forward. The model inside the observer, its command of the past, and the settings are our own.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from lathe_rc.analysis.learning import Array
+from lathe_rc.cell.parameters import Positive, parameter
+from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
+from lathe_rc.cell.stages.law import Now
+from lathe_rc.control.angle_filter import at
+from lathe_rc.jit import kernel
+from lathe_rc.signals.profile_table import derivatives_at
+
+
+class AdrcParameters(FormLawParameters):
+    """Bandwidths of observer and feedback; the feed-forward has no settings beyond the model."""
+
+    observer_bandwidth: Positive = parameter(1000.0, "ωo of the extended state observer", "rad/s")
+    control_bandwidth: Positive = parameter(1000.0, "ωc of the feedback of its states", "rad/s")
+
+
+class Memory(NamedTuple):
+    """State and constants of the law.
+
+    Attributes:
+        forward: feed-forward of the form.
+        step: sampling step [s].
+        gains: 3ωo, 3ωo² and ωo³, shape (3,).
+        stiffness, damping: gains of the feedback [1, s].
+        whole, part: age of the command that belongs to a position, as whole samples and a fraction of a sample.
+        commands: past commands; sample n is at index n modulo the length, a power of two [m].
+        state: z0 [m], z1 [m/s], z2 [m/s²], shape (3,).
+    """
+
+    forward: ForwardTable
+    step: float
+    gains: Array
+    stiffness: float
+    damping: float
+    whole: int
+    part: float
+    commands: Array
+    state: Array
+
+
+@kernel
+def sample(memory: Memory, now: Now) -> float:
+    """Return the command of the law at one sample [m]."""
+    forward, z, gains = memory.forward, memory.state, memory.gains
+    command, mask = fed_forward(forward, now.angle), memory.commands.size - 1
+    if now.sample >= forward.late:
+        if now.sample == forward.late:  # the drive is assumed to be at rest at its first position
+            z[0] = now.position
+        k = now.sample - memory.whole
+        given = z[0]
+        if k >= 1:
+            given = (1.0 - memory.part) * memory.commands[k & mask] + memory.part * memory.commands[(k - 1) & mask]
+        off = now.position - z[0]
+        velocity = z[1] + gains[0] * off
+        acceleration = z[2] + (given - z[0] - forward.a1 * z[1]) / forward.a2 + gains[1] * off
+        z[0] += memory.step * velocity
+        z[1] += memory.step * acceleration
+        z[2] += memory.step * gains[2] * off
+        angle, speed, _ = at(forward.spindle, -forward.late * memory.step)
+        form = forward.form
+        value, slope, _ = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
+        command += memory.stiffness * (value - z[0]) + memory.damping * (speed * slope - z[1]) - forward.a2 * z[2]
+    memory.commands[now.sample & mask] = command
+    return command
+
+
+class Adrc(FormLaw):
+    """Law that feeds the form forward, observes the disturbance as a third state, and feeds the states back.
+
+    Attributes:
+        parameters: parameter table of the node.
+    """
+
+    kind = "adrc"
+    Parameters = AdrcParameters
+    parameters: AdrcParameters
+    sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+
+    def start(self) -> Memory:
+        """Return the initial state of the law, before the first sample."""
+        parameters, forward = self.parameters, self.make_forward()
+        observer, control, step = parameters.observer_bandwidth, parameters.control_bandwidth, parameters.step
+        age = parameters.model_delay / step + parameters.feedback_delay
+        whole = int(np.floor(age + 1e-9))
+        return Memory(
+            forward=forward,
+            step=step,
+            gains=np.array([3.0 * observer, 3.0 * observer**2, observer**3]),
+            stiffness=forward.a2 * control**2 - 1.0,
+            damping=2.0 * forward.a2 * control - forward.a1,
+            whole=whole,
+            part=max(age - whole, 0.0),
+            commands=np.zeros(1 << (whole + 2).bit_length()),
+            state=np.zeros(3),
+        )

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Benchmark oval3000: laws on one fixed problem, with drives that are drawn at random; others can enter theirs.
+
+The cell of ``config/oval3000.yaml`` turns an oval-barrel form of about 1 mm peak to valley at 3000 rpm. Each law is
+given the nominal drive without its resonances, and runs with drives that differ from it. Their first set is drawn by a
+published seed, so that results can be compared, the second one by a seed that is drawn at the time, so that no law can
+be tuned to it. Each drive has a noise and a random speed of its own; all laws get the same ones.
+"""
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+from rich.console import Group
+from rich.table import Table as RichTable
+
+from lathe_papers import cells, robust
+from lathe_papers.judge import LAST, Array, Judge, figure_of, finite, worst_of
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell.parameters import SharedParameters, Value, parameter
+from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import LawParameters, Learner, Loop
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Values = Mapping[str, Value]
+
+PUBLISHED = 3000  #: seed of the first set of drives
+_LARGEST = 2**31  # fresh seeds are below
+_LOOP, _MODE, _LOSS = 0.2, 0.1, 0.5  # relative spreads of the drives, see `Oval3000Parameters.drives`
+_DRIVE = "loaded_drive.coarse_"
+_NODE = "controller"
+_DELAY = 16  # [sample] of the position that the laws see
+
+CONDITIONS: dict[str, Values] = {
+    "counts 100000": {"spindle_encoder.counts_per_revolution": 100_000},
+    "counts 4096": {"spindle_encoder.counts_per_revolution": 4096},
+}
+_ANY: Values = {"allow_unstable": True, "stop_ratio": 0.0}  # divergence shows in the error
+#: parameters of the node ``controller``, by law; figures/oval3000_settings.py has the grids they are from
+LAWS: dict[str, cells.Values] = {
+    "000": robust.LAWS["000"],
+    "001": robust.LAWS["001"],
+    "lead": {**_ANY, "stage": "learning_controller", "identify": False, "lead_time": 1.5e-3, "q_time": 150e-6},
+    "adapt.": {**robust.LAWS["adapt."], "lead_time": 0.2e-3, "soft_start": 0.2},
+    "comp.": {**_ANY, "stage": "compound_controller"},
+    "AFC": {**_ANY, "stage": "resonant_controller"},
+    "ADRC": {**_ANY, "stage": "adrc"},
+    "ours": {
+        **_ANY, "stage": "disturbance_controller", "identify": False,
+        "learned_waves": 8.0, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,
+    },
+}  # fmt: skip
+
+
+class Oval3000Parameters(StudyParameters):
+    """Parameters of the benchmark: drives, length, and a law that is entered."""
+
+    drives: Annotated[int, Ge(2), Le(10_000)] = parameter(
+        64,
+        f"in each set; natural frequency, damping, delay and stiffness within ±{100 * _LOOP:.0f} % of the scenario's, "
+        f"mode frequencies ±{100 * _MODE:.0f} %, mode dampings and participations ±{100 * _LOSS:.0f} %, independent "
+        "and uniform",
+    )
+    fresh_seed: Annotated[int, Ge(0), Le(_LARGEST)] = parameter(
+        0, "draws the second set, and is printed; 0: drawn at the time"
+    )
+    revolutions: Annotated[int, Ge(15), Le(1000)] = parameter(40, "length of a run; the last 10 are judged", "rev")
+    tolerance_um: Annotated[float, Gt(0), Le(1000)] = parameter(2.0, "form tolerance, either way", "µm")
+    conditions: list[Literal[tuple(CONDITIONS)]] = parameter(list(CONDITIONS), "which encoders")  # type: ignore[valid-type]
+    laws: list[Literal[tuple(LAWS)]] = parameter(list(LAWS), "which laws of the benchmark")  # type: ignore[valid-type]
+    law: str = parameter("", "a law that enters, PACKAGE.MODULE:CLASS or a name that a package offers; empty: none")
+    law_set: str = parameter("", "its parameters, PARAM=VALUE PARAM=VALUE ...")
+    quick: bool = parameter(default=False, doc="only the first encoder, two drives in each set, 15 revolutions")
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Check the law that enters, and draw the seed of the second set if it is not given."""
+        super().model_post_init(context)
+        if self.law_set and not self.law:
+            raise InputError(f"law_set = {self.law_set!r} without a law; allowed: law = PACKAGE.MODULE:CLASS")
+        if not self.fresh_seed:
+            self.fresh_seed = 1 + secrets.randbelow(_LARGEST)
+
+
+@dataclass(frozen=True)
+class Oval3000Result:
+    """Scores of each law with each encoder and set of drives.
+
+    Arrays have the shape (sets, conditions, laws, drives); the first set is that of the published seed.
+
+    Attributes:
+        seeds: seed of each set.
+        conditions, laws: names of the encoders and laws.
+        tolerance: tolerance of the form error [µm].
+        largest: form error of the last ten revolutions outside the keyways [µm]; NaN for a stopped run.
+        settled: revolution from which the error stays within the tolerance; inf if it never does.
+        effort: RMS current of the drive [A].
+        margin: smallest relative error of the drive's response with which learning diverges, shape (sets, laws,
+            drives); NaN for a law without factors of a cycle.
+    """
+
+    seeds: list[int]
+    conditions: list[str]
+    laws: list[str]
+    tolerance: float
+    largest: Array
+    settled: Array
+    effort: Array
+    margin: Array
+
+    @property
+    def median(self) -> Array:
+        """Median form error over the drives [µm], shape (sets, conditions, laws); a stopped run counts as infinite."""
+        return np.asarray(np.median(np.where(np.isnan(self.largest), np.inf, self.largest), axis=-1))
+
+    @property
+    def share(self) -> Array:
+        """Share of the drives in tolerance [1], shape (sets, conditions, laws)."""
+        return np.asarray((self.largest <= self.tolerance).mean(axis=-1))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the scores for JSON, by set, encoder and law; None for a stopped run or no value."""
+        scores = {
+            "worst_um": worst_of(self.largest),
+            "median_um": self.median,
+            "in_tolerance": self.share,
+            "revolutions": worst_of(self.settled),
+            "effort_a": worst_of(self.effort),
+            "drive_margin": self.margin.min(axis=-1),
+        }
+        named = {"seeds": self.seeds, "conditions": self.conditions, "laws": self.laws, "tolerance_um": self.tolerance}
+        return {**named, "drives": self.largest.shape[-1], **{name: finite(each) for name, each in scores.items()}}
+
+    def table(self) -> Group:
+        """Return one table of scores for each encoder and set of drives."""
+        columns = ("law", "worst [µm]", "median [µm]", f"in ±{self.tolerance:g} µm", "settled", "margin", "effort [A]")
+        worst, settled, effort = map(worst_of, (self.largest, self.settled, self.effort))
+        margin, tables = self.margin.min(axis=-1), list[RichTable | str]()
+        for (k, condition), (s, seed) in product(enumerate(self.conditions), enumerate(self.seeds)):
+            rows = [
+                (
+                    law,
+                    *map(figure_of, (worst[s, k, n], self.median[s, k, n])),
+                    f"{100.0 * self.share[s, k, n]:.0f} %",
+                    figure_of(settled[s, k, n]),
+                    figure_of(margin[s, n]),
+                    f"{effort[s, k, n]:.1f}",
+                )
+                for n, law in enumerate(self.laws)
+            ]
+            drawn = "published seed" if s == 0 else "fresh seed"
+            title = f"{condition}, {self.largest.shape[-1]} drives of the {drawn} {seed}"
+            tables += [comparison(title, columns, rows), ""]
+        return Group(*tables[:-1])
+
+    def draw(self, figure: "Figure") -> None:
+        """Draw the share of drives below an error, by law: the published set as a line, the fresh one dashed."""
+        panels = figure.subplots(1, len(self.conditions), sharey=True, squeeze=False)[0]
+        shares = 100.0 * np.arange(1, self.largest.shape[-1] + 1) / self.largest.shape[-1]
+        for k, (axes, condition) in enumerate(zip(panels, self.conditions, strict=True)):
+            for n, law in enumerate(self.laws):
+                for s, style in enumerate(("-", "--")):
+                    label = law if s == 0 else None
+                    axes.semilogx(np.sort(self.largest[s, k, n]), shares, style, color=f"C{n}", lw=1.2, label=label)
+            axes.axvline(self.tolerance, color="black", lw=0.8, ls=":")
+            axes.set(xlabel="largest form error [µm]", title=condition)
+            axes.grid(visible=True, alpha=0.3)
+        panels[0].set_ylabel("drives below [%]")
+        panels[0].legend(fontsize=7)
+
+
+def drives_of(base: Scenario, seed: int, count: int) -> list[Values]:
+    """Draw the parameters of ``count`` drives around that of the scenario, and of the noise and speed of each."""
+    random = np.random.default_rng(seed)
+    around: dict[str, Any] = {
+        name: base.value(f"{_DRIVE}{name}")
+        for name in ("natural_frequency", "damping", "delay", "mode_frequency", "mode_damping", "mode_participation")
+    }
+    mass, modes = base.value(f"{_DRIVE}moving_mass"), len(around["mode_frequency"])
+    assert isinstance(mass, float), "it is one parameter"
+    drawn: list[Values] = []
+    for _ in range(count):
+        frequency, damping, delay, stiffness = (1.0 + _LOOP * random.uniform(-1.0, 1.0, 4)).tolist()
+        spreads = {"mode_frequency": _MODE, "mode_damping": _LOSS, "mode_participation": _LOSS}
+        factors = {name: 1.0 + spread * random.uniform(-1.0, 1.0, modes) for name, spread in spreads.items()}
+        values: dict[str, Value] = {
+            "natural_frequency": around["natural_frequency"] * frequency,
+            "damping": around["damping"] * damping,
+            "delay": around["delay"] * delay,
+            # the force deflects the drive by its stiffness, which is the mass times the square of the natural frequency
+            "moving_mass": mass * stiffness / frequency**2,
+            **{name: (np.array(around[name]) * factor).tolist() for name, factor in factors.items()},
+        }
+        drawn.append({**{_DRIVE + name: value for name, value in values.items()}, "seed": int(random.integers(2**31))})
+    return drawn
+
+
+def entered(base: Scenario, values: cells.Values) -> Scenario:
+    """Return the cell with a law in place of its controller, which is given the scenario's drive.
+
+    Args:
+        base: cell of the benchmark.
+        values: parameters of the law, with its ``stage``.
+
+    Raises:
+        InputError: there is no such law, or a parameter is not allowed.
+    """
+    before, kind = base.nodes[_NODE], str(values["stage"])
+    if kind not in TABLES:
+        raise InputError(f"law = {kind!r}; allowed: {TABLES.instead(kind)}")
+    table = TABLES[kind]
+    if not issubclass(table, LawParameters):
+        raise InputError(f"law = {kind!r} is no law; allowed: a class that derives from lathe_rc.Law")
+    shared = {name: getattr(before, name) for name in SharedParameters.model_fields.keys() & before.model_fields_set}
+    made = table.read(_NODE, {**shared, "feedback_delay": _DELAY, **values})
+    return base.with_node(_NODE, made).with_models_given().named()
+
+
+def margins(law: Scenario, drives: list[Values]) -> Array:
+    """Return the drive margin of a law with each drive, at 0.9, 1 and 1.1 times the nominal speed; NaN if unknown."""
+    stage, nominal = Cell(law.nodes).stages[_NODE], law.shared.nominal_speed
+    assert isinstance(stage, Learner), "it commands the drive"
+    found = []
+    for values in drives:
+        drive = Cell(law.varied(values).nodes).stages["loaded_drive"]
+        assert isinstance(drive, Drive), "it is one"
+        loop = Loop(stage, [drive.responses()["coarse/command"]], (0.9 * nominal, nominal, 1.1 * nominal))
+        margin = loop.drive_margin()
+        found.append(np.nan if margin is None else margin.error)
+    return np.array(found)
+
+
+def _own(parameters: Oval3000Parameters) -> dict[str, cells.Values]:
+    """Return the law that enters, by its name in the tables; empty if there is none."""
+    if not parameters.law:
+        return {}
+    values: dict[str, object] = {**_ANY, "stage": parameters.law}
+    for text in parameters.law_set.split():
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(f"law_set: {text!r}; allowed: PARAM=VALUE PARAM=VALUE ...")
+        values[name] = ros_yaml.parse_value(value, f"law_set {name}")
+    name = parameters.law.rpartition(":")[2]
+    return {f"{name} (entered)" if name in LAWS else name: values}
+
+
+def run(parameters: Oval3000Parameters, track: Track = untracked) -> Oval3000Result:
+    """Run every law with every encoder and drive of both sets."""
+    conditions, count, revolutions = parameters.conditions, parameters.drives, parameters.revolutions
+    if parameters.quick:
+        conditions, count, revolutions = conditions[:1], 2, 15
+    base = cells.load("oval3000", spindle_encoder={"revolutions": float(revolutions)})
+    tables = {**{name: LAWS[name] for name in parameters.laws}, **_own(parameters)}
+    laws = {name: entered(base, values) for name, values in tables.items()}
+    seeds = [PUBLISHED, parameters.fresh_seed]
+    drives = [drives_of(base, seed, count) for seed in seeds]
+    made = [
+        law.varied({**CONDITIONS[condition], **drive})
+        for each, condition, law in product(drives, conditions, laws.values())
+        for drive in each
+    ]
+    shape = len(seeds), len(conditions), len(laws), count
+    largest, settled, effort = np.full((3, *shape), np.nan)
+    for place, judged in zip(np.ndindex(shape), cells.kept(made, Judge, track), strict=True):
+        if judged is not None:
+            largest[place] = judged.largest[:revolutions][-LAST:].max()
+            settled[place], effort[place] = judged.settled(parameters.tolerance_um), judged.effort
+    return Oval3000Result(
+        seeds=seeds,
+        conditions=conditions,
+        laws=list(laws),
+        tolerance=parameters.tolerance_um,
+        largest=largest,
+        settled=settled,
+        effort=effort,
+        margin=np.array([[margins(law, each) for law in laws.values()] for each in drives]),
+    )
+
+
+STUDY = Study("oval3000", "benchmark: laws at 3000 rpm, with drives drawn at random", Oval3000Parameters, run)
