@@ -65,9 +65,9 @@ class Judge:
         # The run ends within a revolution, whose start only marks the end of the previous one.
         largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
         last = error[starts[-1 - LAST] : starts[-1]]
-        return Judged(
-            largest, float(np.sqrt(np.mean(last[last > 0.0] ** 2))), float(np.sqrt(np.mean(self._current**2)))
-        )
+        with np.errstate(over="ignore"):  # a law that diverges
+            rms, effort = np.sqrt(np.mean(last[last > 0.0] ** 2)), np.sqrt(np.mean(self._current**2))
+        return Judged(largest, float(rms), float(effort))
 
 
 def worst_of(values: Array) -> Array:

@@ -11,6 +11,7 @@ from click.shell_completion import CompletionItem
 from rich.console import Console
 from rich.progress import Progress
 
+from lathe_rc import allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.commands import completers, options, picture
@@ -78,6 +79,9 @@ class _StudyCommand(click.Command):
         options.as_json(self)
         if "quick" in subject.parameters.rows():
             click.option("--quick", is_flag=True, help="as --set quick=true")(self)
+        if "law" in subject.parameters.rows():
+            entered = "as --set law=...; the class may be in the current folder"
+            click.option("--law", metavar="PACKAGE.MODULE:CLASS", help=entered)(self)
 
     def _complete(self, _ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         return completers.beginning((f"{name}=" for name in self.subject.parameters.rows()), incomplete)
@@ -92,7 +96,13 @@ class _StudyCommand(click.Command):
                 ]
             )
 
-    def _run(self, overrides: tuple[str, ...], figure: Path, *, as_json: bool, quick: bool = False) -> None:
+    def _run(
+        self, overrides: tuple[str, ...], figure: Path, *, as_json: bool, quick: bool = False, law: str | None = None
+    ) -> None:
+        if law is not None:
+            allowed_code.allow_own_code()
+            allowed_code.allow_named(law)
+            overrides = (*overrides, f"law={law}")
         parameters = read(self.subject, (*overrides, "quick=true") if quick else overrides)
         picture.check_place(figure)
         console = Console(stderr=True)
