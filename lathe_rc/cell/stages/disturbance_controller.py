@@ -137,7 +137,7 @@ class DisturbanceController(FormLaw):
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
         """Return candidate remedies: fewer learned waves, a slower observer, or both where neither suffices alone."""
         parameters = self.parameters
-        waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
+        waves = [float(f"{parameters.learned_waves * 0.75**k:.2g}") for k in range(12)]
         observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
         yield ({"learned_waves": each} for each in waves[1:])
         if parameters.observer_bandwidth:
