@@ -121,7 +121,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 _ELSEWHERE = FormTable(
-    np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), alike=True, slide=0, feed=0.0, start=0.0, part=0
+    heights=np.empty(0),
+    table=np.empty((0, 0, 0)),
+    told=np.empty((0, 0, 0)),
+    alike=True,
+    slide=0,
+    feed=0.0,
+    start=0.0,
+    part=0,
+    told_heights=np.empty(0),
 )
 
 
