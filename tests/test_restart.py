@@ -33,6 +33,7 @@ LAWS = {
     "inverse": ("piston", [f"{OWN}.correction=second_order_inverse", f"{OWN}.lead_time=0.36e-3"]),
     "fir": ("piston", [f"{OWN}.q_filter=fir", f"{OWN}.allow_unstable=true"]),
     "gaussian": ("piston", [f"{OWN}.q_filter=gaussian"]),
+    "tuned": ("piston", [f"{OWN}.events=['revolution 4: set lead_time 1.3e-3', 'revolution 6.5: set q_time 90e-6']"]),
 }
 
 
