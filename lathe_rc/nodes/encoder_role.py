@@ -60,6 +60,11 @@ class EncoderRole(SpindleRole):
             self._line.close()
             self._line = None
 
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the parameters that may change in a run: not the pace of a live encoder (extends `SpindleRole`)."""
+        return () if self.stage.live else super().tunable
+
     def statistics(self) -> dict[str, object]:
         """Return the figures of spindle and encoder for the diagnostics (implements `Role`)."""
         counted = self.stage.counted
