@@ -13,6 +13,7 @@ COMMANDS = {
     "budget": "Split the form error of a scenario by its causes.",
     "completion": "Print the shell completion script.",
     "container": "Run several nodes in one process.",
+    "correct": "Correct the programmed form of the next part.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "design": "Find the learning law of a scenario for a measured drive.",
     "export": "Export a recording as CSV, Parquet or NPZ.",

@@ -20,12 +20,14 @@ _MODULES = {
         "xxhash",
     ),
     "view": ("rerun", "rerun_bindings"),
+    "formats": ("x3pio",),
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
 _CHECKOUT = {
     "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
     "sweep": "./lathe setup sweep in a checkout",
     "view": "./lathe setup view in a checkout",
+    "formats": "./lathe setup formats in a checkout",
 }
 
 

@@ -97,7 +97,7 @@ def test_a_cell_that_cannot_be_designed_is_refused(cell, said):
 
 def test_a_file_of_no_drive_is_refused(tmp_path):
     path = tmp_path / "drive.yaml"
-    path.write_text("/drive:\n  ros__parameters:\n    stifness: 1.0\n")
+    path.write_text("/drive:\n  ros__parameters:\n    stiffness: 1.0\n")
     done = CliRunner().invoke(main, ["design", "piston", "--drive", str(path)])
     assert done.exit_code == 2
-    assert f"lathe: {path}: stifness; allowed: parameters of electrodynamic_actuator" in done.output
+    assert f"lathe: {path}: stiffness; allowed: parameters of electrodynamic_actuator" in done.output

@@ -136,6 +136,12 @@ class Candidate:
     worst: Found
 
 
+def _rank(candidate: Candidate) -> tuple[bool, float, float]:
+    out = not candidate.worst.settled < np.inf
+    margin = 0.0 if out or candidate.margin is None else min(candidate.margin.error, 1.0)
+    return out, -round(margin, 2), candidate.worst.largest
+
+
 class _Keep:
     """Keeper of form error and effort (see `lathe_rc.cell.batch.Keeper`)."""
 
@@ -197,12 +203,16 @@ class Design:
         self._nominal = scenario.varied(self.drives[0])
 
     def candidates(self, watch: Callable[[str], None] = lambda _: None) -> list[Candidate]:
-        """Return each law with its best settings, the best law first; ``watch`` is called with the name of each."""
+        """Return each law with its best settings, the best law first; ``watch`` is called with the name of each.
+
+        The best law is in tolerance with every drive and has the largest drive margin. If none is in tolerance, it is
+        the one with the smallest error.
+        """
         found = []
         for name in LAWS:
             watch(name)
             found.append(self._candidate(name))
-        return sorted(found, key=lambda each: (each.worst.settled == np.inf, each.worst.largest))
+        return sorted(found, key=_rank)
 
     def _with(self, base: Scenario, law: Law, values: Values) -> Scenario:
         """Return a scenario with a law in place of its learning controller."""

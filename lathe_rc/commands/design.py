@@ -83,7 +83,8 @@ def _drives(path: Path) -> list["Values"]:
     beside = path.with_suffix(".drives.csv")
     found: list[Any] = list(nominal)
     if beside.exists():
-        found += [{target.rpartition(".")[2]: each[target] for target in each} for each in space.given(beside)]
+        of_set = [{target.rpartition(".")[2]: each[target] for target in each} for each in space.given(beside)]
+        found += [each for each in of_set if each != nominal[0]]
     for values in found:
         if unknown := sorted(values.keys() - ElectrodynamicActuatorParameters.model_fields.keys()):
             raise InputError(f"{path}: {unknown[0]}; allowed: parameters of electrodynamic_actuator")

@@ -86,6 +86,7 @@ class Chain:
             said = self._program.said(number, end)
             if end > first:
                 outputs = [self._tapes.view(topic, first, end - first) for topic in role.outputs.topics]
+                role.angle = self._angle(number, end) if role.stage.tunable else 0.0
                 role.publish_copies(said, outputs, last=last and end == first + samples)
         for role in self._roles:
             role.inputs.pass_over(self._inside, role.samples)
@@ -94,6 +95,14 @@ class Chain:
             self.leave()
         if failure is not None:
             self._roles[self._program.number].node.fail(failure)
+
+    def _angle(self, number: int, end: int) -> float:
+        """Return the measured spindle angle of the newest sample of a stage [rad], which ends before sample ``end``."""
+        stage, inputs, _ = self._stages[number]
+        if stage.angle_input is None:
+            return 0.0
+        tape, delay = inputs[stage.angle_input]
+        return float(self._tapes.view(tape, end - 1, 1, delay)["angle"][0])
 
     def leave(self) -> None:
         """Dissolve the chain: each stage goes on alone from its current sample."""

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -17,16 +18,17 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import Snapshot
 from lathe_rc.bag.writing.order import Merger
-from lathe_rc.bag.writing.record import bag_of
+from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
-from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
@@ -88,6 +90,22 @@ class RecorderRole:
     def member_names(self) -> list[str]:
         """Return the members that the node names: none, since it is no time master (implements `Role`)."""
         return []
+
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the parameters that may change in a run (implements `Role`)."""
+        return () if self.table.mode == "snapshot" else ("split_duration",)
+
+    def tune(self, values: Mapping[str, Value]) -> str:
+        """Change the length of the bag's files (implements `Role`).
+
+        Raises:
+            InputError: the bag is closed.
+        """
+        if self._writer is None:
+            raise InputError(f"{self.node.full_name}: bag {self._path} is closed")
+        split(self._writer, float(cast("float", values["split_duration"])))
+        return "from the next message on"
 
     def relative_topics(self) -> list[str]:
         """Return the relative signal topics: none, since a recorder has no stage (implements `Role`)."""

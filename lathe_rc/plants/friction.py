@@ -2,7 +2,7 @@
 """Friction of a slide, solved together with the speed of the motor within a step.
 
     g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve of the dry friction
-    stribeck   F = g(v)·sgn v + Fv·v; at rest, the holding force up to Fs
+    stribeck   F = g(v)·sgn v + Fv·v; at rest, the holding force within ±Fs
     lugre      dz/dt = v - σ0·|v|/g(v)·z,  F = σ0·z + σ1·dz/dt + Fv·v
 
 z is the mean deflection of the bristles between the surfaces. At a steady speed, LuGre gives the Stribeck curve; below

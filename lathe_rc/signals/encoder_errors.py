@@ -21,6 +21,8 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 
 _TURN = 2.0 * np.pi
+_ROUNDS = 64  # most steps of a root search, enough for a bisection
+_CLOSE = 1e-9  # [rad] last step of Newton's method
 _GREATEST = 0.5  # limit of the signal errors and the eccentricity, below which the reading is monotone
 
 
@@ -121,6 +123,25 @@ def rate(table: ErrorsTable, angle: float) -> float:
     )
     along = x * (1.0 + errors.mismatch) * np.cos(place + errors.skew) + y * np.sin(place)
     return float((1.0 + errors.eccentricity * np.cos(angle + errors.phase)) * along / (x * x + y * y))
+
+
+@kernel
+def place_of(table: ErrorsTable, reading: float, low: float, high: float) -> float:
+    """Return the angle of a reading [rad], between two angles that enclose it, by Newton's method."""
+    angle = high
+    for _ in range(_ROUNDS):
+        off = seen(table, angle) - reading
+        if off >= 0.0:
+            high = angle
+        else:
+            low = angle
+        found = angle - off / rate(table, angle)
+        if not low < found < high:
+            found = 0.5 * (low + high)
+        off, angle = abs(found - angle), found
+        if off < _CLOSE:
+            break
+    return angle
 
 
 @kernel

@@ -2,7 +2,7 @@
 """Stages of the cell: physics and control laws with their parameters and ports.
 
 Time and angle: `time_master`, `spindle_encoder` with `speed_law`, `loaded_spindle`, `encoder_device`.
-Form and tool: `form`, `tool`, `vibration`.
+Form and tool: `form`, `tool`, `gauge`, `vibration`.
 Tool drives: `drive` and `plant` (common parts), `electrodynamic_actuator`, `piezo_actuator`, `series_drive`, and
 `loaded_drive`, which includes the cut; `cutting_process`.
 Laws of the tool: `law` and `learner` (common parts), `learning_controller` with `learning_parameters` and
@@ -34,6 +34,7 @@ _OWN = {
     "vibration": "vibration:Vibration",
     "profile": "form:ProfileStage",
     "tool": "tool:Tool",
+    "gauge": "gauge:Gauge",
     "feed_drive": "feed_drive:FeedDriveStage",
     "cutting_process": "cutting_process:CuttingProcessStage",
     "position_controller": "position_controller:PositionController",

@@ -20,7 +20,7 @@ from lathe_rc.cell.stages.law import Now
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
 from lathe_rc.control.disturbance import DisturbanceTable, FormAhead, commanded, disturbance, forget, observed
-from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing
+from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing, with_gain
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 
@@ -106,6 +106,7 @@ class DisturbanceController(FormLaw):
     kind = "disturbance_controller"
     Parameters = DisturbanceControllerParameters
     parameters: DisturbanceControllerParameters
+    tunable = ("learning_gain",)
     law: Memory
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
     factor = "sup|factor of a revolution|"
@@ -128,6 +129,12 @@ class DisturbanceController(FormLaw):
         else:
             super().perform(action)
 
+    def tune(self, parameters: DisturbanceControllerParameters) -> None:
+        """Continue with another learning gain from the next sample on; memory and estimates are kept."""
+        self.parameters = parameters
+        known = self.law.known
+        self.law = self.law._replace(known=known._replace(memory=with_gain(known.memory, parameters.learning_gain)))
+
     def settings(self) -> str:
         """Return the drive model that decides whether learning converges, in words."""
         parameters = self.parameters
@@ -137,7 +144,7 @@ class DisturbanceController(FormLaw):
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
         """Return candidate remedies: fewer learned waves, a slower observer, or both where neither suffices alone."""
         parameters = self.parameters
-        waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
+        waves = [float(f"{parameters.learned_waves * 0.75**k:.2g}") for k in range(12)]
         observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
         yield ({"learned_waves": each} for each in waves[1:])
         if parameters.observer_bandwidth:

@@ -20,7 +20,7 @@ from lathe_rc.messages import Samples
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
-from lathe_rc.signals.profile_table import deviation_along, height_along, tabulated
+from lathe_rc.signals.profile_table import ProfileTable, deviation_along, height_along, tabulated
 from lathe_rc.signals.tip_path import TipPath
 
 _OWN = ("harmonics", "piston", "polygon", "csv")
@@ -36,6 +36,12 @@ class FormParameters(NodeParameters):
         [], "profile of others: numbers that it is made of, in the order of its constructor"
     )
     profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
+    programmed_file: str = parameter(
+        "",
+        "CSV file of the programmed form, which the controllers follow, as lathe correct writes it; the form error is "
+        "that of the form itself; empty: the form itself",
+        path=True,
+    )
     harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
         [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
     )
@@ -103,6 +109,17 @@ class FormParameters(NodeParameters):
         with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
+    def programmed_form(self, node: str) -> Measured | None:
+        """Return the programmed form of the controllers of a node; None: the form itself.
+
+        Raises:
+            InputError: the file cannot be used.
+        """
+        if not self.programmed_file:
+            return None
+        with about(node, "programmed_file"):
+            return read_csv(resources.find(Path(self.programmed_file)))
+
 
 FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters
 
@@ -116,6 +133,7 @@ class FormTable(NamedTuple):
         alike: whether both tables are equal.
         slide: index of the first input of the longitudinal slide if the slide determines the height, otherwise 0.
         feed, start, part: parameters of the height without a slide, see `lathe_rc.signals.profile_table.height_along`.
+        told_heights: heights of the table of the controllers.
     """
 
     heights: Samples
@@ -126,6 +144,7 @@ class FormTable(NamedTuple):
     feed: float
     start: float
     part: int
+    told_heights: Samples
 
 
 @kernel
@@ -167,7 +186,13 @@ def evaluate(
     else:
         # The result array first contains the height, which is copied before the result is written.
         _place(form, angle, measured, expected)
-        deviation_along(form.heights, form.told, angle, expected.copy(), expected)
+        deviation_along(form.told_heights, form.told, angle, expected.copy(), expected)
+
+
+def _tip_path(node: str, parameters: FormParameters, form: Profile) -> ProfileTable:
+    """Return the table of the path on which a round tip turns a form."""
+    with about(node, "tip_radius"):
+        return tabulated(TipPath(form, parameters.part_radius, parameters.tip_radius))
 
 
 class Form:
@@ -179,25 +204,34 @@ class Form:
 
     Attributes:
         surface: table of the form of the part.
-        profile: table of the path of the drives, which is the form or the path of a round tip.
+        profile: table of the path that the controllers follow: the form, the path of a round tip, or that of the
+            programmed form.
         inputs: input ports.
         table: table for `evaluate`.
-        doubts: warnings about the file of the form, one line each.
+        doubts: warnings about the files of the form, one line each.
 
     Raises:
         InputError: as for `FormParameters.form`, or the tip does not fit the form, or a slide would have to restart.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
-        form = parameters.form(node)
-        said = doubts(form) if isinstance(form, Measured) else []
-        self.doubts = [f"{node}.profile_file = {parameters.profile_file}: {doubt}" for doubt in said]
-        self.surface = self.profile = path = tabulated(form)
+        form, programmed = parameters.form(node), parameters.programmed_form(node)
+        files = (
+            ("profile_file", parameters.profile_file, form),
+            ("programmed_file", parameters.programmed_file, programmed),
+        )
+        self.doubts = [
+            f"{node}.{name} = {file}: {doubt}"
+            for name, file, read in files
+            if isinstance(read, Measured)
+            for doubt in doubts(read)
+        ]
+        self.surface = path = tabulated(form)
+        self.profile = path if programmed is None else tabulated(programmed)
         if parameters.tip_radius:
-            with about(node, "tip_radius"):
-                path = tabulated(TipPath(form, parameters.part_radius, parameters.tip_radius))
+            path = _tip_path(node, parameters, form)
             if parameters.tip_correction:
-                self.profile = path
+                self.profile = path if programmed is None else _tip_path(node, parameters, programmed)
         self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
         slides = parameters.height_from == "slide"
         self.table = FormTable(
@@ -209,6 +243,7 @@ class Form:
             feed=parameters.feed,
             start=parameters.start_height,
             part=parameters.part_revolutions,
+            told_heights=self.profile.heights,
         )
         if slides:
             self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))

@@ -128,13 +128,14 @@ class Learner(Obedient):
         """Return the parameters that decide whether learning converges, in words."""
         return "its parameters"
 
-    def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
+    def encoder_warnings(self, low: float, high: float, counts: int, edge_clock: float = 0.0) -> list[str]:
         """Return causes of an avoidable form error, with remedies, one line each; none of them is an error.
 
         Args:
             low: lowest speed of the spindle [rad/s].
             high: highest speed of the spindle [rad/s].
             counts: encoder counts per revolution; 0 for an ideal encoder.
+            edge_clock: resolution of the time of the encoder's last edge [s]; 0: it is not known.
         """
         return []
 
@@ -160,7 +161,8 @@ class Learner(Obedient):
         low, high = cell.speed_range
         self._check_delay(cell, high)
         self._check_convergence(cell, self.checked_speeds(low, high), cures=cures)
-        cell.warnings += self.encoder_warnings(low, high, cell.master.parameters.counts_per_revolution)
+        encoder = cell.master.parameters
+        cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
         """Return the commanded drives and their responses."""

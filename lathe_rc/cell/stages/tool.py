@@ -13,6 +13,7 @@ from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, ProfileStage, evaluate
+from lathe_rc.cell.stages.gauge import Gauge
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
@@ -121,7 +122,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 _ELSEWHERE = FormTable(
-    np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), alike=True, slide=0, feed=0.0, start=0.0, part=0
+    heights=np.empty(0),
+    table=np.empty((0, 0, 0)),
+    told=np.empty((0, 0, 0)),
+    alike=True,
+    slide=0,
+    feed=0.0,
+    start=0.0,
+    part=0,
+    told_heights=np.empty(0),
 )
 
 
@@ -165,6 +174,9 @@ class Tool(Stage):
         owner = self._form_owner(cell)
         topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
         source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
+        if isinstance(source, Gauge):
+            topic = remapped(source.shared, source.drive_topic)
+            source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
         if owner is None or owner.form is None:
             return
         if isinstance(source, Drive):
