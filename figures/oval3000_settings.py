@@ -13,7 +13,7 @@ from lathe_papers import cells, oval3000
 from lathe_papers.judge import LAST, Judge
 from lathe_rc.study import untracked
 
-SEED, DRIVES, REVOLUTIONS = 1, 6, 60
+SEED, DRIVES, REVOLUTIONS = 1, 6, 40
 _FLAT: dict[str, list[object]] = {
     "q_filter": ["fir"], "q_pass": [1000.0, 2000.0, 3000.0], "q_stop": [5000.0, 7500.0], "q_ripple": [1e-3],
 }  # fmt: skip

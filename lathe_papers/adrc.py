@@ -9,8 +9,9 @@ x'' + 2ζωn·x' + ωn²·x = ωn²·u(t - τ) + f from the measured position x,
     z2' = ωo³·(x - z0)
     command = u_form + ((ωc² - ωn²)·(r - z0) + 2·(ωc - ζωn)·(r' - z1) - z2)/ωn²
 
-The position is ``feedback_delay`` samples old, so the observer uses the command u that had reached the drive by then,
-and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through the inverse
+The model is discretised exactly for a command that is linear between samples; 3ωo, 3ωo² and ωo³ times the sampling
+step correct its prediction. The position is ``feedback_delay`` samples old, so the observer uses the command u that had
+reached the drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through the inverse
 of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at -ωc.
 
 Source: Wu, Chen, Design and analysis of precision active disturbance rejection control for noncircular turning
@@ -29,6 +30,7 @@ from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTab
 from lathe_rc.cell.stages.law import Now
 from lathe_rc.control.angle_filter import at
 from lathe_rc.jit import kernel
+from lathe_rc.plants.linear import discretise
 from lathe_rc.signals.profile_table import derivatives_at
 
 
@@ -45,20 +47,22 @@ class Memory(NamedTuple):
     Attributes:
         forward: feed-forward of the form.
         step: sampling step [s].
-        gains: 3ωo, 3ωo² and ωo³, shape (3,).
+        transition, weights: difference equation of z0, z1 and z2, shape (3, 3) each.
+        age: age of the newest command in that equation [samples].
+        gains: correction of z0, z1 and z2 per difference between the positions, shape (3,).
         stiffness, damping: gains of the feedback [1, s].
-        whole, part: age of the command that belongs to a position, as whole samples and a fraction of a sample.
         commands: past commands; sample n is at index n modulo the length, a power of two [m].
         state: z0 [m], z1 [m/s], z2 [m/s²], shape (3,).
     """
 
     forward: ForwardTable
     step: float
+    transition: Array
+    weights: Array
+    age: int
     gains: Array
     stiffness: float
     damping: float
-    whole: int
-    part: float
     commands: Array
     state: Array
 
@@ -66,26 +70,25 @@ class Memory(NamedTuple):
 @kernel
 def sample(memory: Memory, now: Now) -> float:
     """Return the command of the law at one sample [m]."""
-    forward, z, gains = memory.forward, memory.state, memory.gains
-    command, mask = fed_forward(forward, now.angle), memory.commands.size - 1
+    forward, z, commands = memory.forward, memory.state, memory.commands
+    command, mask = fed_forward(forward, now.angle), commands.size - 1
     if now.sample >= forward.late:
         if now.sample == forward.late:  # the drive is assumed to be at rest at its first position
             z[0] = now.position
-        k = now.sample - memory.whole
-        given = z[0]
-        if k >= 1:
-            given = (1.0 - memory.part) * memory.commands[k & mask] + memory.part * memory.commands[(k - 1) & mask]
+        k = now.sample - memory.age
+        before = z[0], z[1], z[2]
+        for i in range(3):
+            z[i] = 0.0
+            for j in range(3):
+                z[i] += memory.transition[i, j] * before[j] + memory.weights[i, j] * commands[(k - j) & mask]
         off = now.position - z[0]
-        velocity = z[1] + gains[0] * off
-        acceleration = z[2] + (given - z[0] - forward.a1 * z[1]) / forward.a2 + gains[1] * off
-        z[0] += memory.step * velocity
-        z[1] += memory.step * acceleration
-        z[2] += memory.step * gains[2] * off
+        for i in range(3):
+            z[i] += memory.gains[i] * off
         angle, speed, _ = at(forward.spindle, -forward.late * memory.step)
         form = forward.form
         value, slope, _ = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
         command += memory.stiffness * (value - z[0]) + memory.damping * (speed * slope - z[1]) - forward.a2 * z[2]
-    memory.commands[now.sample & mask] = command
+    commands[now.sample & mask] = command
     return command
 
 
@@ -105,16 +108,19 @@ class Adrc(FormLaw):
         """Return the initial state of the law, before the first sample."""
         parameters, forward = self.parameters, self.make_forward()
         observer, control, step = parameters.observer_bandwidth, parameters.control_bandwidth, parameters.step
-        age = parameters.model_delay / step + parameters.feedback_delay
-        whole = int(np.floor(age + 1e-9))
+        square = 1.0 / forward.a2
+        a = np.array([[0.0, 1.0, 0.0], [-square, -square * forward.a1, 1.0], [0.0, 0.0, 0.0]])
+        delay = parameters.model_delay + parameters.feedback_delay * step
+        model = discretise(a, np.array([0.0, square, 0.0]), delay, step, "foh")
         return Memory(
             forward=forward,
             step=step,
-            gains=np.array([3.0 * observer, 3.0 * observer**2, observer**3]),
+            transition=model.transition,
+            weights=model.weights,
+            age=model.delay,
+            gains=step * np.array([3.0 * observer, 3.0 * observer**2, observer**3]),
             stiffness=forward.a2 * control**2 - 1.0,
             damping=2.0 * forward.a2 * control - forward.a1,
-            whole=whole,
-            part=max(age - whole, 0.0),
-            commands=np.zeros(1 << (whole + 2).bit_length()),
+            commands=np.zeros(1 << (model.delay + 3).bit_length()),
             state=np.zeros(3),
         )

@@ -69,7 +69,7 @@ LAWS: dict[str, cells.Values] = {
     "ADRC": {**_ANY, "stage": "adrc", "observer_bandwidth": 1000.0, "control_bandwidth": 2000.0},
     "ours": {
         **_ANY, "stage": "disturbance_controller", "identification_bandwidth": 3000.0,
-        "learned_waves": 7.0, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,
+        "learned_waves": 7.5, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,
     },
 }  # fmt: skip
 

@@ -38,7 +38,7 @@ def test_scores_of_the_second_set_are_those_of_its_seed():
         np.testing.assert_array_equal(first, getattr(other, name)[0])
     assert np.all(other.largest[0] != other.largest[1])
     # A law that leads the memory alone errs by what the speed varies within a revolution.
-    assert np.all(same.largest[:, :, 1] < 0.5 * same.largest[:, :, 0])
+    assert np.all(same.largest[:, :, 1] < same.largest[:, :, 0])
     assert np.all(same.margin[:, 1] > 0.3)
 
 
@@ -110,22 +110,25 @@ QUIET = {
     "loaded_drive.coarse_noise_rms": 0.0, "loaded_drive.coarse_mode_frequency": [],
     "loaded_drive.coarse_mode_damping": [], "loaded_drive.coarse_mode_participation": [],
 }  # fmt: skip
-STEADY = {"loaded_drive.cut_gap_start": [], "loaded_drive.cut_gap_width": [], "loaded_drive.cut_lag": 0.0}
+STEADY = {
+    "loaded_drive.cut_gap_start": [], "loaded_drive.cut_gap_width": [], "loaded_drive.cut_blank": "form",
+}  # fmt: skip
 
 
-def test_adrc_removes_a_constant_force_and_no_more_of_the_keyways_than_its_observer_is_fast():
+def test_adrc_removes_a_constant_force_and_a_part_of_the_keyways():
     """With its model exact ADRC leaves nothing of the form or of a constant force, and something of each keyway."""
-    base = cells.load("oval3000", spindle_encoder={"revolutions": 20.0})
+    base = cells.load("oval3000", spindle_encoder={"revolutions": 15.0})
 
     def error(law, **changes):
         cell = oval3000.entered(base, {**oval3000.LAWS["ADRC"], **law}).varied({**QUIET, **changes})
         (judged,) = cells.kept([cell], Judge, untracked)
-        return judged.largest[10:20].max()
+        return judged.largest[6:14].max()
 
     slow = {"observer_bandwidth": 1e-3}
-    assert error({}, **STEADY) < 0.1
-    assert error(slow, **STEADY) > 5.0
-    assert 1.0 < error({}) < error(slow)
+    assert error(slow, **STEADY, **{"loaded_drive.radial_ratio": 0.0}) < 0.01
+    assert error({}, **STEADY) < 0.01
+    assert error(slow, **STEADY) > 10.0
+    assert 1.0 < error({}) < 0.5 * error(slow)
 
 
 def test_adrc_is_offered_as_the_laws_of_packages_are():
