@@ -11,8 +11,9 @@ x'' + 2ζωn·x' + ωn²·x = ωn²·u(t - τ) + f from the measured position x,
 
 The model is discretised exactly for a command that is linear between samples; 3ωo, 3ωo² and ωo³ times the sampling
 step correct its prediction. The position is ``feedback_delay`` samples old, so the observer uses the command u that had
-reached the drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through the inverse
-of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at -ωc.
+reached the drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed
+forward through the inverse of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at
+-ωc.
 
 Source: Wu, Chen, Design and analysis of precision active disturbance rejection control for noncircular turning
 process, IEEE Trans. Industrial Electronics 56 (2009), for the structure: observer, feedback of its states, and

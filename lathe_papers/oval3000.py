@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark oval3000: laws on one fixed problem, with drives that are drawn at random; others can enter theirs.
 
-The cell of ``config/oval3000.yaml`` turns an oval-barrel form of about 1 mm peak to valley at 3000 rpm. Each law is
-given the nominal drive without its resonances, and runs with drives that differ from it. Their first set is drawn by a
+The cell of ``config/oval3000.yaml`` turns an oval form of 0.84 mm peak to valley at 3000 rpm. Each law is given
+the nominal drive without its resonances, and runs with drives that differ from it. Their first set is drawn by a
 published seed, so that results can be compared, the second one by a seed that is drawn at the time, so that no law can
 be tuned to it. Each drive has a noise and a random speed of its own; all laws get the same ones.
 """

@@ -131,5 +131,10 @@ def test_adrc_removes_a_constant_force_and_a_part_of_the_keyways():
     assert 1.0 < error({}) < 0.5 * error(slow)
 
 
+def test_the_scenario_has_the_settings_of_ours():
+    own = cells.load("oval3000").nodes["controller"]
+    assert oval3000.LAWS["ours"].items() <= {**own.model_dump(), **oval3000._ANY}.items()
+
+
 def test_adrc_is_offered_as_the_laws_of_packages_are():
     assert oval3000.TABLES["adrc"] is Adrc.Parameters

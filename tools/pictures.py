@@ -93,6 +93,7 @@ TABLE = {
     "study-drive-tolerance.png": _study("drive-tolerance", 60),
     "study-invariance.png": _study("invariance", 10),
     "study-multichannel.png": _study("multichannel", 10),
+    "study-oval3000.png": _study("oval3000", 300, options=" --set fresh_seed=1544672515"),
     "study-piston.png": _study("piston", 10),
     "study-robust.png": _study("robust", 600),
     "study-sampled-servo.png": _study("sampled-servo", 30, "feed"),
