@@ -26,7 +26,7 @@ GRIDS: dict[str, dict[str, list[object]]] = {
         "proportional": [0.0, 0.2, 0.5, 1.0], "integral": [10.0, 100.0, 300.0, 700.0],
         "derivative": [0.0, 0.3e-3, 1e-3], "derivative_bandwidth": [1600.0],
     },
-    "AFC": {"highest_order": [4, 8, 12, 16, 24], "rate": [0.5, 1.0, 2.0, 4.0, 8.0]},
+    "AFC": {"highest_order": [8, 12, 16], "rate": [4.0, 8.0, 12.0, 16.0, 24.0]},
     "ADRC": {
         "observer_bandwidth": [300.0, 700.0, 1000.0, 1500.0, 2000.0, 2500.0, 3000.0, 4000.0],
         "control_bandwidth": [1000.0, 1500.0, 2000.0, 2500.0, 3000.0],

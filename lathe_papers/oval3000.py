@@ -63,9 +63,9 @@ LAWS: dict[str, cells.Values] = {
     },
     "comp.": {
         **_ANY, "stage": "compound_controller",
-        "proportional": 1.0, "integral": 10.0, "derivative": 0.3e-3, "derivative_bandwidth": 1600.0,
+        "proportional": 1.0, "integral": 10.0, "derivative": 0.0, "derivative_bandwidth": 1600.0,
     },
-    "AFC": {**_ANY, "stage": "resonant_controller", "highest_order": 8, "rate": 4.0},
+    "AFC": {**_ANY, "stage": "resonant_controller", "highest_order": 12, "rate": 12.0},
     "ADRC": {**_ANY, "stage": "adrc", "observer_bandwidth": 1000.0, "control_bandwidth": 2000.0},
     "ours": {
         **_ANY, "stage": "disturbance_controller", "identification_bandwidth": 3000.0,
