@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured frequency responses: read from a file, or estimated from a record of command and response.
+
+The estimate is H1 by Welch's method, the cross spectrum over the spectrum of the command, with the coherence
+
+    γ² = |Suy|²/(Suu·Syy)
+
+and the variance of real and imaginary part each (Bendat and Piersol, Random Data, 4th ed., ch. 9.2)
+
+    (1 - γ²)/(2·n·γ²)·|H1|²,
+
+n the number of independent averages. A periodic command is averaged over its periods without a window, which has no
+leakage. Another one takes Hann windows with an overlap of 3/4. Their expected value is then the response smoothed over
+neighbouring bins, with the weights 1/6, 2/3, 1/6 to second order in the resolution; `FrequencyResponse.smoothed` does
+the same with a model. Every second bin is used: neighbours are correlated.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc.errors import InputError
+from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.table import write_table
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+Hold = Literal["linear", "zero", "none"]
+
+LEAST = 16  #: points of a response
+AVERAGES = 16.0  #: assumed for a coherence whose number of averages is not given
+
+_LEAST_SAMPLES = 512
+_MOST_FREQUENCY = 0.4  # of the sampling frequency: near a half, images of the band fold back
+_RESOLUTION = 0.5  # [Hz], the finest without a wish
+_SEGMENTS = 8  # of the record, at least, without a wish
+_LONGEST = 2**22  # samples of a segment
+_LEAST_COHERENCE = 0.5
+_LEAST_POWER = 1e-10  # of the command in a bin, over the largest
+_SURE = 1e-12  # of the coherence below 1
+_LEAST_DEVIATION = 1e-6  # relative, below which a measurement is never
+_PERIODIC = 0.01  # RMS difference between two periods of the command, over its RMS
+_SEARCHED = 2**21  # samples in which a period is searched
+_PERIODS = 4  # at least, after the first, in which the drive settles
+_STILL = 1e-12
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """Measured frequency response.
+
+    Args:
+        frequency: frequencies, increasing, above 0 [rad/s], shape (n,), n at least `LEAST`.
+        value: response, shape (n,).
+        deviation: standard deviation of real and imaginary part each, relative to the magnitude, shape (n,); None if
+            unknown.
+        coherence: coherence γ² between command and response, shape (n,); None if unknown.
+        averages: number of independent averages; 0 if unknown.
+        resolution: distance of the bins of Hann windows, over which the response is smoothed [rad/s]; 0: not smoothed.
+
+    Raises:
+        InputError: the arrays are not such a response.
+    """
+
+    frequency: Array
+    value: Complex
+    deviation: Array | None = None
+    coherence: Array | None = None
+    averages: float = 0.0
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        frequency, count = self.frequency, self.frequency.size
+        if count < LEAST:
+            raise InputError(f"frequency response: {count} points; allowed: {LEAST} or more")
+        falling = np.flatnonzero(np.diff(frequency, prepend=0.0) <= 0.0)
+        if falling.size:
+            at = int(falling[0])
+            raise InputError(
+                f"frequency response: {frequency[at] / (2.0 * np.pi):.6g} Hz at point {at + 1}; allowed: above 0 and "
+                "increasing"
+            )
+        if not np.all(np.abs(self.value) > 0.0):
+            at = int(np.argmin(np.abs(self.value)))
+            raise InputError(
+                f"frequency response: 0 at {frequency[at] / (2.0 * np.pi):.6g} Hz; allowed: a magnitude above 0 (leave "
+                "the point out)"
+            )
+
+    def smoothed(self, response: Callable[[Array], npt.NDArray[np.complex128]]) -> npt.NDArray[np.complex128]:
+        """Return a model's response as this measurement would show it, from one of frequencies [rad/s].
+
+        Args:
+            response: function of frequencies of shape (n,), with a result of shape (n,) or (n, k).
+        """
+        if not self.resolution:
+            return response(self.frequency)
+        below, at, above = (response(self.frequency + offset) for offset in (-self.resolution, 0.0, self.resolution))
+        return (below + 4.0 * at + above) / 6.0
+
+    def within(self, low: float, high: float) -> "FrequencyResponse":
+        """Return the points from ``low`` to ``high`` [rad/s].
+
+        Raises:
+            InputError: too few points are left.
+        """
+        kept = (self.frequency >= low) & (self.frequency <= high)
+        return FrequencyResponse(
+            self.frequency[kept],
+            self.value[kept],
+            None if self.deviation is None else self.deviation[kept],
+            None if self.coherence is None else self.coherence[kept],
+            self.averages,
+            self.resolution,
+        )
+
+
+def deviation_of(coherence: Array, averages: float) -> Array:
+    """Return the relative standard deviation of real and imaginary part of H1 for a coherence, shape (n,)."""
+    rest = np.maximum(1.0 - coherence, _SURE)
+    return np.maximum(np.sqrt(rest / (2.0 * averages * coherence)), _LEAST_DEVIATION)
+
+
+def _period(command: Array) -> int:
+    """Return the period of a command in samples; 0 if it has none, or too few of them."""
+    part = command[:_SEARCHED] - command[:_SEARCHED].mean()
+    size = scipy.fft.next_fast_len(2 * part.size, real=True)
+    spectrum = scipy.fft.rfft(part, size)
+    # Products of the two parts that overlap at a lag, over their RMS: 1 at a period.
+    product = scipy.fft.irfft(np.abs(spectrum) ** 2, size)[: part.size]
+    energy = np.append(0.0, np.cumsum(part**2))
+    lags = np.arange(1, part.size * 2 // 3)
+    likeness = product[lags] / np.sqrt(np.maximum(energy[part.size - lags] * (energy[-1] - energy[lags]), _STILL**2))
+    below = np.flatnonzero(likeness < 0.9)
+    if not below.size:
+        return 0
+    near = np.flatnonzero(likeness[below[0] :] > 1.0 - _PERIODIC) + below[0]
+    if not near.size:
+        return 0
+    # The first maximum: smooth commands are alike at some lags around it, too.
+    begin = int(near[0])
+    end = begin + int(np.argmax(np.append(likeness[begin:] < 1.0 - _PERIODIC, True)))  # noqa: FBT003 - an element
+    period = int(lags[begin + int(np.argmax(likeness[begin:end]))])
+    difference = command[period:] - command[:-period]
+    alike = np.sqrt(np.mean(difference**2)) <= _PERIODIC * np.std(command)
+    return period if alike and command.size >= (_PERIODS + 1) * period else 0
+
+
+def _spectra(signals: tuple[Array, Array], window: Array, hop: int, first: int) -> tuple[Array, Complex, Array, int]:
+    """Return Suu, Suy and Syy by Welch's method, shape (m,) each, and the number of segments.
+
+    They are those of `scipy.signal.csd` up to a factor, in memory that does not grow with the record.
+    """
+    size = window.size
+    power_u, cross, power_y = np.zeros(size // 2 + 1), np.zeros(size // 2 + 1, np.complex128), np.zeros(size // 2 + 1)
+    begins = range(first, signals[0].size - size + 1, hop)
+    for begin in begins:
+        u, y = (scipy.fft.rfft(window * signal[begin : begin + size]) for signal in signals)
+        power_u += u.real**2 + u.imag**2
+        power_y += y.real**2 + y.imag**2
+        cross += u.conj() * y
+    return power_u, cross, power_y, len(begins)
+
+
+def _independent(window: Array, hop: int, segments: int) -> float:
+    """Return the number of independent averages of overlapping segments (Welch 1967)."""
+    lags = np.arange(1, -(-window.size // hop))
+    likeness = np.array([window[lag * hop :] @ window[: -lag * hop] for lag in lags]) / (window @ window)
+    return segments / float(1.0 + 2.0 * np.sum(likeness**2 * np.maximum(1.0 - lags / segments, 0.0)))
+
+
+def estimate(
+    command: Array, response: Array, step: float, *, hold: Hold = "linear", resolution: float | None = None
+) -> FrequencyResponse:
+    """Estimate the frequency response of a drive from its command and response.
+
+    Args:
+        command: command, shape (n,).
+        response: response, shape (n,).
+        step: sampling step [s].
+        hold: course of the command between its samples: ``linear``, as in the cell; ``zero``: constant until the next,
+            as a converter holds it; ``none``: both are samples of analogue signals.
+        resolution: distance of the bins [Hz]; None: at least 8 segments, and at least 0.5 Hz. A periodic command has
+            the distance of its lines.
+
+    Raises:
+        InputError: the record is too short, the command is constant, or the response does not follow it.
+    """
+    if command.size < _LEAST_SAMPLES:
+        raise InputError(f"record: {command.size} samples; allowed: {_LEAST_SAMPLES} or more")
+    signals = (command - command.mean(), response - response.mean())
+    for name, signal in zip(("command", "response"), signals, strict=True):
+        if np.sqrt(np.mean(signal**2)) < _STILL:
+            raise InputError(f"record: the {name} does not move; nothing to identify")
+    period = _period(command) if resolution is None else 0
+    if period:
+        window, hop, first = np.ones(period), period, period
+    else:
+        size = _segment(command.size, step, resolution)
+        window, hop, first = scipy.signal.get_window("hann", size), size // 4, 0
+    power_u, cross, power_y, segments = _spectra(signals, window, hop, first)
+    averages = _independent(window, hop, segments) if hop < window.size else float(segments)
+    frequency = np.arange(window.size // 2 + 1) / (window.size * step)
+    bins = np.arange(1, frequency.size) if period else np.arange(2, frequency.size, 2)
+    bins = bins[(frequency[bins] <= _MOST_FREQUENCY / step) & (power_u[bins] > _LEAST_POWER * power_u[bins].max())]
+    coherence = np.minimum(np.abs(cross[bins]) ** 2 / np.maximum(power_u[bins] * power_y[bins], np.finfo(float).tiny), 1)
+    sure = coherence >= max(_LEAST_COHERENCE, 3.0 / averages)
+    bins, coherence = bins[sure], coherence[sure]
+    if bins.size < LEAST:
+        raise InputError(
+            f"record: the response follows the command at {bins.size} frequencies (coherence from {_LEAST_COHERENCE:g}"
+            f"); allowed: {LEAST} or more (a longer record, or a command that moves at more frequencies)"
+        )
+    value = cross[bins] / power_u[bins] / _held(frequency[bins] * step, hold)
+    return FrequencyResponse(
+        2.0 * np.pi * frequency[bins],
+        value,
+        deviation_of(coherence, averages),
+        coherence,
+        averages,
+        0.0 if period else 2.0 * np.pi / (window.size * step),
+    )
+
+
+def _segment(samples: int, step: float, resolution: float | None) -> int:
+    """Return the length of a Hann window, a power of 2."""
+    if resolution is None:
+        most = min(samples // _SEGMENTS, int(1.0 / (_RESOLUTION * step)), _LONGEST)
+        return 2 ** int(np.log2(max(most, 64)))
+    size = int(np.ceil(1.0 / (resolution * step)))
+    if not 64 <= size <= min(samples // 2, _LONGEST):
+        finest = 1.0 / (min(samples // 2, _LONGEST) * step)
+        raise InputError(
+            f"--resolution {resolution:g} Hz of {samples} samples; allowed: from {finest:.4g} to "
+            f"{1.0 / (64 * step):.4g} Hz"
+        )
+    return size
+
+
+def _held(cycles: Array, hold: Hold) -> Complex:
+    """Return the response of the hold at frequencies in parts of the sampling frequency."""
+    if hold == "none":
+        return np.ones(cycles.size, np.complex128)
+    if hold == "zero":
+        return np.sinc(cycles) * np.exp(-1j * np.pi * cycles)
+    return np.sinc(cycles) ** 2 + 0j
+
+
+def of_measurement(measurement: Measurement, averages: float | None = None) -> FrequencyResponse:
+    """Return the frequency response in a file.
+
+    The file has ``frequency`` with ``magnitude`` and ``phase``, ``real`` and ``imaginary``, or a complex ``response``;
+    besides, if known, ``relative_uncertainty`` (one standard deviation) or ``coherence``.
+
+    Args:
+        measurement: columns of the file.
+        averages: number of averages of the coherence; None: `AVERAGES`.
+
+    Raises:
+        InputError: a column is missing or out of range.
+    """
+    (frequency,) = measurement.read("frequency")
+    if "real" in measurement and "imaginary" in measurement:
+        real, imaginary = measurement.read("real", "imaginary")
+        value = real + 1j * imaginary
+    elif "magnitude" in measurement and "phase" in measurement:
+        magnitude, phase = measurement.read("magnitude", "phase")
+        value = magnitude * np.exp(1j * phase)
+    elif "response" in measurement:
+        (value,) = measurement.read("response")
+        if value.dtype.kind != "c":
+            raise measurement.lacking("a complex response with the frequency")
+    else:
+        raise measurement.lacking("frequency with magnitude and phase, or with real and imaginary")
+    if frequency.size != value.size:
+        raise InputError(f"{measurement.name}: {frequency.size} frequencies, {value.size} values; allowed: as many")
+    known: dict[str, Array] = {}
+    for quantity in ("coherence", "relative_uncertainty"):
+        if quantity in measurement:
+            known[quantity] = measurement.read(quantity)[0]
+    coherence, deviation = known.get("coherence"), known.get("relative_uncertainty")
+    if coherence is not None and not np.all((coherence >= 0.0) & (coherence <= 1.0)):
+        at = int(np.flatnonzero(~((coherence >= 0.0) & (coherence <= 1.0)))[0])
+        raise InputError(
+            f"{measurement.name}: coherence {coherence[at]:g} in row {at + 1}; allowed: from 0 to 1 (the square γ²)"
+        )
+    if deviation is not None and not np.all(deviation >= 0.0):
+        at = int(np.flatnonzero(~(deviation >= 0.0))[0])
+        raise InputError(f"{measurement.name}: relative_uncertainty {deviation[at]:g} in row {at + 1}; allowed: from 0")
+    order = np.argsort(frequency, kind="stable")
+    kept = order[frequency[order] > 0.0]  # the point at 0 Hz of an analyser has no phase
+    count = AVERAGES if averages is None else averages
+    if coherence is not None:
+        kept = kept[coherence[kept] >= _LEAST_COHERENCE]
+    if deviation is not None:
+        deviation = np.maximum(deviation, _LEAST_DEVIATION)
+    elif coherence is not None:
+        deviation = deviation_of(np.maximum(coherence, _LEAST_COHERENCE), count)
+    try:
+        return FrequencyResponse(
+            frequency[kept],
+            value[kept],
+            None if deviation is None else deviation[kept],
+            None if coherence is None else coherence[kept],
+            0.0 if coherence is None else count,
+        )
+    except InputError as error:
+        raise InputError(f"{measurement.name}: {error}") from None
+
+
+def write_points(path: Path, response: FrequencyResponse, deviation: Array, comment: str) -> None:
+    """Write the points of a response as a CSV file that `of_measurement` reads.
+
+    Args:
+        path: CSV file.
+        response: measured response.
+        deviation: its relative uncertainty, one standard deviation of real and imaginary part each, shape (n,).
+        comment: first line of the file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    columns = {
+        "frequency_hz": response.frequency / (2.0 * np.pi),
+        "real": response.value.real,
+        "imaginary": response.value.imag,
+        "relative_uncertainty": deviation,
+    }
+    if response.coherence is not None:
+        columns["coherence"] = response.coherence
+    write_table(path, ",".join(columns), np.stack(list(columns.values()), axis=1), comment, digits=12)
