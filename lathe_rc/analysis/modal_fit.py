@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.analysis.frequency_response import FrequencyResponse
+from lathe_rc.analysis.frequency_response import LEAST, FrequencyResponse
 from lathe_rc.analysis.modal_drive import BASE, EACH, MILLI, ModalDrive, resonance, resonance_step
 from lathe_rc.analysis.reduced_order import refuse_unusable
 from lathe_rc.errors import InputError
@@ -32,8 +32,11 @@ _LONGEST_DELAY = 0.1  # [s], as the drive's parameter allows
 _DAMPINGS = (1e-4, 20.0)
 _LARGEST_SHARE = 10.0  # of a mode
 _PAYS = 10.0  # least gain of BIC for a further mode: strong evidence (Kass and Raftery 1995)
+_AHEAD = 2  # modes beyond the best number that are tried: with one of two missing, a fit may be worse than with none
 _COARSE, _FINE = 0.03, 1e-4  # ε while modes are looked for: at first, and at least
-_FEW = 6000  # points in which modes are looked for
+_NEAR, _NEAR_LAG = (0.05, 0.1), 0.05  # of a held drive: logarithms of ω1 and ζ1, and delay over 1/ω1
+_BEYOND = 20.0  # times the highest frequency: place of the mode that stands for those that are still missing
+_FEW = 4000  # points in which modes are looked for
 _TRIED = (0.005, 0.02, 0.08)  # damping of a mode
 _PLACES = 1.012  # between tried frequencies
 _STARTS = 3  # places from which a further mode is fitted
@@ -63,12 +66,18 @@ class Data(Protocol):
     def deviation(self, drive: ModalDrive, model_error: float) -> Array:
         """Return the standard deviation of each number, for a relative error ε of the model, shape (m,)."""
 
+    def coarse(self, level: float) -> Array:
+        """Return deviations for the search of modes, relative to the static gain, not to a small magnitude."""
+
     def thinned(self, most: int) -> "Data":
         """Return at most about ``most`` of the points."""
 
     @property
     def band(self) -> tuple[float, float]:
         """Range of the frequencies of modes that it can show [rad/s]."""
+
+    def low(self) -> "Data":
+        """Return the points in which the drive without modes shows."""
 
     def starts(self) -> Sequence[ModalDrive]:
         """Return drives without modes from which the search starts."""
@@ -111,6 +120,11 @@ class ResponseData:
         model = model_error * np.abs(self.measured.smoothed(drive.response))
         return np.tile(np.hypot(noise, model), 2)
 
+    def coarse(self, level: float) -> Array:
+        """Return deviations for the search of modes."""
+        noise = 0.0 if self.measured.deviation is None else self.measured.deviation * np.abs(self.measured.value)
+        return np.tile(np.hypot(noise, level) * np.ones(self.measured.frequency.size), 2)
+
     def thinned(self, most: int) -> "ResponseData":
         """Return points at logarithmic distances, or all where they are further apart."""
         measured = self.measured
@@ -132,6 +146,11 @@ class ResponseData:
     def band(self) -> tuple[float, float]:
         """Range of the measured frequencies [rad/s]."""
         return float(self.measured.frequency[0]), float(self.measured.frequency[-1])
+
+    def low(self) -> "ResponseData":
+        """Return the points below the frequency at which the magnitude has fallen to 0.3."""
+        most = max(self._corner(), float(self.measured.frequency[min(2 * LEAST, self.measured.frequency.size) - 1]))
+        return ResponseData(self.measured.within(0.0, most))
 
     def starts(self) -> Sequence[ModalDrive]:
         """Return the best drives of linear fits with trial delays: W·e^{pτ}·(1 + a1·p + a2·p²) = 1."""
@@ -220,6 +239,10 @@ class StepData:
         """Return the standard deviation of each number: noise and error of the model are not separated."""
         return np.full(self.time.size, model_error)
 
+    def coarse(self, level: float) -> Array:
+        """Return deviations for the search of modes."""
+        return np.full(self.time.size, level)
+
     def thinned(self, most: int) -> "StepData":
         """Return every n-th point."""
         every = -(-self.time.size // most)
@@ -229,6 +252,10 @@ class StepData:
     def band(self) -> tuple[float, float]:
         """Range of frequencies between the length of the record and its step [rad/s]."""
         return 2.0 * np.pi / float(self.time[-1] - self.time[0]), 0.8 * np.pi / float(np.diff(self.time).min())
+
+    def low(self) -> "StepData":
+        """Return all points."""
+        return self
 
     def starts(self) -> Sequence[ModalDrive]:
         """Return drives whose response rises through 1/2 where the measured one does."""
@@ -296,24 +323,39 @@ class ModalFit:
         return [self.drive, *(ModalDrive.of_searched(place) for place in places)]
 
 
-def _search(data: Data, start: ModalDrive, model_error: float, loss: str = "linear") -> ModalDrive:
-    """Fit all parameters by weighted least squares from a start."""
-    deviation = data.deviation(start, model_error)
+def _search(
+    data: Data, start: ModalDrive, deviation: Array, *, rest: bool = False, held: ModalDrive | None = None
+) -> ModalDrive:
+    """Fit all parameters by weighted least squares from a start.
+
+    Args:
+        data: the points.
+        start: drive from which the search starts.
+        deviation: standard deviations of the points, shape (m,).
+        rest: whether the last mode stands for those that are still missing: far above the band, static within it. The
+            loss is then one on which their points have little influence.
+        held: drive near which frequency, damping and delay stay; None: they are free.
+    """
     low, high = data.band
     count = len(start.mode_frequency)
-    bottom = [np.log(low / 3.0), np.log(_DAMPINGS[0]), 0.0, *[np.log(low), np.log(_DAMPINGS[0]), -_LARGEST_SHARE] * count]
-    top = [
-        *(np.log(high * 3.0), np.log(_DAMPINGS[1]), _LONGEST_DELAY / MILLI),
-        *[np.log(high), np.log(_DAMPINGS[1]), _LARGEST_SHARE] * count,
-    ]
-    begin = np.clip(start.searched(), np.array(bottom) + 1e-9, np.array(top) - 1e-9)
+    own = (np.log([low / 3.0, high * 3.0]), np.log(_DAMPINGS), (0.0, _LONGEST_DELAY / MILLI))
+    mode = (np.log([low, high]), np.log(_DAMPINGS), (-_LARGEST_SHARE, _LARGEST_SHARE))
+    bounds = np.array([*own, *(mode * count)], dtype=np.float64)
+    if rest:
+        bounds[-EACH : -EACH + 2] = np.log([[0.5 * _BEYOND * high, 2.0 * _BEYOND * high], [0.5, 2.0]])
+    if held is not None:
+        near = np.array([*_NEAR, _NEAR_LAG / (held.natural_frequency * MILLI)])
+        bounds[:BASE] = held.searched()[:BASE, None] + near[:, None] * np.array([-1.0, 1.0])
+        bounds[2, 0] = max(bounds[2, 0], 0.0)
+    bottom, top = bounds.T
+    begin = np.clip(start.searched(), bottom + 1e-9, top - 1e-9)
     found = scipy.optimize.least_squares(
         lambda x: data.residual(ModalDrive.of_searched(x)) / deviation,
         begin,
         jac=lambda x: data.jacobian(ModalDrive.of_searched(x)) / deviation[:, None],
         bounds=(bottom, top),
         x_scale="jac",
-        loss=loss,
+        loss="soft_l1" if rest else "linear",
         xtol=1e-10,
         ftol=1e-10,
         gtol=1e-10,
@@ -322,8 +364,21 @@ def _search(data: Data, start: ModalDrive, model_error: float, loss: str = "line
     return ModalDrive.of_searched(found.x)
 
 
-def _cost(data: Data, drive: ModalDrive, model_error: float) -> float:
-    return float(np.sum((data.residual(drive) / data.deviation(drive, model_error)) ** 2))
+def _first(data: Data) -> ModalDrive:
+    """Return the drive without modes that the low frequencies show."""
+    low = data.low()
+    deviation = low.coarse(_FINE)
+    found = [_search(low, _with_rest(low, start), deviation, rest=True) for start in data.starts()]
+    return _without_rest(min(found, key=lambda one: _robust_cost(low, one, deviation)))
+
+
+def _cost(data: Data, drive: ModalDrive, deviation: Array) -> float:
+    return float(np.sum((data.residual(drive) / deviation) ** 2))
+
+
+def _robust_cost(data: Data, drive: ModalDrive, deviation: Array) -> float:
+    """Return the cost of the loss ``soft_l1``, on which the points of further modes have little influence."""
+    return float(np.sum(2.0 * (np.sqrt(1.0 + (data.residual(drive) / deviation) ** 2) - 1.0)))
 
 
 def _model_error(data: Data, drive: ModalDrive) -> float:
@@ -331,7 +386,7 @@ def _model_error(data: Data, drive: ModalDrive) -> float:
     freedom = max(data.size - drive.searched().size, 1)
 
     def excess(logarithm: float) -> float:
-        return _cost(data, drive, float(np.exp(logarithm))) - freedom
+        return _cost(data, drive, data.deviation(drive, float(np.exp(logarithm)))) - freedom
 
     low, high = np.log(_EPSILON)
     if excess(low) <= 0.0:
@@ -343,7 +398,7 @@ def _polish(data: Data, drive: ModalDrive) -> tuple[ModalDrive, float]:
     """Fit all parameters with the error of the model that the residuals require; return both."""
     error = _model_error(data, drive)
     for _ in range(_ROUNDS):
-        drive, before = _search(data, drive, error), error
+        drive, before = _search(data, drive, data.deviation(drive, error)), error
         error = _model_error(data, drive)
         if abs(error - before) <= 0.02 * before:
             break
@@ -352,13 +407,32 @@ def _polish(data: Data, drive: ModalDrive) -> tuple[ModalDrive, float]:
 
 def _bic(data: Data, drive: ModalDrive, model_error: float) -> float:
     deviation = data.deviation(drive, model_error)
-    likelihood = _cost(data, drive, model_error) + 2.0 * float(np.sum(np.log(deviation)))
+    likelihood = _cost(data, drive, deviation) + 2.0 * float(np.sum(np.log(deviation)))
     return likelihood + (drive.searched().size + 1) * float(np.log(data.size))
 
 
-def _with_mode(data: Data, drive: ModalDrive, model_error: float) -> ModalDrive:
-    """Return the drive with a further mode where it reduces the residual most, all parameters fitted again."""
-    deviation = data.deviation(drive, model_error)
+def _with_rest(data: Data, drive: ModalDrive) -> ModalDrive:
+    """Return the drive with a mode for those that are still missing, see `_search`."""
+    return drive.with_mode(_BEYOND * data.band[1], 1.0, 0.0)
+
+
+def _without_rest(drive: ModalDrive) -> ModalDrive:
+    """Return the drive without its last mode."""
+    return ModalDrive(
+        drive.natural_frequency,
+        drive.damping,
+        drive.delay,
+        drive.mode_frequency[:-1],
+        drive.mode_damping[:-1],
+        drive.mode_participation[:-1],
+    )
+
+
+def _with_mode(data: Data, drive: ModalDrive, deviation: Array, held: ModalDrive | None) -> ModalDrive:
+    """Return the drive with a further mode where it reduces the residual most, all parameters fitted again.
+
+    The last mode of the drive is the one that stands for others, and stays the last.
+    """
     rest = data.residual(drive) / deviation
     low, high = data.band
     count = max(int(np.log(0.98 * high / (1.5 * low)) / np.log(_PLACES)), 8)
@@ -376,11 +450,13 @@ def _with_mode(data: Data, drive: ModalDrive, model_error: float) -> ModalDrive:
         place = int(np.argmax(best))
         row = int(np.argmax(gains[:, place]))
         share = float(np.clip(shares[row, place], -1.0, 1.0))
-        found.append(_search(data, drive.with_mode(float(frequency[place]), _TRIED[row], share), model_error))
+        begun = _without_rest(drive).with_mode(float(frequency[place]), _TRIED[row], share)
+        begun = begun.with_mode(*drive.modes[-1])
+        found.append(_search(data, begun, deviation, rest=True, held=held))
         best[np.abs(np.log(frequency / frequency[place])) < np.log(_APART)] = -1.0
         if best.max() <= 0.0:
             break
-    return min(found, key=lambda one: _cost(data, one, model_error))
+    return min(found, key=lambda one: _robust_cost(data, one, deviation))
 
 
 def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] = lambda _: None) -> ModalFit:
@@ -398,33 +474,33 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
     fewest = 2 * (BASE + EACH * (modes or 0))
     if data.size < fewest:
         raise InputError(f"fit: {data.size} real numbers; allowed: {fewest} or more for {modes or 0} modes")
-    coarse = data.thinned(_FEW)
-    level = _COARSE
     report(0)
-    drive = min(
-        (_search(coarse, start, level, "soft_l1") for start in data.starts()),
-        key=lambda one: _robust_cost(coarse, one, level),
-    )
-    chosen, error = _polish(data, drive)
-    bic = [_bic(data, chosen, error)]
+    points = data.thinned(_FEW)
+    deviation = points.coarse(_COARSE)
+    first = _first(data)
+    # With modes missing, a fit of all points distorts the drive that the low frequencies show, and this one may be
+    # wrong where a mode is near: both are tried.
+    tracks = {held: _search(points, _with_rest(points, first), deviation, rest=True, held=held) for held in (first, None)}
+    chosen, error = min((_polish(points, _without_rest(drive)) for drive in tracks.values()), key=lambda pair: pair[1])
+    bic = [_bic(points, chosen, error)]
     for count in range(1, wanted + 1):
-        if data.size < 2 * (BASE + EACH * count):
+        if points.size < 2 * (BASE + EACH * count):
             break
         report(count)
-        further, further_error = _polish(data, _with_mode(coarse, drive, level))
-        bic.append(_bic(data, further, further_error))
-        if modes is None and bic[-1] > bic[-2] - _PAYS:
+        if error < _COARSE:  # the modes so far are right: a further one is looked for with the error that they leave
+            tracks = {None: _with_rest(points, chosen)}
+            deviation = points.deviation(chosen, max(error, _FINE))
+        tracks = {held: _with_mode(points, drive, deviation, held) for held, drive in tracks.items()}
+        further, further_error = min(
+            (_polish(points, _without_rest(drive)) for drive in tracks.values()), key=lambda pair: pair[1]
+        )
+        bic.append(_bic(points, further, further_error))
+        if modes is not None or bic[-1] < min(bic[:-1]) - _PAYS:
+            chosen, error = further, further_error
+        elif error < _COARSE or count - len(chosen.mode_frequency) >= _AHEAD:
             break
-        chosen, error = further, further_error
-        # The next mode is looked for with the error that this model leaves.
-        drive, level = chosen, min(level, max(error, _FINE))
+    chosen, error = _polish(data, chosen)
     return ModalFit(chosen, _covariance(data, chosen, error), error, tuple(bic))
-
-
-def _robust_cost(data: Data, drive: ModalDrive, model_error: float) -> float:
-    """Return the cost of the loss ``soft_l1``, on which points of modes have little influence."""
-    square = (data.residual(drive) / data.deviation(drive, model_error)) ** 2
-    return float(np.sum(2.0 * (np.sqrt(1.0 + square) - 1.0)))
 
 
 def _covariance(data: Data, drive: ModalDrive, model_error: float) -> Array:
