@@ -64,7 +64,7 @@ setup(
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
     extras_require={
-        **{name: requirements(name) for name in ("notebook", "sweep", "view")},
+        **{name: requirements(name) for name in ("formats", "notebook", "sweep", "view")},
         # pip builds the messages from their sdist, see msg_defs/pyproject.toml
         "ros": [*requirements("ros"), f"lathe_rc_msgs=={VERSION}"],
     },

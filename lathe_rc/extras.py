@@ -11,6 +11,7 @@ from types import ModuleType
 from lathe_rc.errors import LatheError
 
 _MODULES = {
+    "formats": ("asammdf", "nptdms"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),
@@ -23,6 +24,7 @@ _MODULES = {
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
 _CHECKOUT = {
+    "formats": "./lathe setup formats in a checkout",
     "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
     "sweep": "./lathe setup sweep in a checkout",
     "view": "./lathe setup view in a checkout",

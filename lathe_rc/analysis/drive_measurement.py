@@ -21,13 +21,14 @@ def frequency_response(
     hold: Hold = "linear",
     resolution: float | None = None,
     averages: float | None = None,
+    highest: float | None = None,
 ) -> FrequencyResponse | None:
     """Return the frequency response that a measurement has or shows; None for a step.
 
     Args:
         measurement: quantities of the measurement.
         rate: sampling frequency of a record [Hz]; None: that of its time.
-        hold, resolution: see `lathe_rc.analysis.frequency_response.estimate`.
+        hold, resolution, highest: see `lathe_rc.analysis.frequency_response.estimate`.
         averages: number of averages of a coherence in the measurement.
 
     Raises:
@@ -46,7 +47,7 @@ def frequency_response(
         return None
     step = measurement.clock(rate, "command", "response").step
     try:
-        return estimate(command, response, step, hold=hold, resolution=resolution)
+        return estimate(command, response, step, hold=hold, resolution=resolution, highest=highest)
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None
 
@@ -94,7 +95,10 @@ def data(
     Raises:
         InputError: the measurement is unusable.
     """
-    response = frequency_response(measurement, rate=rate, hold=hold, resolution=resolution, averages=averages)
+    highest = band[1] if band else None
+    response = frequency_response(
+        measurement, rate=rate, hold=hold, resolution=resolution, averages=averages, highest=highest
+    )
     if response is None:
         return step_response(measurement, rate=rate, hold=hold)
     return ResponseData(response.within(*band) if band else response)

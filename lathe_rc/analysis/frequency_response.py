@@ -36,11 +36,14 @@ LEAST = 16  #: points of a response
 AVERAGES = 16.0  #: assumed for a coherence whose number of averages is not given
 
 _LEAST_SAMPLES = 512
-_MOST_FREQUENCY = 0.4  # of the sampling frequency: near a half, images of the band fold back
+_HIGHEST, _MOST_FREQUENCY = 0.2, 0.4  # of the sampling frequency, without a wish and at most: images fold back
+_APPROXIMATE = 1e-4  # relative error of the estimate itself: smoothing to second order, images
 _RESOLUTION = 0.5  # [Hz], the finest without a wish
 _SEGMENTS = 8  # of the record, at least, without a wish
 _LONGEST = 2**22  # samples of a segment
 _LEAST_COHERENCE = 0.5
+_TREND = 31  # bins over which the coherence is judged
+_SWEEPING = 0.25  # part of the segments that command a frequency, below which the command sweeps; 1/2 in noise
 _LEAST_POWER = 1e-10  # of the command in a bin, over the largest
 _SURE = 1e-12  # of the coherence below 1
 _LEAST_DEVIATION = 1e-6  # relative, below which a measurement is never
@@ -151,20 +154,42 @@ def _period(command: Array) -> int:
     return period if alike and command.size >= (_PERIODS + 1) * period else 0
 
 
-def _spectra(signals: tuple[Array, Array], window: Array, hop: int, first: int) -> tuple[Array, Complex, Array, int]:
-    """Return Suu, Suy and Syy by Welch's method, shape (m,) each, and the number of segments.
+@dataclass
+class _Spectra:
+    """Sums over the segments of Welch's method, shape (m,) each.
 
     They are those of `scipy.signal.csd` up to a factor, in memory that does not grow with the record.
+
+    Attributes:
+        power_u, cross, power_y: Suu, Suy and Syy.
+        square_u: sum of the squares of the segments' Suu.
+        segments: number of segments.
     """
-    size = window.size
-    power_u, cross, power_y = np.zeros(size // 2 + 1), np.zeros(size // 2 + 1, np.complex128), np.zeros(size // 2 + 1)
-    begins = range(first, signals[0].size - size + 1, hop)
-    for begin in begins:
-        u, y = (scipy.fft.rfft(window * signal[begin : begin + size]) for signal in signals)
-        power_u += u.real**2 + u.imag**2
-        power_y += y.real**2 + y.imag**2
-        cross += u.conj() * y
-    return power_u, cross, power_y, len(begins)
+
+    power_u: Array
+    cross: Complex
+    power_y: Array
+    square_u: Array
+    segments: int
+
+    @classmethod
+    def of(cls, signals: tuple[Array, Array], window: Array, hop: int, first: int) -> "_Spectra":
+        size, bins = window.size, window.size // 2 + 1
+        begins = range(first, signals[0].size - size + 1, hop)
+        sums = cls(np.zeros(bins), np.zeros(bins, np.complex128), np.zeros(bins), np.zeros(bins), len(begins))
+        for begin in begins:
+            u, y = (scipy.fft.rfft(window * signal[begin : begin + size]) for signal in signals)
+            power = u.real**2 + u.imag**2
+            sums.power_u += power
+            sums.square_u += power**2
+            sums.power_y += y.real**2 + y.imag**2
+            sums.cross += u.conj() * y
+        return sums
+
+    def sweeps(self, bins: Array) -> bool:
+        """Return whether a frequency is commanded in few of the segments only, as by a chirp."""
+        share = self.power_u[bins] ** 2 / (self.segments * np.maximum(self.square_u[bins], np.finfo(float).tiny))
+        return bool(np.median(share) < _SWEEPING)
 
 
 def _independent(window: Array, hop: int, segments: int) -> float:
@@ -175,7 +200,8 @@ def _independent(window: Array, hop: int, segments: int) -> float:
 
 
 def estimate(
-    command: Array, response: Array, step: float, *, hold: Hold = "linear", resolution: float | None = None
+    command: Array, response: Array, step: float, *, hold: Hold = "linear", resolution: float | None = None,
+    highest: float | None = None,
 ) -> FrequencyResponse:
     """Estimate the frequency response of a drive from its command and response.
 
@@ -187,6 +213,8 @@ def estimate(
             as a converter holds it; ``none``: both are samples of analogue signals.
         resolution: distance of the bins [Hz]; None: at least 8 segments, and at least 0.5 Hz. A periodic command has
             the distance of its lines.
+        highest: highest frequency [rad/s], up to 0.4 of the sampling frequency; None: 0.2 of it. Parts of the response
+            above the sampling frequency fold back, 0.4 % of a second order at 0.2 and 20 % at 0.4.
 
     Raises:
         InputError: the record is too short, the command is constant, or the response does not follow it.
@@ -203,13 +231,22 @@ def estimate(
     else:
         size = _segment(command.size, step, resolution)
         window, hop, first = scipy.signal.get_window("hann", size), size // 4, 0
-    power_u, cross, power_y, segments = _spectra(signals, window, hop, first)
-    averages = _independent(window, hop, segments) if hop < window.size else float(segments)
     frequency = np.arange(window.size // 2 + 1) / (window.size * step)
     bins = np.arange(1, frequency.size) if period else np.arange(2, frequency.size, 2)
-    bins = bins[(frequency[bins] <= _MOST_FREQUENCY / step) & (power_u[bins] > _LEAST_POWER * power_u[bins].max())]
+    most = _HIGHEST / step if highest is None else min(highest / (2.0 * np.pi), _MOST_FREQUENCY / step)
+    bins = bins[frequency[bins] <= most]
+    sums = _Spectra.of(signals, window, hop, first)
+    if not period and sums.sweeps(bins):
+        # All parts of a sweep count alike with a segment of rest before and after it.
+        padded = tuple(np.pad(signal, window.size) for signal in signals)
+        sums = _Spectra.of((padded[0], padded[1]), window, hop, 0)
+    averages = _independent(window, hop, sums.segments) if hop < window.size else float(sums.segments)
+    power_u, cross, power_y = sums.power_u, sums.cross, sums.power_y
+    bins = bins[power_u[bins] > _LEAST_POWER * power_u[bins].max()]
     coherence = np.minimum(np.abs(cross[bins]) ** 2 / np.maximum(power_u[bins] * power_y[bins], np.finfo(float).tiny), 1)
-    sure = coherence >= max(_LEAST_COHERENCE, 3.0 / averages)
+    # The band ends where most bins are incoherent: single ones chosen by their coherence would be too large by chance.
+    trend = scipy.ndimage.median_filter(coherence, min(_TREND, coherence.size))
+    sure = (trend >= _LEAST_COHERENCE) & (coherence >= min(3.0 / averages, _LEAST_COHERENCE))
     bins, coherence = bins[sure], coherence[sure]
     if bins.size < LEAST:
         raise InputError(
@@ -220,7 +257,7 @@ def estimate(
     return FrequencyResponse(
         2.0 * np.pi * frequency[bins],
         value,
-        deviation_of(coherence, averages),
+        np.hypot(deviation_of(coherence, averages), _APPROXIMATE),
         coherence,
         averages,
         0.0 if period else 2.0 * np.pi / (window.size * step),
