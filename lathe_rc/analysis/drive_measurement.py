@@ -28,8 +28,10 @@ def frequency_response(
     Args:
         measurement: quantities of the measurement.
         rate: sampling frequency of a record [Hz]; None: that of its time.
-        hold, resolution, highest: see `lathe_rc.analysis.frequency_response.estimate`.
-        averages: number of averages of a coherence in the measurement.
+        hold: course of a record's command between its samples (`lathe_rc.analysis.frequency_response.estimate`).
+        resolution: distance of the bins of a record [Hz]; None: chosen.
+        averages: number of averages of a coherence in the measurement; None: 16.
+        highest: highest frequency of a record [rad/s]; None: 0.2 of its sampling frequency.
 
     Raises:
         InputError: the quantities are those of no measurement, or unusable.
@@ -75,7 +77,7 @@ def step_response(measurement: Measurement, *, rate: float | None = None, hold: 
         command, response = measurement.read("command", "response")
         first, step = _change(command), measurement.clock(rate, "command", "response").step
         height = float(command[-1] - command[0])
-        time = (np.arange(response.size - first) + (0.0 if hold == "zero" else 0.5)) * step
+        time = np.asarray((np.arange(response.size - first) + (0.0 if hold == "zero" else 0.5)) * step, np.float64)
         return StepData(time, (response[first:] - float(np.mean(response[:first]))) / height)
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None

@@ -37,7 +37,7 @@ AVERAGES = 16.0  #: assumed for a coherence whose number of averages is not give
 
 _LEAST_SAMPLES = 512
 _HIGHEST, _MOST_FREQUENCY = 0.2, 0.4  # of the sampling frequency, without a wish and at most: images fold back
-_APPROXIMATE = 1e-4  # relative error of the estimate itself: smoothing to second order, images
+_APPROXIMATE = 1e-4  # relative error of the estimate itself: smoothing to second order
 _RESOLUTION = 0.5  # [Hz], the finest without a wish
 _SEGMENTS = 8  # of the record, at least, without a wish
 _LONGEST = 2**22  # samples of a segment
@@ -147,7 +147,7 @@ def _period(command: Array) -> int:
         return 0
     # The first maximum: smooth commands are alike at some lags around it, too.
     begin = int(near[0])
-    end = begin + int(np.argmax(np.append(likeness[begin:] < 1.0 - _PERIODIC, True)))  # noqa: FBT003 - an element
+    end = begin + int(np.argmax(np.append(likeness[begin:] < 1.0 - _PERIODIC, True)))
     period = int(lags[begin + int(np.argmax(likeness[begin:end]))])
     difference = command[period:] - command[:-period]
     alike = np.sqrt(np.mean(difference**2)) <= _PERIODIC * np.std(command)
@@ -186,7 +186,7 @@ class _Spectra:
             sums.cross += u.conj() * y
         return sums
 
-    def sweeps(self, bins: Array) -> bool:
+    def sweeps(self, bins: npt.NDArray[np.intp]) -> bool:
         """Return whether a frequency is commanded in few of the segments only, as by a chirp."""
         share = self.power_u[bins] ** 2 / (self.segments * np.maximum(self.square_u[bins], np.finfo(float).tiny))
         return bool(np.median(share) < _SWEEPING)
@@ -200,7 +200,12 @@ def _independent(window: Array, hop: int, segments: int) -> float:
 
 
 def estimate(
-    command: Array, response: Array, step: float, *, hold: Hold = "linear", resolution: float | None = None,
+    command: Array,
+    response: Array,
+    step: float,
+    *,
+    hold: Hold = "linear",
+    resolution: float | None = None,
     highest: float | None = None,
 ) -> FrequencyResponse:
     """Estimate the frequency response of a drive from its command and response.
@@ -243,7 +248,9 @@ def estimate(
     averages = _independent(window, hop, sums.segments) if hop < window.size else float(sums.segments)
     power_u, cross, power_y = sums.power_u, sums.cross, sums.power_y
     bins = bins[power_u[bins] > _LEAST_POWER * power_u[bins].max()]
-    coherence = np.minimum(np.abs(cross[bins]) ** 2 / np.maximum(power_u[bins] * power_y[bins], np.finfo(float).tiny), 1)
+    coherence = np.minimum(
+        np.abs(cross[bins]) ** 2 / np.maximum(power_u[bins] * power_y[bins], np.finfo(float).tiny), 1
+    )
     # The band ends where most bins are incoherent: single ones chosen by their coherence would be too large by chance.
     trend = scipy.ndimage.median_filter(coherence, min(_TREND, coherence.size))
     sure = (trend >= _LEAST_COHERENCE) & (coherence >= min(3.0 / averages, _LEAST_COHERENCE))
@@ -257,7 +264,7 @@ def estimate(
     return FrequencyResponse(
         2.0 * np.pi * frequency[bins],
         value,
-        np.hypot(deviation_of(coherence, averages), _APPROXIMATE),
+        np.hypot(deviation_of(coherence, averages), np.maximum(_images(frequency[bins] * step, hold), _APPROXIMATE)),
         coherence,
         averages,
         0.0 if period else 2.0 * np.pi / (window.size * step),
@@ -268,7 +275,7 @@ def _segment(samples: int, step: float, resolution: float | None) -> int:
     """Return the length of a Hann window, a power of 2."""
     if resolution is None:
         most = min(samples // _SEGMENTS, int(1.0 / (_RESOLUTION * step)), _LONGEST)
-        return 2 ** int(np.log2(max(most, 64)))
+        return 1 << int(np.log2(max(most, 64)))
     size = int(np.ceil(1.0 / (resolution * step)))
     if not 64 <= size <= min(samples // 2, _LONGEST):
         finest = 1.0 / (min(samples // 2, _LONGEST) * step)
@@ -279,13 +286,23 @@ def _segment(samples: int, step: float, resolution: float | None) -> int:
     return size
 
 
+def _images(cycles: Array, hold: Hold) -> Array:
+    """Return the part of a second order's response that folds back, at frequencies over the sampling frequency.
+
+    Analogue signals have a filter against it.
+    """
+    if hold == "none":
+        return np.zeros(cycles.size)
+    return np.asarray((cycles / (1.0 - cycles)) ** (4 if hold == "linear" else 3))
+
+
 def _held(cycles: Array, hold: Hold) -> Complex:
     """Return the response of the hold at frequencies in parts of the sampling frequency."""
     if hold == "none":
         return np.ones(cycles.size, np.complex128)
     if hold == "zero":
-        return np.sinc(cycles) * np.exp(-1j * np.pi * cycles)
-    return np.sinc(cycles) ** 2 + 0j
+        return np.asarray(np.sinc(cycles) * np.exp(-1j * np.pi * cycles), np.complex128)
+    return np.asarray(np.sinc(cycles) ** 2, np.complex128)
 
 
 def of_measurement(measurement: Measurement, averages: float | None = None) -> FrequencyResponse:
@@ -301,34 +318,11 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
     Raises:
         InputError: a column is missing or out of range.
     """
-    (frequency,) = measurement.read("frequency")
-    if "real" in measurement and "imaginary" in measurement:
-        real, imaginary = measurement.read("real", "imaginary")
-        value = real + 1j * imaginary
-    elif "magnitude" in measurement and "phase" in measurement:
-        magnitude, phase = measurement.read("magnitude", "phase")
-        value = magnitude * np.exp(1j * phase)
-    elif "response" in measurement:
-        (value,) = measurement.read("response")
-        if value.dtype.kind != "c":
-            raise measurement.lacking("a complex response with the frequency")
-    else:
-        raise measurement.lacking("frequency with magnitude and phase, or with real and imaginary")
+    (frequency,), value = measurement.read("frequency"), _values(measurement)
     if frequency.size != value.size:
         raise InputError(f"{measurement.name}: {frequency.size} frequencies, {value.size} values; allowed: as many")
-    known: dict[str, Array] = {}
-    for quantity in ("coherence", "relative_uncertainty"):
-        if quantity in measurement:
-            known[quantity] = measurement.read(quantity)[0]
-    coherence, deviation = known.get("coherence"), known.get("relative_uncertainty")
-    if coherence is not None and not np.all((coherence >= 0.0) & (coherence <= 1.0)):
-        at = int(np.flatnonzero(~((coherence >= 0.0) & (coherence <= 1.0)))[0])
-        raise InputError(
-            f"{measurement.name}: coherence {coherence[at]:g} in row {at + 1}; allowed: from 0 to 1 (the square γ²)"
-        )
-    if deviation is not None and not np.all(deviation >= 0.0):
-        at = int(np.flatnonzero(~(deviation >= 0.0))[0])
-        raise InputError(f"{measurement.name}: relative_uncertainty {deviation[at]:g} in row {at + 1}; allowed: from 0")
+    coherence = _between(measurement, "coherence", 1.0)
+    deviation = _between(measurement, "relative_uncertainty", np.inf)
     order = np.argsort(frequency, kind="stable")
     kept = order[frequency[order] > 0.0]  # the point at 0 Hz of an analyser has no phase
     count = AVERAGES if averages is None else averages
@@ -348,6 +342,33 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
         )
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None
+
+
+def _values(measurement: Measurement) -> Complex:
+    """Return the complex response in a file."""
+    if "real" in measurement and "imaginary" in measurement:
+        real, imaginary = measurement.read("real", "imaginary")
+        return np.asarray(real + 1j * imaginary)
+    if "magnitude" in measurement and "phase" in measurement:
+        magnitude, phase = measurement.read("magnitude", "phase")
+        return np.asarray(magnitude * np.exp(1j * phase))
+    value = measurement.read("response")[0] if "response" in measurement else np.empty(0)
+    if value.dtype.kind != "c":
+        raise measurement.lacking("frequency with magnitude and phase, with real and imaginary, or a complex response")
+    return value.astype(np.complex128)
+
+
+def _between(measurement: Measurement, quantity: str, most: float) -> Array | None:
+    """Return a quantity after checking that it is between 0 and ``most``; None if the measurement lacks it."""
+    if quantity not in measurement:
+        return None
+    (values,) = measurement.read(quantity)
+    outside = np.flatnonzero((values < 0.0) | (values > most))
+    if outside.size:
+        at = int(outside[0])
+        allowed = "from 0" if np.isinf(most) else f"from 0 to {most:g}"
+        raise InputError(f"{measurement.name}: {quantity} {values[at]:g} in row {at + 1}; allowed: {allowed}")
+    return values
 
 
 def write_points(path: Path, response: FrequencyResponse, deviation: Array, comment: str) -> None:

@@ -66,7 +66,7 @@ class ModalDrive:
 
     def response(self, frequency: Array) -> Complex:
         """Return W(jω) at frequencies [rad/s], shape (n,)."""
-        p = 1j * frequency
+        p = np.asarray(1j * frequency, np.complex128)
         whole = (1.0 - sum(self.mode_participation)) * resonance(p, self.natural_frequency, self.damping)[0]
         for mode_frequency, mode_damping, share in self.modes:
             whole += share * resonance(p, mode_frequency, mode_damping)[0]
@@ -83,7 +83,7 @@ class ModalDrive:
 
     def derivatives(self, frequency: Array) -> Complex:
         """Return the derivatives of W(jω) by the searched parameters (see `searched`), shape (n, 3 + 3·modes)."""
-        p = 1j * frequency
+        p = np.asarray(1j * frequency, np.complex128)
         delayed = np.exp(-p * self.delay)
         rest = 1.0 - sum(self.mode_participation)
         own, by_frequency, by_damping = resonance(p, self.natural_frequency, self.damping)

@@ -109,7 +109,7 @@ class ResponseData:
 
     def mode(self, drive: ModalDrive, frequency: Array, damping: float) -> Array:
         """Return the derivatives of the residual by the participation of further modes."""
-        p = 1j * self.measured.frequency
+        p = np.asarray(1j * self.measured.frequency, np.complex128)
         own, delayed = resonance(p, drive.natural_frequency, drive.damping)[0], np.exp(-p * drive.delay)
         below = (p**2)[:, None] + 2.0 * damping * frequency * p[:, None] + frequency**2
         return _split(delayed[:, None] * (frequency**2 / below - own[:, None]))
@@ -206,8 +206,8 @@ class StepData:
             raise InputError(f"step response: time {a:g} s is followed by {b:g} s; allowed: increasing times")
         if not _LEAST_GAIN <= self.response[-1] <= _MOST_GAIN:
             raise InputError(
-                f"step response: ends at {self.response[-1]:.4g}; allowed: {_LEAST_GAIN:g} to {_MOST_GAIN:g} (divide by "
-                "the height of the step, and record until the drive has settled)"
+                f"step response: ends at {self.response[-1]:.4g}; allowed: {_LEAST_GAIN:g} to {_MOST_GAIN:g} (divide "
+                "by the height of the step, and record until the drive has settled)"
             )
 
     @property
@@ -349,10 +349,17 @@ def _search(
         bounds[2, 0] = max(bounds[2, 0], 0.0)
     bottom, top = bounds.T
     begin = np.clip(start.searched(), bottom + 1e-9, top - 1e-9)
+
+    def residual(x: Array) -> Array:
+        return np.asarray(data.residual(ModalDrive.of_searched(x)) / deviation, np.float64)
+
+    def jacobian(x: Array) -> Array:
+        return np.asarray(data.jacobian(ModalDrive.of_searched(x)) / deviation[:, None], np.float64)
+
     found = scipy.optimize.least_squares(
-        lambda x: data.residual(ModalDrive.of_searched(x)) / deviation,
+        residual,
         begin,
-        jac=lambda x: data.jacobian(ModalDrive.of_searched(x)) / deviation[:, None],
+        jac=jacobian,
         bounds=(bottom, top),
         x_scale="jac",
         loss="soft_l1" if rest else "linear",
@@ -480,7 +487,9 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
     first = _first(data)
     # With modes missing, a fit of all points distorts the drive that the low frequencies show, and this one may be
     # wrong where a mode is near: both are tried.
-    tracks = {held: _search(points, _with_rest(points, first), deviation, rest=True, held=held) for held in (first, None)}
+    tracks = {
+        held: _search(points, _with_rest(points, first), deviation, rest=True, held=held) for held in (first, None)
+    }
     chosen, error = min((_polish(points, _without_rest(drive)) for drive in tracks.values()), key=lambda pair: pair[1])
     bic = [_bic(points, chosen, error)]
     for count in range(1, wanted + 1):

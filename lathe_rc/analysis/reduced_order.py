@@ -9,8 +9,8 @@ Both stages of paper 004 (Figs 6-9):
 
 A model is linear in its numerator, so only the denominator is searched, and with it a delay e^{-pτ} if asked for. The
 poles of the model are kept stable by factors of second and first order with positive coefficients. The relative error
-of a frequency response is minimised, weighted by its uncertainty. The lags τ_i of the inverse have a lower bound: without
-it the optimum is the exact inverse, which is not realisable.
+of a frequency response is minimised, weighted by its uncertainty. The lags τ_i of the inverse have a lower bound:
+without it the optimum is the exact inverse, which is not realisable.
 """
 
 from collections.abc import Callable
@@ -219,7 +219,8 @@ def _search(
         residual: of these numbers.
         starts: logarithms from which the searches start.
         powers: power of a time that each coefficient is.
-        low, high: bounds of these times [s].
+        low: lower bound of these times [s].
+        high: upper bound of these times [s].
         delay: estimate of the delay [s]; None: the model has none.
     """
     bottom, top = np.log(low) * powers, np.log(high) * powers
@@ -305,7 +306,11 @@ def fit_response(
 
     Args:
         measured: frequency response of the channel.
-        zeros, poles, integrator, oscillating, delayed: see `fit`.
+        zeros: degree of the numerator.
+        poles: number of poles without the integrator.
+        integrator: whether the model has an integrator.
+        oscillating: whether poles may be complex.
+        delayed: whether the model has a delay.
 
     Raises:
         InputError: the orders do not give a strictly proper model.
@@ -330,7 +335,7 @@ def fit_response(
 
     def residual(x: Array) -> Array:
         error = (numerator(x)[2] - value) / deviation
-        return np.concatenate((error.real, error.imag)) / np.sqrt(value.size)
+        return np.asarray(np.concatenate((error.real, error.imag)) / np.sqrt(value.size), np.float64)
 
     powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
     low, high = 1.0 / float(measured.frequency[-1]), 1.0 / float(measured.frequency[0])

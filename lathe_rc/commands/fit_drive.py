@@ -6,7 +6,7 @@ import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -23,28 +23,28 @@ from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture, tables
 from lathe_rc.errors import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_GREY, _RED, _BLUE = "#7f7f7f", "#c0392b", "#1f6f8b"
 _NODE = ElectrodynamicActuator.kind
 
 
-class _Band(click.ParamType):
-    """Range of frequencies, ``LOW:HIGH`` in Hz, in rad/s."""
-
-    name = "LOW:HIGH"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float]:
-        low, colon, high = str(value).partition(":")
-        try:
-            band = (float(low) * _TURN, float(high) * _TURN)
-        except ValueError:
-            band = (0.0, 0.0)
-        if not colon or not 0.0 <= band[0] < band[1]:
-            self.fail(f"{value!r}; allowed: LOW:HIGH in Hz, LOW below HIGH", param, ctx)
-        return band
+def _band(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tuple[float, float] | None:
+    """Parse a range of frequencies, ``LOW:HIGH`` in Hz; return it in rad/s."""
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    try:
+        band = (float(low) * _TURN, float(high) * _TURN)
+    except ValueError:
+        band = (0.0, 0.0)
+    if not 0.0 <= band[0] < band[1]:
+        raise InputError(f"--band {text!r}; allowed: LOW:HIGH in Hz, LOW below HIGH")
+    return band
 
 
 @click.command("drive")
@@ -60,13 +60,13 @@ class _Band(click.ParamType):
 )
 @click.option("--resolution", type=options.POSITIVE, help="distance of the bins of a record [Hz]")
 @click.option("--averages", type=options.POSITIVE, help="behind the coherence of a file; default: 16")
-@click.option("--band", type=_Band(), help="frequencies that count [Hz]; default: all")
+@click.option("--band", callback=_band, metavar="LOW:HIGH", help="frequencies that count [Hz]; default: all")
 @click.option("--modes", type=click.IntRange(0, 24), help="number of modes; default: that of the least BIC")
-@click.option("--drives", type=click.IntRange(1, 4096), default=32, show_default=True, help="of the set, beside the fit")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the set")
 @click.option(
-    "-o", "--output", type=options.PATH, default=Path("drive.yaml"), show_default=True, help="parameter file"
+    "--drives", type=click.IntRange(1, 4096), default=32, show_default=True, help="of the set, beside the fit"
 )
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the set")
+@click.option("-o", "--output", type=options.PATH, default=Path("drive.yaml"), show_default=True, help="parameter file")
 @click.option("--figure", type=options.PATH, default=Path("fit-drive.png"), show_default=True)
 @options.as_json
 def drive(
@@ -87,8 +87,9 @@ def drive(
 ) -> None:
     """Delay, second order and modes of an electrodynamic drive (docs/drives.md).
 
-    MEASURED is a bag, or a file (CSV, Parquet, .mat, TDMS, MDF) with time,response of a step of 1; time,command,response
-    of a record; or frequency with magnitude,phase or real,imaginary. A unit may follow: time_ms, command_um.
+    MEASURED is a bag, or a file (CSV, Parquet, .mat, TDMS, MDF) with time,response of a step of 1; with
+    time,command,response of a record; or with frequency and magnitude,phase or real,imaginary. A unit may follow:
+    time_ms, command_um.
     """
     picture.check_place(figure)
     files.check_place("--output", output)
@@ -258,33 +259,42 @@ def _draw(path: Path, data: ResponseData | StepData, fit: ModalFit) -> None:
 
     figure = Figure(figsize=(8.0, 7.0) if isinstance(data, ResponseData) else (7.0, 5.0), layout="constrained")
     if isinstance(data, ResponseData):
-        measured = data.measured
-        frequency = measured.frequency / _TURN
-        model = measured.smoothed(fit.drive.response)
-        top, middle, bottom = figure.subplots(3, 1, sharex=True)
-        delayed = np.exp(1j * measured.frequency * fit.drive.delay)
-        for values, label, style in (
-            (measured.value, "measured", {"color": "#7f7f7f", "lw": 3.0}),
-            (model, f"model, {_count(fit)}", {"color": "#c0392b", "lw": 1.2}),
-        ):
-            top.loglog(frequency, np.abs(values), label=label, **style)
-            middle.semilogx(frequency, np.degrees(np.unwrap(np.angle(values * delayed))), label=label, **style)
-        bottom.loglog(frequency, np.abs(measured.value - model) / np.abs(model), color="#1f6f8b", lw=1.0, label="residual")
-        if measured.deviation is not None:
-            bottom.loglog(frequency, np.sqrt(2.0) * measured.deviation, color="#7f7f7f", lw=1.0, label="noise")
-        top.set(ylabel="magnitude")
-        middle.set(ylabel="phase without the delay [°]")
-        bottom.set(ylabel="relative to the model", xlabel="frequency [Hz]")
-        shown = (top, middle, bottom)
+        _draw_response(figure, data, fit)
     else:
-        top, bottom = figure.subplots(2, 1, sharex=True)
-        top.plot(data.time * 1e3, data.response, color="#7f7f7f", lw=3.0, label="measured")
-        top.plot(data.time * 1e3, fit.drive.step(data.time), color="#c0392b", lw=1.2, label=f"model, {_count(fit)}")
-        bottom.plot(data.time * 1e3, -data.residual(fit.drive), color="#1f6f8b", lw=1.0, label="residual")
-        top.set(ylabel="step response")
-        bottom.set(ylabel="residual", xlabel="time [ms]")
-        shown = (top, bottom)
-    for axes in shown:
+        _draw_step(figure, data, fit)
+    for axes in figure.axes:
         axes.grid(visible=True, alpha=0.3)
         axes.legend(fontsize=8)
     picture.save(figure, path)
+
+
+def _draw_response(figure: "Figure", data: ResponseData, fit: ModalFit) -> None:
+    measured = data.measured
+    frequency = measured.frequency / _TURN
+    model = measured.smoothed(fit.drive.response)
+    top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    delayed = np.exp(1j * measured.frequency * fit.drive.delay)
+    for values, label, colour, width in (
+        (measured.value, "measured", _GREY, 3.0),
+        (model, f"model, {_count(fit)}", _RED, 1.2),
+    ):
+        top.loglog(frequency, np.abs(values), label=label, color=colour, lw=width)
+        phase = np.degrees(np.unwrap(np.angle(values * delayed)))
+        middle.semilogx(frequency, phase, label=label, color=colour, lw=width)
+    residual = np.abs(measured.value - model) / np.abs(model)
+    bottom.loglog(frequency, residual, color=_BLUE, lw=1.0, label="residual")
+    if measured.deviation is not None:
+        bottom.loglog(frequency, np.sqrt(2.0) * measured.deviation, color=_GREY, lw=1.0, label="noise")
+    top.set(ylabel="magnitude")
+    middle.set(ylabel="phase without the delay [°]")
+    bottom.set(ylabel="relative to the model", xlabel="frequency [Hz]")
+
+
+def _draw_step(figure: "Figure", data: StepData, fit: ModalFit) -> None:
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    time = data.time * 1e3
+    top.plot(time, data.response, color=_GREY, lw=3.0, label="measured")
+    top.plot(time, fit.drive.step(data.time), color=_RED, lw=1.2, label=f"model, {_count(fit)}")
+    bottom.plot(time, -data.residual(fit.drive), color=_BLUE, lw=1.0, label="residual")
+    top.set(ylabel="step response")
+    bottom.set(ylabel="residual", xlabel="time [ms]")

@@ -46,7 +46,8 @@ class BagColumns:
         """
         with Source(self._path) as source:
             recorded = Recorded(source, {})
-            found = {name: recorded.whole(*name.rsplit(".", 1)) for name in names}
+            places = {name: name.rpartition(".") for name in names}
+            found = {name: recorded.whole(topic, field) for name, (topic, _, field) in places.items()}
         common = min(array.size for array in found.values())  # a run that was stopped may lack the last blocks of one
         return {name: array[:common] for name, array in found.items()}
 
@@ -63,4 +64,5 @@ def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
     """
     source = BagColumns(path)
     own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
-    return Measurement(str(path), source, {name: of for name, of in own.items() if of.column in source.units} | mapping)
+    own = {quantity: found for quantity, found in own.items() if found.column in source.units}
+    return Measurement(str(path), source, {**own, **mapping})
