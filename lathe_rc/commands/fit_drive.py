@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
+_NOTHING = 1e-6  # relative error of a model
+_OCTAVES = 8  # of the table of residuals; the last one has all that is below
 _GREY, _RED, _BLUE = "#7f7f7f", "#c0392b", "#1f6f8b"
 _NODE = ElectrodynamicActuator.kind
 
@@ -166,7 +168,7 @@ def _missed(data: ResponseData, fit: ModalFit) -> list[dict[str, float]]:
     model = measured.smoothed(fit.drive.response)
     residual = np.abs(measured.value - model) / np.abs(model)
     noise = np.zeros(residual.size) if measured.deviation is None else measured.deviation
-    octave = np.floor(np.log2(measured.frequency / measured.frequency[-1]) - 1e-9)
+    octave = np.maximum(np.floor(np.log2(measured.frequency / measured.frequency[-1]) - 1e-9), -_OCTAVES)
     rows = []
     for each in np.unique(octave):
         within = np.flatnonzero(octave == each)
@@ -208,17 +210,16 @@ def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path],
         out.print(f"frequency response: {measured.frequency.size} points from {band}{averages}")
     else:
         out.print(f"step response: {data.time.size} samples")
-    table = tables.table("", "frequency [Hz]", "[rad/s]", "damping", "participation", "delay [µs]", left=1)
+    table = tables.table("", "frequency [Hz]", "damping", "participation", "delay [µs]", left=1)
     drive, errors = fit.drive, fit.errors
 
-    def told(value: float, error: float) -> str:
-        return f"{value:.5g} ± {error:.1g}"
+    def told(value: float, error: float, digits: int = 5) -> str:
+        return f"{value:#.{digits}g} ± {error:.1g}"
 
     table.add_row(
         "drive",
         told(drive.natural_frequency / _TURN, errors.natural_frequency / _TURN),
-        f"{drive.natural_frequency:.6g}",
-        told(drive.damping, errors.damping),
+        told(drive.damping, errors.damping, 4),
         f"{1.0 - sum(drive.mode_participation):.4g}",
         told(drive.delay * 1e6, errors.delay * 1e6),
     )
@@ -226,9 +227,8 @@ def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path],
         table.add_row(
             f"mode {number}",
             told(mode[0] / _TURN, error[0] / _TURN),
-            f"{mode[0]:.6g}",
-            told(mode[1], error[1]),
-            told(mode[2], error[2]),
+            told(mode[1], error[1], 4),
+            told(mode[2], error[2], 4),
             "",
         )
     out.print(table)
@@ -236,7 +236,7 @@ def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path],
         values = ", ".join(f"{count}: {value - min(fit.bic):.4g}" for count, value in enumerate(fit.bic))
         out.print(f"{_count(fit)}, chosen by BIC (above the least, by number of modes: {values})")
     if isinstance(data, ResponseData):
-        missed = tables.table("octave [Hz]", "largest residual [%]", "at [Hz]", "noise there [%]", "RMS [%]", left=1)
+        missed = tables.table("octave [Hz]", "largest residual [%]", "at [Hz]", "noise [%]", "RMS [%]", left=1)
         for row in _missed(data, fit):
             missed.add_row(
                 f"{row['from_hz']:.4g} to {row['to_hz']:.4g}",
@@ -246,7 +246,8 @@ def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path],
                 f"{100.0 * row['rms']:.3g}",
             )
         out.print(missed)
-        out.print(f"relative error of the model beyond the noise: {100.0 * fit.model_error:.2g} %")
+        beyond = f"{100.0 * fit.model_error:.2g} % of the magnitude" if fit.model_error > _NOTHING else "none"
+        out.print(f"error of the model beyond the noise: {beyond}")
     else:
         out.print(f"residual: {100.0 * fit.model_error:.3g} % of the step, RMS")
     for name, path in places.items():
