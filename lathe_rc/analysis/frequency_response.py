@@ -10,9 +10,12 @@ and the variance of real and imaginary part each (Bendat and Piersol, Random Dat
     (1 - γ²)/(2·n·γ²)·|H1|²,
 
 n the number of independent averages. A periodic command is averaged over its periods without a window, which has no
-leakage. Another one takes Hann windows with an overlap of 3/4. Their expected value is then the response smoothed over
-neighbouring bins, with the weights 1/6, 2/3, 1/6 to second order in the resolution; `FrequencyResponse.smoothed` does
-the same with a model. Every second bin is used: neighbours are correlated.
+leakage. Another one takes Hann windows with an overlap of 3/4. A bin then shows the response averaged over the
+frequencies near it, weighted by the power of the command times that of the window. The mean frequency and the spread of
+these weights follow from a second transform, with the derivative of the window (Auger and Flandrin 1995); so a line of
+the command counts at its own frequency, and `FrequencyResponse.smoothed` averages a model to second order alike. It
+also adds the images of the model's response above the sampling frequency. Every second bin is used: neighbours are
+correlated.
 """
 
 from collections.abc import Callable
@@ -36,13 +39,16 @@ LEAST = 16  #: points of a response
 AVERAGES = 16.0  #: assumed for a coherence whose number of averages is not given
 
 _LEAST_SAMPLES = 512
-_HIGHEST, _MOST_FREQUENCY = 0.2, 0.4  # of the sampling frequency, without a wish and at most: images fold back
+_HIGHEST, _MOST_FREQUENCY = 0.2, 0.4  # of the sampling frequency, without a wish and at most
 _APPROXIMATE = 1e-4  # relative error of the estimate itself: smoothing to second order
 _RESOLUTION = 0.5  # [Hz], the finest without a wish
 _SEGMENTS = 8  # of the record, at least, without a wish
 _LONGEST = 2**22  # samples of a segment
 _LEAST_COHERENCE = 0.5
 _TREND = 31  # bins over which the coherence is judged
+_REST = 0.05  # of the RMS of the response, within which the drive is at rest
+_FAR = 1.5  # bins of spread; 0.58 in noise
+_NEXT = 1.0  # bins, to the next one that is used
 _SWEEPING = 0.25  # part of the segments that command a frequency, below which the command sweeps; 1/2 in noise
 _LEAST_POWER = 1e-10  # of the command in a bin, over the largest
 _SURE = 1e-12  # of the coherence below 1
@@ -64,7 +70,9 @@ class FrequencyResponse:
             unknown.
         coherence: coherence γ² between command and response, shape (n,); None if unknown.
         averages: number of independent averages; 0 if unknown.
-        resolution: distance of the bins of Hann windows, over which the response is smoothed [rad/s]; 0: not smoothed.
+        spread: standard deviation of the frequencies over which each value is an average [rad/s], shape (n,); None: 0.
+        sampling: sampling frequency whose images of the response the values contain [rad/s]; 0: none.
+        holding: power with which the hold of the command lowers the images: 1 held, 2 linear.
 
     Raises:
         InputError: the arrays are not such a response.
@@ -75,7 +83,9 @@ class FrequencyResponse:
     deviation: Array | None = None
     coherence: Array | None = None
     averages: float = 0.0
-    resolution: float = 0.0
+    spread: Array | None = None
+    sampling: float = 0.0
+    holding: int = 0
 
     def __post_init__(self) -> None:
         frequency, count = self.frequency, self.frequency.size
@@ -101,10 +111,33 @@ class FrequencyResponse:
         Args:
             response: function of frequencies of shape (n,), with a result of shape (n,) or (n, k).
         """
-        if not self.resolution:
-            return response(self.frequency)
-        below, at, above = (response(self.frequency + offset) for offset in (-self.resolution, 0.0, self.resolution))
-        return (below + 4.0 * at + above) / 6.0
+        shown = response(self.frequency)
+        if self.spread is not None:
+            # Three points with the weights 1/6, 2/3, 1/6 have this spread.
+            offset = np.sqrt(3.0) * self.spread
+            shown = (response(self.frequency - offset) + 4.0 * shown + response(self.frequency + offset)) / 6.0
+        if self.sampling:
+            for image in (self.frequency - self.sampling, self.frequency + self.sampling):
+                part = (self.frequency / image) ** self.holding
+                shown = shown + (response(image).T * part).T
+        return shown
+
+    def at(self, kept: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> "FrequencyResponse":
+        """Return some of the points.
+
+        Raises:
+            InputError: too few points are left.
+        """
+        return FrequencyResponse(
+            self.frequency[kept],
+            self.value[kept],
+            None if self.deviation is None else self.deviation[kept],
+            None if self.coherence is None else self.coherence[kept],
+            self.averages,
+            None if self.spread is None else self.spread[kept],
+            self.sampling,
+            self.holding,
+        )
 
     def within(self, low: float, high: float) -> "FrequencyResponse":
         """Return the points from ``low`` to ``high`` [rad/s].
@@ -112,15 +145,7 @@ class FrequencyResponse:
         Raises:
             InputError: too few points are left.
         """
-        kept = (self.frequency >= low) & (self.frequency <= high)
-        return FrequencyResponse(
-            self.frequency[kept],
-            self.value[kept],
-            None if self.deviation is None else self.deviation[kept],
-            None if self.coherence is None else self.coherence[kept],
-            self.averages,
-            self.resolution,
-        )
+        return self.at((self.frequency >= low) & (self.frequency <= high))
 
 
 def deviation_of(coherence: Array, averages: float) -> Array:
@@ -163,6 +188,8 @@ class _Spectra:
     Attributes:
         power_u, cross, power_y: Suu, Suy and Syy.
         square_u: sum of the squares of the segments' Suu.
+        offset: sum of (ν - f)·|U(ν)|² over the frequencies ν in the bin f, in bins times power.
+        offset_square: sum of (ν - f)²·|U(ν)|², in bins² times power.
         segments: number of segments.
     """
 
@@ -170,15 +197,25 @@ class _Spectra:
     cross: Complex
     power_y: Array
     square_u: Array
+    offset: Array
+    offset_square: Array
     segments: int
 
     @classmethod
     def of(cls, signals: tuple[Array, Array], window: Array, hop: int, first: int) -> "_Spectra":
+        """Return the sums for a command and a response, in windows ``hop`` samples apart from sample ``first`` on."""
         size, bins = window.size, window.size // 2 + 1
         begins = range(first, signals[0].size - size + 1, hop)
-        sums = cls(np.zeros(bins), np.zeros(bins, np.complex128), np.zeros(bins), np.zeros(bins), len(begins))
+        power_u, power_y, square_u, offset, offset_square = np.zeros((5, bins))
+        sums = cls(power_u, np.zeros(bins, np.complex128), power_y, square_u, offset, offset_square, len(begins))
+        # The derivative of a window over time multiplies its transform by 2πj·(f - ν).
+        slope = scipy.fft.irfft(2j * np.pi * np.arange(bins) * scipy.fft.rfft(window), size) if hop < size else None
         for begin in begins:
             u, y = (scipy.fft.rfft(window * signal[begin : begin + size]) for signal in signals)
+            if slope is not None:
+                turned = scipy.fft.rfft(slope * signals[0][begin : begin + size]) / (2j * np.pi)
+                sums.offset -= u.real * turned.real + u.imag * turned.imag
+                sums.offset_square += turned.real**2 + turned.imag**2
             power = u.real**2 + u.imag**2
             sums.power_u += power
             sums.square_u += power**2
@@ -218,8 +255,7 @@ def estimate(
             as a converter holds it; ``none``: both are samples of analogue signals.
         resolution: distance of the bins [Hz]; None: at least 8 segments, and at least 0.5 Hz. A periodic command has
             the distance of its lines.
-        highest: highest frequency [rad/s], up to 0.4 of the sampling frequency; None: 0.2 of it. Parts of the response
-            above the sampling frequency fold back, 0.4 % of a second order at 0.2 and 20 % at 0.4.
+        highest: highest frequency [rad/s], up to 0.4 of the sampling frequency; None: 0.2 of it.
 
     Raises:
         InputError: the record is too short, the command is constant, or the response does not follow it.
@@ -241,8 +277,9 @@ def estimate(
     most = _HIGHEST / step if highest is None else min(highest / (2.0 * np.pi), _MOST_FREQUENCY / step)
     bins = bins[frequency[bins] <= most]
     sums = _Spectra.of(signals, window, hop, first)
-    if not period and sums.sweeps(bins):
-        # All parts of a sweep count alike with a segment of rest before and after it.
+    at_rest = max(abs(signals[1][0]), abs(signals[1][-1])) < _REST * np.std(signals[1])
+    if not period and at_rest and sums.sweeps(bins):
+        # All parts of a sweep from rest to rest count alike with a segment of rest before and after it.
         padded = tuple(np.pad(signal, window.size) for signal in signals)
         sums = _Spectra.of((padded[0], padded[1]), window, hop, 0)
     averages = _independent(window, hop, sums.segments) if hop < window.size else float(sums.segments)
@@ -254,20 +291,27 @@ def estimate(
     # The band ends where most bins are incoherent: single ones chosen by their coherence would be too large by chance.
     trend = scipy.ndimage.median_filter(coherence, min(_TREND, coherence.size))
     sure = (trend >= _LEAST_COHERENCE) & (coherence >= min(3.0 / averages, _LEAST_COHERENCE))
-    bins, coherence = bins[sure], coherence[sure]
+    width = 2.0 * np.pi / (window.size * step)
+    offset = sums.offset[bins] / power_u[bins]
+    spread = np.sqrt(np.maximum(sums.offset_square[bins] / power_u[bins] - offset**2, 0.0))
+    sure &= (np.abs(offset) < _NEXT) & (spread < _FAR)  # otherwise it shows other bins
+    bins, coherence, offset, spread = bins[sure], coherence[sure], offset[sure], spread[sure] * width
     if bins.size < LEAST:
         raise InputError(
             f"record: the response follows the command at {bins.size} frequencies (coherence from {_LEAST_COHERENCE:g}"
             f"); allowed: {LEAST} or more (a longer record, or a command that moves at more frequencies)"
         )
-    value = cross[bins] / power_u[bins] / _held(frequency[bins] * step, hold)
+    true = (bins + offset) * width
+    cycles = true * step / (2.0 * np.pi)
     return FrequencyResponse(
-        2.0 * np.pi * frequency[bins],
-        value,
-        np.hypot(deviation_of(coherence, averages), np.maximum(_images(frequency[bins] * step, hold), _APPROXIMATE)),
+        true,
+        cross[bins] / power_u[bins] / _held(cycles, hold),
+        np.hypot(deviation_of(coherence, averages), _APPROXIMATE),
         coherence,
         averages,
-        0.0 if period else 2.0 * np.pi / (window.size * step),
+        None if period else spread,
+        0.0 if hold == "none" else 2.0 * np.pi / step,
+        2 if hold == "linear" else 1,
     )
 
 
@@ -284,16 +328,6 @@ def _segment(samples: int, step: float, resolution: float | None) -> int:
             f"{1.0 / (64 * step):.4g} Hz"
         )
     return size
-
-
-def _images(cycles: Array, hold: Hold) -> Array:
-    """Return the part of a second order's response that folds back, at frequencies over the sampling frequency.
-
-    Analogue signals have a filter against it.
-    """
-    if hold == "none":
-        return np.zeros(cycles.size)
-    return np.asarray((cycles / (1.0 - cycles)) ** (4 if hold == "linear" else 3))
 
 
 def _held(cycles: Array, hold: Hold) -> Complex:

@@ -10,7 +10,7 @@ residual most, then all parameters are fitted again, until a further mode no lon
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -132,15 +132,7 @@ class ResponseData:
             return self
         places = np.searchsorted(measured.frequency, np.geomspace(*self.band, most))
         kept = np.unique(np.minimum(places, measured.frequency.size - 1))
-        deviation = None if measured.deviation is None else measured.deviation[kept]
-        thinner = replace(
-            measured,
-            frequency=measured.frequency[kept],
-            value=measured.value[kept],
-            deviation=deviation,
-            coherence=None,
-        )
-        return ResponseData(thinner)
+        return ResponseData(measured.at(kept))
 
     @property
     def band(self) -> tuple[float, float]:
