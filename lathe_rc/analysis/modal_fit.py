@@ -541,8 +541,9 @@ def refuse_other_gain(data: ResponseData) -> None:
     """
     gain = float(np.median(np.abs(data.measured.value[:3])))
     if not _LEAST_GAIN <= gain <= _MOST_GAIN:
-        at = data.measured.frequency[1] / (2.0 * np.pi)
+        at = data.measured.frequency[0] / (2.0 * np.pi)
         raise InputError(
-            f"response: magnitude {gain:.4g} at {at:.4g} Hz; allowed: near 1, {_LEAST_GAIN:g} to {_MOST_GAIN:g} (give "
-            f"the units of the columns, such as --column response=NAME:{1.0 / gain:.4g}, or a lower band)"
+            f"response: magnitude {gain:.4g} at {at:.4g} Hz, the lowest frequency; allowed: near the static gain of 1, "
+            f"{_LEAST_GAIN:g} to {_MOST_GAIN:g} (measure lower frequencies too; if the units differ, give them, such as "
+            f"--column response=NAME:{1.0 / gain:.4g})"
         )

@@ -120,7 +120,7 @@ def _unit_of(quantity: str, column: str) -> str | None:
     """Return the unit in the name of a column, ``NAME_UNIT`` or ``NAME [UNIT]``; None if it has none."""
     match = _NAMED.fullmatch(column)
     if match and match["bracket"] is not None:
-        return match["bracket"] if _plain(match["bracket"]) in UNITS[quantity] else None
+        return match["bracket"] if re.search("[^\\W\\d]|[%°]", match["bracket"]) else None  # "[2]" is no unit
     known = sorted((unit for unit in UNITS[quantity] if unit and unit != "1"), key=len, reverse=True)
     return next((unit for unit in known if _plain(column).endswith(f"_{unit}")), None)
 
@@ -477,11 +477,11 @@ def open_file(path: Path) -> Source:
         InputError: the ending is unknown, or the file is missing or damaged.
         LatheError: the package that reads the format is not installed.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read ({'a folder' if path.is_dir() else 'no such file'}); check the path")
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: no format of measurements; allowed: {', '.join(_FORMATS)}, or a bag")
     name, opened = _FORMATS[path.suffix.lower()]
-    if not path.is_file():
-        raise InputError(f"{path}: cannot be read ({'a folder' if path.is_dir() else 'no such file'}); check the path")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the libraries warn of what they ignore in a file
