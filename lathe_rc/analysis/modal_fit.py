@@ -76,6 +76,9 @@ class Data(Protocol):
     def band(self) -> tuple[float, float]:
         """Range of the frequencies of modes that it can show [rad/s]."""
 
+    def resolved(self, drive: ModalDrive) -> bool:
+        """Return whether each mode is wider than the distance of the points; otherwise it stands for a single one."""
+
     def low(self) -> "Data":
         """Return the points in which the drive without modes shows."""
 
@@ -138,6 +141,13 @@ class ResponseData:
     def band(self) -> tuple[float, float]:
         """Range of the measured frequencies [rad/s]."""
         return float(self.measured.frequency[0]), float(self.measured.frequency[-1])
+
+    def resolved(self, drive: ModalDrive) -> bool:
+        """Return whether each mode is wider than the distance of the points."""
+        frequency = self.measured.frequency
+        places = np.clip(np.searchsorted(frequency, drive.mode_frequency), 1, frequency.size - 1)
+        widths = 2.0 * np.array(drive.mode_damping) * np.array(drive.mode_frequency)
+        return bool(np.all(widths > frequency[places] - frequency[places - 1]))
 
     def low(self) -> "ResponseData":
         """Return the points below the frequency at which the magnitude has fallen to 0.3."""
@@ -244,6 +254,10 @@ class StepData:
     def band(self) -> tuple[float, float]:
         """Range of frequencies between the length of the record and its step [rad/s]."""
         return 2.0 * np.pi / float(self.time[-1] - self.time[0]), 0.8 * np.pi / float(np.diff(self.time).min())
+
+    def resolved(self, drive: ModalDrive) -> bool:
+        """Return True: a step shows a mode in all of its samples."""
+        return True
 
     def low(self) -> "StepData":
         """Return all points."""
@@ -496,7 +510,8 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
             (_polish(points, _without_rest(drive)) for drive in tracks.values()), key=lambda pair: pair[1]
         )
         bic.append(_bic(points, further, further_error))
-        if modes is not None or bic[-1] < min(bic[:-1]) - _PAYS:
+        pays = bic[-1] < min(bic[:-1]) - _PAYS and data.resolved(further)
+        if modes is not None or pays:
             chosen, error = further, further_error
         elif error < _COARSE or count - len(chosen.mode_frequency) >= _AHEAD:
             break
@@ -544,6 +559,6 @@ def refuse_other_gain(data: ResponseData) -> None:
         at = data.measured.frequency[0] / (2.0 * np.pi)
         raise InputError(
             f"response: magnitude {gain:.4g} at {at:.4g} Hz, the lowest frequency; allowed: near the static gain of 1, "
-            f"{_LEAST_GAIN:g} to {_MOST_GAIN:g} (measure lower frequencies too; if the units differ, give them, such as "
-            f"--column response=NAME:{1.0 / gain:.4g})"
+            f"{_LEAST_GAIN:g} to {_MOST_GAIN:g} (measure lower frequencies too; if the units differ, give them, such "
+            f"as --column response=NAME:{1.0 / gain:.4g})"
         )
