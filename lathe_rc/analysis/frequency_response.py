@@ -46,6 +46,7 @@ _SEGMENTS = 8  # of the record, at least, without a wish
 _LONGEST = 2**22  # samples of a segment
 _LEAST_COHERENCE = 0.5
 _TREND = 31  # bins over which the coherence is judged
+_EDGE = 0.1  # part of a sweep's power in the first or last segment
 _REST = 0.05  # of the RMS of the response, within which the drive is at rest
 _FAR = 1.5  # bins of spread; 0.58 in noise
 _NEXT = 1.0  # bins, to the next one that is used
@@ -188,6 +189,7 @@ class _Spectra:
     Attributes:
         power_u, cross, power_y: Suu, Suy and Syy.
         square_u: sum of the squares of the segments' Suu.
+        edges_u: Suu of the first and the last segment, shape (2, m).
         offset: sum of (ν - f)·|U(ν)|² over the frequencies ν in the bin f, in bins times power.
         offset_square: sum of (ν - f)²·|U(ν)|², in bins² times power.
         segments: number of segments.
@@ -197,6 +199,7 @@ class _Spectra:
     cross: Complex
     power_y: Array
     square_u: Array
+    edges_u: Array
     offset: Array
     offset_square: Array
     segments: int
@@ -206,8 +209,9 @@ class _Spectra:
         """Return the sums for a command and a response, in windows ``hop`` samples apart from sample ``first`` on."""
         size, bins = window.size, window.size // 2 + 1
         begins = range(first, signals[0].size - size + 1, hop)
-        power_u, power_y, square_u, offset, offset_square = np.zeros((5, bins))
-        sums = cls(power_u, np.zeros(bins, np.complex128), power_y, square_u, offset, offset_square, len(begins))
+        zeros = np.zeros((5, bins))
+        edges = np.zeros((2, bins))
+        sums = cls(zeros[0], np.zeros(bins, np.complex128), zeros[1], zeros[2], edges, zeros[3], zeros[4], len(begins))
         # The derivative of a window over time multiplies its transform by 2πj·(f - ν).
         slope = scipy.fft.irfft(2j * np.pi * np.arange(bins) * scipy.fft.rfft(window), size) if hop < size else None
         for begin in begins:
@@ -219,6 +223,9 @@ class _Spectra:
             power = u.real**2 + u.imag**2
             sums.power_u += power
             sums.square_u += power**2
+            if begin == first:
+                edges[0] = power
+            edges[1] = power
             sums.power_y += y.real**2 + y.imag**2
             sums.cross += u.conj() * y
         return sums
@@ -277,11 +284,8 @@ def estimate(
     most = _HIGHEST / step if highest is None else min(highest / (2.0 * np.pi), _MOST_FREQUENCY / step)
     bins = bins[frequency[bins] <= most]
     sums = _Spectra.of(signals, window, hop, first)
-    at_rest = max(abs(signals[1][0]), abs(signals[1][-1])) < _REST * np.std(signals[1])
-    if not period and at_rest and sums.sweeps(bins):
-        # All parts of a sweep from rest to rest count alike with a segment of rest before and after it.
-        padded = tuple(np.pad(signal, window.size) for signal in signals)
-        sums = _Spectra.of((padded[0], padded[1]), window, hop, 0)
+    if not period and sums.sweeps(bins):
+        sums, bins = _swept(signals, window, hop, bins)
     averages = _independent(window, hop, sums.segments) if hop < window.size else float(sums.segments)
     power_u, cross, power_y = sums.power_u, sums.cross, sums.power_y
     bins = bins[power_u[bins] > _LEAST_POWER * power_u[bins].max()]
@@ -313,6 +317,22 @@ def estimate(
         0.0 if hold == "none" else 2.0 * np.pi / step,
         2 if hold == "linear" else 1,
     )
+
+
+def _swept(
+    signals: tuple[Array, Array], window: Array, hop: int, bins: npt.NDArray[np.intp]
+) -> tuple[_Spectra, npt.NDArray[np.intp]]:
+    """Return the sums of a sweep, and the bins that its ends do not falsify.
+
+    The windows overlap less at the ends of the record. A segment of rest before a sweep that begins at rest makes all
+    its parts count alike; frequencies of its end, and of a beginning out of motion, are left out.
+    """
+    u, y = signals
+    at_rest = abs(y[0]) < _REST * np.std(y)
+    rest = window.size if at_rest else 0
+    sums = _Spectra.of((np.pad(u, (rest, 0)), np.pad(y, (rest, 0))), window, hop, 0)
+    share = sums.edges_u[:, bins] / np.maximum(sums.power_u[bins], np.finfo(float).tiny)
+    return sums, bins[share[int(at_rest) :].max(axis=0) < _EDGE]
 
 
 def _segment(samples: int, step: float, resolution: float | None) -> int:
