@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches: variations of a cell on all cores, against plain C on one.
+"""Batches run variations of a cell on all cores; plain C runs on one.
 
-1000 two-channel cells of 20 revolutions that differ in five parameters, and 200 full cells that differ in three; what
-is kept of each is the form error by revolution. A ratio is the speed a core over that of C: 1 is as fast as C on every
-core. ``prepared_c_ratio`` counts the computing alone: the cells stand ready, and threads run them. ``c_ratio`` counts
-all of it, from the scenario's values to the errors. Those of ``all_cores`` are against C that computes on every core at
-once, as the batch does. The threads share Python's lock: preparing a cell is Python, computing is not. ``memory_mb`` is
-what the process takes more after the whole batch than after a tenth of it.
+1000 two-channel cells of 20 revolutions differ in five parameters, 200 full cells in three; each keeps the form error
+by revolution. A ratio is the speed per core over that of C: 1 is as fast as C on every core. ``prepared_c_ratio``
+covers only the computing of prepared cells in threads, ``c_ratio`` all from the scenario's values to the errors. For
+``all_cores``, C also computes on every core at once. Preparing a cell takes Python's lock, which the threads share;
+computing does not. ``memory_mb`` is the memory growth of the process from a tenth of the batch to the whole.
 """
 
 import os

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offline engine against plain C, one core: the two-channel cell, and the full cell of 13 nodes.
+"""The offline engine is compared with plain C on one core, in the two-channel cell and the full cell of 13 nodes.
 
-The same arithmetic stands in benchmarks/c, one sample after the other, compiled with -O3 -march=native; with
--ffp-contract=off it gives the same bits, which is checked here in every field of every topic that carries blocks. Sides
-take turns on the same run: the engine, C, and C with contraction. A ratio is the speed of the engine over that of C, so
-1 is as fast as C. The random numbers of the full cell's allowance are drawn by NumPy on both sides, and count on both.
-Nobody takes the signals, and neither side makes messages at chosen samples (joint states, learning status) or
-identifies its drives.
+benchmarks/c has the same arithmetic, sample by sample, compiled with -O3 -march=native. With -ffp-contract=off its
+results are bit-identical, checked in every field of every block topic. A ratio is the speed of the engine over that of
+C. On both sides NumPy draws the random allowance of the full cell within the measured time. The signals have no reader,
+and neither side makes messages at chosen samples (joint states, learning status) or identifies its drives.
 
-``real_time_factor`` is that of the engine in the same run, ``unchanged_real_time_factor`` that of the scenario as it
-stands, and ``recorded_real_time_factor`` that of ``harness.run`` with a bag, from the first sample until the bag is
-closed, on one core, also of the scenario as it stands.
+``real_time_factor`` is that of the engine in the same run. For the unmodified scenario, ``unchanged_real_time_factor``
+is that of the engine, and ``recorded_real_time_factor`` that of ``lathe_rc.run`` with a bag, on one core, from the
+first sample until the bag is closed.
 """
 
 import sys

@@ -282,14 +282,13 @@ def page(result: Mapping[str, Any]) -> str:
     lines = [
         "# Performance",
         "",
-        "Generated from the benchmarks of this repository: `./lathe bench` measures,",
-        "`./lathe bench --page COMMIT` writes this page.",
+        "`./lathe bench` measures; `./lathe bench --page COMMIT` writes this page.",
         "",
         f"- **Machine**: {where}; {machine.get('system', '')}, Python {machine.get('python', '?')}.",
         f"- **Commit**: `{result.get('commit', '?')}`{' (quick: rough figures)' if result.get('quick') else ''}.",
-        "- **Figures** are medians on this machine, the lowest and the highest run in brackets. Compared sides were",
-        "  measured in turn (A B A B …), and a **ratio** is the median of the quotients, one a round: it holds while",
-        "  the speed of the machine wanders. Absolute figures are worth less.",
+        "- **Figures** are medians on this machine, with the lowest and the highest run in brackets. Compared",
+        "  sides were measured in turn (A B A B …). A **ratio** is the median of the quotients of all rounds; unlike",
+        "  absolute figures it is reliable if the machine's speed varies.",
         *([f"- **Note**: {result['note']}"] if "note" in result else []),
         "",
         "`./lathe bench --against COMMIT` compares with a stored result; no test asserts a timing.",
@@ -303,7 +302,7 @@ def page(result: Mapping[str, Any]) -> str:
     rows = list(_peer_rows(result))
     if rows:
         head = ("job", "peer", "`lathe_rc`", "peer's", "times as fast", "")
-        lines += ["## Peers", "", "How many times as fast `lathe_rc` is; below 1 the peer is faster.", ""]
+        lines += ["## Peers", "", "The table shows how many times as fast `lathe_rc` is as the peer.", ""]
         lines += _table(head, rows, texts=(0, 1, 5))
     for part in ("peers", "recorder", "viewer"):
         if part in result:

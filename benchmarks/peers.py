@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other programs at the same work: one drive alone, and the loop of one channel.
+"""Other programs do the same work.
 
-**drive**: the electrodynamic drive follows a command of given samples, in ns a sample, against `scipy.signal` (lfilter,
-dlsim, lsim) and python-control (forced_response, input_output_response). ``lathe_rc`` is asked in chunks as the offline
-engine asks, ``lathe_rc_blocks`` in blocks of 64 samples; both have end stops, velocity and current as well, the others
-the position only. Where the difference equation is the same, the largest difference of the outputs is told; lsim takes
-the continuous drive, for which the fraction of a step in the delay has to be interpolated.
+**drive**: the electrodynamic drive follows a given command, in ns per sample, against ``scipy.signal`` (lfilter, dlsim,
+lsim) and python-control (forced_response, input_output_response). ``lathe_rc`` computes in chunks like the offline
+engine, ``lathe_rc_blocks`` in blocks of 64 samples. Both include end stops, velocity and current, the others the
+position only. The table gives the largest difference of the outputs. lsim uses the continuous drive, for which the
+fraction of a step in the delay has to be interpolated.
 
-**loop**: encoder, profile, repetitive controller, drive and error, at constant speed, in samples a second. ``lathe_rc``
-is the offline engine with the error kept, ``drake`` the diagram in others/drake_loop.py with the error logged. It runs
-if pydrake is installed, see requirements/bench.in; ``reason`` says why it does not. The RMS error of the last
-revolution of both shows that it is the same loop; Drake's filters its memory a revolution at a time, as a circle.
+**loop**: encoder, profile, repetitive controller, drive and error run at constant speed, in samples per second.
+``lathe_rc`` is the offline engine with the error kept, ``drake`` the diagram in others/drake_loop.py with the error
+logged. It needs pydrake (requirements/bench.in); ``reason`` states why it did not run. The RMS errors of the last
+revolution show that both are the same loop; Drake's loop filters its memory once per revolution, as a circle.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's writing and reading against ``mcap`` and ``rosbags``: the same blocks of the piston's four topics.
+"""The recorder is compared with ``mcap`` and ``rosbags`` on the same blocks of the piston's four topics.
 
-**write**, uncompressed and with zstd: from the first message to the closed bag, on the disk that holds temporary
-files, in messages a second and MB a second (of message bytes). Chunks have 256 KiB for ``lathe_rc`` and ``mcap``;
+**write**, uncompressed and with zstd, is timed from the first message to the closed bag, on the disk with the temporary
+files. Rates are in messages and MB (of message bytes) per second. Chunks have 256 KiB for ``lathe_rc`` and ``mcap``;
 rosbags has no such option. Each compresses at its own level of zstd, ``lathe_rc`` at −5.
 
-- ``lathe_rc``, ``mcap`` and ``rosbags`` get finished messages in the order of the bag: the same job.
-- ``lathe_rc_node`` does what the recorder node does: it reads each message, checks it, puts it in its row among those
-  of the other topics, and writes rows.
-- ``lathe_rc_offline`` makes the messages as well, from the arrays of a run.
+- ``lathe_rc``, ``mcap`` and ``rosbags`` get the same finished messages in the order of the bag.
+- ``lathe_rc_node`` does the work of the recorder node: it reads and checks each message, sorts it into a row with the
+  other topics, and writes rows.
+- ``lathe_rc_offline`` also makes the messages from the arrays of a run.
 
-**read** of the zstd bag: all messages as bytes (``lathe_rc`` checks size and checksum of each chunk), and all samples:
-``lathe_rc_arrays`` as pieces of whole signals, ``rosbags_arrays`` as an object a message.
+**read** covers all messages of the zstd bag as bytes (``lathe_rc`` checks size and checksum of each chunk), or all
+samples: ``lathe_rc_arrays`` as pieces of whole signals, ``rosbags_arrays`` as one object per message.
 
-A ratio is the rate of lathe_rc over that of the other: above 1, lathe_rc is faster. ``node_ratio`` is that of the node.
+A ratio is the rate of lathe_rc over that of the other, ``node_ratio`` that of the node.
 """
 
 import tempfile

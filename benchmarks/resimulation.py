@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe resim BAG`` with nothing changed: the spindle from the bag, all that stands behind it computed again.
+"""``lathe resim BAG`` takes the spindle from the bag and computes everything after it again, with nothing changed.
 
-How many times faster than real time, digests and the comparison with the recorded ones included; opening the bag and
-wiring the cell are left out. Every run must come out to the bit.
+The factor includes digests and their comparison with the recorded ones, but not opening the bag and wiring the cell.
+Every run must be bit-identical.
 """
 
 import tempfile

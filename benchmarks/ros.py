@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell over ROS, everything recorded: how fast, at what cost, and how much faster than the obvious way.
+"""The cell runs over ROS, with everything recorded.
 
-Cells of 5, 8 and 13 nodes (recorder included) run as fast as they can, one process a node, grouped in two processes
-(the recorder in one, all others in the other) and composed in one, for blocks of 64, 256 and 1024 samples. The loops of
-the 13 close within 64 samples, so they know no longer blocks. Of each run:
+Cells of 5, 8 and 13 nodes (recorder included) run at full speed: one process per node, grouped in two processes (the
+recorder in one, all others in the other), and composed in one, with blocks of 64, 256 and 1024 samples. The loops of
+the 13 close within 64 samples, which excludes longer blocks. The figures are:
 
-- ``real_time_factor``: simulated over wall time from block 0 to the last block in the bag; the target beside it;
-- ``cpu_us_per_message``: processor time of all processes together in that span over all blocks of all topics
-  (the stored result has it by process, too);
-- ``latency_per_hop_us``: with one block in flight, wall time of a block over the hops that it makes: spindle,
-  controller, drive, tool, recorder, spindle again. It contains what the nodes compute.
+- ``real_time_factor`` is simulated over wall time from block 0 to the last block in the bag, with the target beside it.
+- ``cpu_us_per_message`` is the processor time of all processes together in that span over all blocks of all topics (by
+  process in the stored result).
+- ``latency_per_hop_us`` is, with one block in flight, the wall time of a block over its hops: spindle, controller,
+  drive, tool, recorder, spindle again. It includes the nodes' computing.
 
-Against: the same cell with a message a sample (`benchmarks.naive.piston`), at the pace of a timer, which loses samples,
-and in lockstep; lathe_rc itself with a SingleThreadedExecutor (`benchmarks.naive.container`); and bare transport
-(`benchmarks.transport`): as many processes as the piston with one process a node, which pass the bytes of the same
-messages along the same topics and compute nothing. ``bare_transport_ratio`` is the pace of the cell over that of bare
-transport, measured by turns: what is left of what the middleware allows.
+References are the same cell with one message per sample (``benchmarks.naive.piston``), paced by a timer, which loses
+samples, or in lockstep; lathe_rc with a SingleThreadedExecutor (``benchmarks.naive.container``); and bare transport
+(``benchmarks.transport``): the processes of the piston, one per node, pass the bytes of the same messages along the
+same topics and compute nothing. ``bare_transport_ratio`` is the pace of the cell over that of bare transport, the limit
+of the middleware.
 """
 
 import contextlib

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From ``lathe run`` to the first block, and what of it is what.
+"""The time from ``lathe run`` to the first block is split into parts.
 
 ``lathe run piston`` is started anew each time, in each mode. All figures are wall time from the start of the command:
 
 - ``to_checked_s``: its modules are imported and the scenario is accepted;
-- ``to_active_s``, ``to_ready_s``: the last node is active, the last has met its peers (there are none offline);
-- ``to_first_block_s``: the first block has been computed, and by every member;
-- ``to_end_s``: the command is over; it turns one revolution.
+- ``to_active_s``, ``to_ready_s``: the last node is active, and is matched with its peers (not offline);
+- ``to_first_block_s``: every member has computed the first block;
+- ``to_end_s``: the command has ended after one revolution.
 
-``import_..._s``: a Python process that imports and ends. Compiled code: with an empty NUMBA_CACHE_DIR, then once more:
-``compiled_on_second_start`` counts files of the cache that are new or changed, and has to be 0.
+``import_..._s`` is the time of a Python process that only imports. Starts with an empty NUMBA_CACHE_DIR and once more
+show the compiling: ``compiled_on_second_start``, the new or changed files of the cache, must be 0.
 
-python -m benchmarks.start ARGUMENTS is ``lathe ARGUMENTS`` and reports the moments above.
+python -m benchmarks.start ARGUMENTS runs ``lathe ARGUMENTS`` and reports these moments.
 """
 
 import importlib

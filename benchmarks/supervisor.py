@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of monitors and of a supervisor: the piston with every monitor on, against the same with less.
+"""The piston with all monitors on is compared with variants without them.
 
-The scenarios are `supervised`, with nothing allowed to break (`watched`), the same with every monitor off (`idle`),
-with every monitor off and no margin published for them (`unwatched`), and `piston`, which has neither a supervisor nor
-a node that obeys one (`alone`); the signals that they have in common are the same to the bit. A ratio is the real-time
-factor with every monitor on over that of another side: `same_topics` of `idle`, `monitors` of `unwatched`,
-`supervisor` of `alone`.
+The scenarios are ``supervised`` without faults (``watched``), with every monitor off (``idle``), also without the
+margin published for them (``unwatched``), and ``piston``, which has neither a supervisor nor a node that obeys one
+(``alone``). Common signals are bit-identical. A ratio is the real-time factor with every monitor on over that of
+another side: ``same_topics`` refers to ``idle``, ``monitors`` to ``unwatched``, ``supervisor`` to ``alone``.
 
-- `engine`: the offline engine alone, processor time of whole chunks, engines that take turns after each; from the
-  revolution on at which nothing is forgiven any more (12): before, a controller takes 15 ms for its stability margins.
-- `recorded`: `harness.run` offline, all signals kept, the start left out. Wall time.
-- `composed`: all nodes in one process over ROS, recorded. There the supervisor is one more node with five readers, a
-  topic of its own that is recorded, and a reader more in the controller, and all of that is in the ratio to `alone`;
-  three of these readers, and the topic with the margin, are there for the monitors.
+- ``engine`` is the processor time of chunks in the offline engine; the engines take turns after each. It counts from
+  revolution 12 on, after all exceptions of the monitors: before, a controller takes 15 ms for its stability margins.
+- ``recorded`` is the wall time of ``lathe_rc.run`` offline without the start, with all signals kept.
+- ``composed`` has all nodes in one process over ROS, recorded. There the supervisor adds a node with five readers, a
+  recorded topic, and a reader in the controller, all in the ratio to ``alone``. Three of these readers, and the topic
+  with the margin, serve the monitors.
 """
 
 import gc

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps: thousands of cells by Dask on all cores, against their computing alone, and how they grow.
+"""Sweeps run thousands of cells by Dask on all cores.
 
-10 000 two-channel cells of 20 revolutions that differ in five parameters, and 2000 full cells that differ in three (a
-fifth of them with --quick). ``computing_share`` is the time of the computing alone, in which the cells stand ready and
-a thread a core runs them, over that of the whole sweep, from its first task to the last row on the disk; workers are
-running when it begins. Sweep and computing take turns.
+10 000 two-channel cells of 20 revolutions differ in five parameters, 2000 full cells in three (a fifth of them with
+--quick). ``computing_share`` is the time of the computing alone (prepared cells, one thread per core) over that of the
+whole sweep, from the first task to the last row on the disk. The workers are already running.
 
-``growth`` has sweeps of cells of one revolution of the piston, which are nearly all preparation: time a cell, the part
-of the cores' time that workers do not spend on cells (``overhead_percent``), and the memory that this process holds
-at the end.
+``growth`` sweeps cells of one revolution of the piston, which are nearly all preparation. It gives the time per cell,
+the share of the cores' time not spent on cells (``overhead_percent``), and the memory of this process at the end.
 """
 
 import os

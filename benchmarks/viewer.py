@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe view BAG -o FILE.rrd`` against ``rr.log`` of single samples, both from the same bag of the piston.
+"""``lathe view BAG -o FILE.rrd`` is compared with ``rr.log`` of single samples from the same bag of the piston.
 
-Counted are samples a second over the curves that a view draws of the piston's topics. ``lathe_view`` reads the bag and
-writes the file as the command does: curves thinned to extremes (no peak is lost), the part in three dimensions, error
-map, spectra. ``lathe_view_every_sample`` keeps all of them. ``rr_log`` sets the time and logs one scalar at a time,
-from arrays that it need not read, over the first samples of the same bag; it does nothing else. A ratio is the rate
-over that of ``rr_log``.
+Figures are samples per second over the curves of a view. ``lathe_view`` reads the bag and writes the file as the
+command does: curves thinned to extremes (no peak is lost), the part in three dimensions, error map, spectra.
+``lathe_view_every_sample`` keeps all samples. ``rr_log`` only sets the time and logs one scalar at a time, for the
+first samples of the bag, from arrays in memory. A ratio is the rate over that of ``rr_log``.
 
-``reason`` says why there are no figures: rerun is not installed.
+If rerun is not installed, ``reason`` says so in place of figures.
 """
 
 import importlib.util

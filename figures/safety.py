@@ -141,9 +141,9 @@ def noticed(name: str, node: str, fault: str, revolution: int) -> tuple[str, int
 HEAD = """\
 # Every fault, and its reaction
 
-Printed by `./lathe python figures/safety.py`: one run for each row. A fault begins at the revolution named and stays.
-"Too deep" is the largest form error into the part from the fault until the tool is out, or until the end. Definitions
-and limits are in [safety.md](safety.md).
+`./lathe python figures/safety.py` prints this page, one run per row. Each fault begins at the given revolution and is
+permanent. "Too deep" is the largest form error into the part from the fault until the tool is out, or until the end.
+Definitions and limits are in [safety.md](safety.md).
 """
 
 

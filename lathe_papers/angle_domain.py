@@ -27,7 +27,7 @@ Array = npt.NDArray[np.float64]
 _GOST = (0.10, 0.15)  # speed deviations allowed by the standard for lathes, relative to Ω0 (paper 000, after eq. 11)
 _LABELS = ("exact", "quasi-static, eq. 9", "linearised, eq. 12")
 _COLOURS = ("#1f6f8b", "#c0392b", "#e08e0b")
-_POINTS = 64  # points per wave of the profile
+_POINTS = 64  # points per period of the profile
 _DECAY = 20.0  # time constants until the initial transient has decayed
 
 
@@ -47,7 +47,7 @@ class AngleDomainParameters(StudyParameters):
     tolerance: Annotated[float, Gt(0), Lt(1)] = parameter(0.01, "error that is good enough, relative to the profile")
 
     def model_post_init(self, context: Any, /) -> None:
-        """Reject amplitudes or frequencies that do not form a map: fewer than two, or not increasing."""
+        """Reject amplitudes or frequencies that cannot span a map: fewer than two, or not in ascending order."""
         super().model_post_init(context)
         for name in ("amplitudes", "frequencies"):
             values = getattr(self, name)
@@ -69,7 +69,7 @@ class AngleDomainResult:
     errors: Array
 
     def good_to(self, kind: int, amplitude: int) -> float | None:
-        """Return the highest frequency up to which a set is within the tolerance [rad/s]; None if there is none."""
+        """Return the highest frequency up to which a set stays within tolerance [rad/s]; None if there is none."""
         bad = self.errors[kind, amplitude] > self.parameters.tolerance
         good = int(bad.argmax()) if bad.any() else bad.size
         return self.parameters.frequencies[good - 1] if good else None
@@ -77,7 +77,7 @@ class AngleDomainResult:
     def to_json(self) -> dict[str, Any]:
         """Return the results for JSON: errors by set, one row per amplitude.
 
-        ``good_to_SET`` contains a frequency or None per amplitude.
+        ``good_to_SET`` contains one frequency, or None, for each amplitude.
         """
         given = self.parameters
         rows = range(len(given.amplitudes))
@@ -91,7 +91,7 @@ class AngleDomainResult:
         }
 
     def table(self) -> Group:
-        """Return a table of the worst errors by amplitude, and the frequency up to which each set is in tolerance."""
+        """Return a table of the worst errors by amplitude, and of the frequency up to which each set is usable."""
         given = self.parameters
         highest = given.frequencies[-1]
         rows = []

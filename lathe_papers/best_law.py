@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of learning laws: smallest error by speed deviation, model error and sensors.
+"""Comparison of learning laws: which law errs least, depending on speed deviation, model error and sensors.
 
-Every law of ``speed-deviation`` turns the oval of ``config/speed_deviation.yaml`` under the same conditions: a Sobol
-sample of the frequency and amplitude of the deviation, the assumed ωn and ζ of the drive, and the noise of the
+Every law of the ``speed-deviation`` study turns the oval of ``config/speed_deviation.yaml`` under the same conditions:
+a Sobol sample of the frequency and amplitude of the deviation, the assumed ωn and ζ of the drive, and the noise of the
 position sensor, each for several encoders. The law keeps learning while the speed oscillates. The criterion is the
 largest form error of the last revolutions, over a period of the slowest deviation. Laws with advance knowledge of the
 speed are shown, but not ranked. The study is a sweep; see docs/sweeps.md.
@@ -86,7 +86,7 @@ class BestLawResult:
         return [self.rivals[place] for place in np.argmin(errors, axis=0)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the results for JSON: share of conditions in which each law is best, agreement of seeds, medians."""
+        """Return the results for JSON: how often each law is best, agreement between seeds, and medians."""
         return {
             "conditions": self.counts.size // self.parameters.seeds,
             "seeds": self.parameters.seeds,
@@ -96,13 +96,13 @@ class BestLawResult:
         }
 
     def _shares(self, counts: int) -> dict[str, float]:
-        """Return the share of conditions in which each ranked law is best with one encoder [%]."""
+        """Return the share of one encoder's conditions in which each ranked law is best [%]."""
         best = [law for law, of in zip(self.best, self.counts, strict=True) if of == counts]
         found = Counter(best)
         return {law: 100.0 * found[law] / len(best) for law in self.rivals}
 
     def _agreed(self, counts: int) -> float:
-        """Return the share of conditions in which all seeds have the same best law [%]."""
+        """Return the share of one encoder's conditions in which all seeds have the same best law [%]."""
         best = np.array(self.best)[self.counts == counts].reshape(-1, self.parameters.seeds)
         return 100.0 * float(np.mean((best == best[:, :1]).all(axis=1)))
 
@@ -141,7 +141,7 @@ class BestLawResult:
         return Group(tables[0], "", tables[1], "", tables[2])
 
     def draw(self, figure: "Figure") -> None:
-        """Draw the best law over the deviation, and adaptive inverse against variable lead over noise and model."""
+        """Draw maps of the best law over the deviation, and of two laws compared over noise and model error."""
         encoders = self.parameters.encoder_counts
         upper, lower = figure.subplots(2, len(encoders), squeeze=False)
         best, ratio = np.array(self.best), np.log10(self.error[_PLAIN] / self.error[_ADAPTIVE])

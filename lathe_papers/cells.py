@@ -33,7 +33,7 @@ def run(name: str, shared: Values | None = None, **nodes: Values) -> harness.Res
 
 
 def kept(made: Sequence[Scenario], keep: batch.Make[K], track: Track) -> Iterator[K | None]:
-    """Run many scenarios; yield the result of each keeper in order, and None for a failed run.
+    """Run many scenarios; yield each keeper's result in order, or None for a failed run.
 
     Raises:
         InputError: a scenario is invalid.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors due to a delay in the loop of drive and cut, and its effect in the loop of cut and spindle.
+"""Errors due to a delay in the loop of drive and cut, and the effect of a delay in the loop of cut and spindle.
 
 An electrodynamic drive follows an oval and cuts a part with two keyways. In one stage, drive and cut are computed
 sample by sample; in two stages, the force would reach the drive some samples late. The stability limit is that of
 `lathe_papers.formulas.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
-cut and loaded spindle has such a delay, and its effect is compared with a delay of one sample.
+cut and loaded spindle contains such a delay; longer delays are compared with a delay of one sample.
 """
 
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ Array = npt.NDArray[np.float64]
 
 _STEP = 1 / 64000  # [s]
 _SPEED = 1000.0 * np.pi / 30.0  # [rad/s]
-_FREQUENCY, _DAMPING, _MASS = 1038.0, 0.804, 1.2  # of the drive [rad/s, 1, kg]
+_FREQUENCY, _DAMPING, _MASS = 1038.0, 0.804, 1.2  # drive parameters [rad/s, 1, kg]
 _COMPLIANCE = compliance(natural_frequency=_FREQUENCY, damping=_DAMPING, moving_mass=_MASS)
-_DELAY = 0.36e-3  # of the command [s]
-_TURNS, _SPINDLE_TURNS = 3, 12  # simulated revolutions, the last is compared; a spindle takes longer to settle
+_DELAY = 0.36e-3  # delay of the command [s]
+_TURNS, _SPINDLE_TURNS = 3, 12  # simulated revolutions, of which the last is compared; a spindle takes longer to settle
 _LEAD = 1.425e-3  # lead T0 of a controller of this drive (spec/learning.md) [s]
 _FEED = 1e-3  # [m/rev]; at this feed, K is kc1 times 1 mm
 _GAPS = ((1.0, 0.35), (1.0 + np.pi, 0.35))
@@ -63,8 +63,8 @@ class CouplingResult:
         angle: spindle angle over the last revolution [rad], shape (m,).
         position, force: position and force with drive and cut as one stage [m, N], shape (m,).
         moved: position with each delay minus ``position`` [m], shape (delays, m).
-        invented: spurious energy that the delay adds to the drive, over the energy exchanged by force and drive,
-            shape (delays,).
+        invented: spurious energy that the delay adds to the drive, relative to the energy that force and drive
+            exchange, shape (delays,).
         limits: largest stable K without a delay, then with each delay [N/m], shape (delays + 1,).
         speed: speed of the loaded spindle at a delay of one sample [rad/s], shape (m,).
         slowed: speed with each delay minus the speed with a delay of one sample [rad/s], shape (delays, m).
@@ -98,7 +98,7 @@ class CouplingResult:
         }
 
     def _edge(self) -> Array:
-        """Return the edge error due to the speed difference of each delay at the lead T0 [m], shape (delays,)."""
+        """Return the edge error that the speed difference of each delay causes at the lead T0 [m], shape (delays,)."""
         return np.asarray(2.0 * self.parameters.amplitude * _LEAD * np.abs(self.slowed).max(axis=1))
 
     def table(self) -> Group:
@@ -205,7 +205,7 @@ def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array],
     sent = np.concatenate((np.zeros(table.delay + 2), command))
     moved, force = np.zeros((samples + 1, 2)), np.zeros(samples + delay + 1)
     driven = np.stack([sent[2 - k : samples + 2 - k] for k in range(3)], axis=1) @ weights.coarse.T
-    # With a force ``delay`` samples late, blocks of ``delay`` samples can be computed before the next chip.
+    # The force is ``delay`` samples late, so blocks of ``delay`` samples can be computed before the next chip.
     for begin in range(0, samples, delay):
         block = slice(begin, min(begin + delay, samples))
         for n in range(block.start, block.stop):
@@ -218,7 +218,7 @@ def _apart(given: CouplingParameters, command: Array, turning: dict[str, Array],
 
 
 def _energy(given: CouplingParameters, velocity: Array, acts: Array, made: Array) -> float:
-    """Return the energy added by the delayed force over the energy exchanged by the drive and the undelayed force."""
+    """Return the energy added by the delayed force, relative to that exchanged by drive and undelayed force."""
     power = given.radial_ratio * velocity
     return float(((acts - made) * power).sum() / np.abs(made * power).sum())
 
@@ -264,7 +264,7 @@ def run(parameters: CouplingParameters, track: Track = untracked) -> CouplingRes
         moved.append(state[last, 0] - true["position"][last])
         made = acts[delay : delay + samples]
         invented.append(_energy(parameters, state[last, 1], acts[:samples][last], made[last]))
-        # A delay of one sample is the reference itself, and the slowest run, since every sample is a block.
+        # A delay of one sample is the reference itself, and the slowest run, because every sample is a block.
         late = swinging if delay == 1 else _spun(parameters, _SPINDLE_TURNS * turn, delay)[-turn:]
         slowed.append(late - swinging)
     return CouplingResult(

@@ -79,7 +79,7 @@ _RED, _BLUE, _AMBER, _GREY = "#c0392b", "#1f6f8b", "#e08e0b", "#7f8c8d"
 
 
 def numbers(loop: Loop) -> dict[str, float | None]:
-    """Return the figures of a loop in the units of the paper; None for missing values."""
+    """Return the key figures of a loop in the paper's units; None for missing values."""
     values = {
         "rise_s": loop.rise,
         "settling_s": loop.settling,
@@ -129,7 +129,7 @@ class DecouplingResult:
         }
 
     def noise_numbers(self) -> dict[str, float]:
-        """Return the noise figures with both compensators, and those of the position loop alone."""
+        """Return the noise results with both compensators, and those of the position loop alone."""
         alone = rms(self.alone.settled(self.alone.position)) * 1e3
         return {**self.prompt.noise_numbers(self.parameters.force), "position_error_alone_mm": alone}
 
@@ -272,7 +272,7 @@ class DecouplingResult:
         )
 
     def draw(self, figure: "Figure") -> None:
-        """Draw Figs 11 and 12, 4 and 14 of the paper, then steps, entry, disturbance and the reduced-order model."""
+        """Draw Figs 11, 12, 4 and 14 of the paper, then steps, entry, disturbance and the reduced-order model."""
         panels = figure.subplots(3, 3)
         self._draw_single(panels[0, 0], panels[0, 1])
         self._draw_together(panels[0, 2])
@@ -367,7 +367,7 @@ def run(parameters: DecouplingParameters, track: Track = untracked) -> Decouplin
     noise = disturbance(parameters)
     prompt, delayed = (behaviour(parameters, wait, noise) for wait in track([0.0, parameters.delay_ms * 1e-3]))
     none, both = (loops(parameters.preset, parameters.plant, name) for name in ("none", "both"))
-    # Without W4 and the force controller, the position loop acts alone, under the deflection by the disturbance.
+    # Without W4 and the force controller, the position loop acts alone and is deflected by the disturbance.
     off = PidGains(0.0, 0.0, 0.0, 1.0)
     uncoupled = replace(none, force=off, channels=replace(none.channels, w4=gain(0.0)))
     time = times(round(_FIT_SPAN / _FIT_STEP) + 1, _FIT_STEP)

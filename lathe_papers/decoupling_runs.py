@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of the decoupling study at one delay: poles, single loops, steps, disturbance."""
+"""Runs of the decoupling study at one delay: poles, single loops, steps and disturbance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from lathe_rc.transfer import LinearSystem
 
 Array = npt.NDArray[np.float64]
 
-SETTLED = 2.0  #: start of the RMS of the force in the paper [s]
+SETTLED = 2.0  #: time from which the paper computes the RMS of the force [s]
 CROSS = 3.0  #: simulated duration of a step [s]
 _SHOWN = 4000  # points per curve in the figure
 
@@ -126,7 +126,7 @@ def course(
 
 
 def disturbance(given: DecouplingParameters) -> Array:
-    """Return the force n [N] due to the allowance through W4, at the step of the simulation."""
+    """Return the force n [N] that the allowance causes through W4, at the step of the simulation."""
     samples = round(given.seconds / STEP)
     allowance = Allowance(
         mean_reverting(given.walk_um * 1e-6, given.correlation_s, STEP),
@@ -152,8 +152,8 @@ class Behaviour:
 
     Attributes:
         stability: largest real part of the poles by connection [1/s].
-        force, position: figures of each loop alone.
-        position_step, force_step: response to a step of the set point, without and with K1 and K2.
+        force, position: key figures of each loop alone.
+        position_step, force_step: responses to a set-point step, without and with K1 and K2.
         noise: entry and disturbance with K1 and K2.
     """
 
@@ -165,7 +165,7 @@ class Behaviour:
     noise: Course
 
     def peaks(self) -> dict[str, dict[str, float]]:
-        """Return the largest deviation of force [N] and position [m] during a step of the other loop."""
+        """Return the largest deviation of force [N] and of position [m] during a step in the other loop."""
         names = ("uncompensated", "compensated")
         forces = [float(np.abs(run.force).max()) for run in self.position_step]
         positions = [float(np.abs(run.position).max()) for run in self.force_step]
@@ -175,7 +175,7 @@ class Behaviour:
         }
 
     def noise_numbers(self, force: float) -> dict[str, float]:
-        """Return RMS and efficiency as defined in the paper: force after 2 s, position from the start.
+        """Return RMS and efficiency as the paper defines them: force after 2 s, position from the start.
 
         Args:
             force: set point of the force [N].

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drive models from a step response, and learning with the inverse of each model as correction (000, Fig. 4).
+"""Drive models identified from a step response, and learning with each model's inverse (paper 000, Fig. 4).
 
-The correction is the inverse of the model, 1/W0 = 1/W; for a delay it is the lead by T0, which reads the memory ahead.
-With the drive Wi it gives Z = Wi/W, and Q - Z with Q = 1/(1 + (ω·q_time)²) is the factor per learning cycle.
+The correction is the inverse of the model, 1/W0 = 1/W; for a delay, the inverse is a lead of T0, obtained by reading
+the memory ahead. With the actual drive Wi this gives Z = Wi/W, and each learning cycle multiplies the error by Q - Z,
+where Q = 1/(1 + (ω·q_time)²).
 """
 
 from dataclasses import asdict, dataclass
@@ -94,7 +95,7 @@ class Candidate:
         return f"ωn {model.natural_frequency:.4g} rad/s, ζ {model.damping:.3g}{delay}"
 
     def correction(self) -> str:
-        """Inverse of the model as a formula in its own parameters."""
+        """Inverse of the model as a formula in the model's parameters."""
         if isinstance(self.model, FirstOrder):
             return "1 + p·time_constant"
         lead = "e^(p·delay)"
@@ -212,7 +213,7 @@ def _simulated(drive: SecondOrder) -> StepResponse:
     )
     position, velocity, current = np.empty((3, _SAMPLES))
     machine.block(np.ones(_SAMPLES), position, velocity, current)
-    # The command rises linearly from sample -1 to sample 0: on average, half a step earlier.
+    # The command rises linearly from sample -1 to sample 0, which on average is half a sampling step before sample 0.
     return StepResponse((np.arange(_SAMPLES) + 0.5) * step, position)
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of a tolerance of the drive parameters: one controller for many drives of a batch.
+"""Cost of a tolerance on the drive parameters: one controller design for many drives of a batch.
 
 The controllers keep the models and settings of the scenario. Natural frequency, damping and delay of every drive are
-independent and normally distributed about the value of the scenario, with the tolerance as the standard deviation. A
-drive with which learning would diverge is rejected, and its error counts as infinite. The study is a sweep; see
-docs/sweeps.md.
+independent and normally distributed about the scenario's values, with the tolerance as standard deviation. A drive with
+which learning would diverge is rejected, and its error counts as infinite. The study is a sweep; see docs/sweeps.md.
 """
 
 from dataclasses import dataclass
@@ -59,7 +58,7 @@ class DriveToleranceResult:
     error: Array
 
     def _at(self, share: float) -> Array:
-        """Return the quantile of the error at ``share`` of the drives, by tolerance [µm]."""
+        """Return the error that ``share`` of the drives do not exceed, for each tolerance [µm]."""
         place = int(np.ceil(share * self.error.shape[1])) - 1
         return np.asarray(self.error[:, place])
 
@@ -135,7 +134,7 @@ def run(parameters: DriveToleranceParameters, track: Track = untracked) -> Drive
     for tolerance in parameters.tolerance:
         laws = dict.fromkeys(_drawn(base), f"normal:{100.0 * tolerance!r}%")
         spaces.append(Space(sampled=laws, sample=f"sobol:{parameters.drives}"))
-    # One folder per tolerance: nothing else distinguishes their rows.
+    # One folder per tolerance, because nothing else distinguishes the rows of different tolerances.
     asked = [(f"tolerance-{number}", base, space) for number, space in enumerate(spaces)]
     own, *found = sweeps.table(asked, parameters.folder, ["tool.max_error"], track, models="nominal")
     errors = [

@@ -49,7 +49,7 @@ class InvarianceParameters(StudyParameters):
     )
 
     def model_post_init(self, context: Any, /) -> None:
-        """Reject speeds that would make the response more than ten times as long."""
+        """Reject speeds at which the response would take more than ten times as long as at the nominal speed."""
         super().model_post_init(context)
         if min(self.speeds) < self.nominal_speed / 10:
             raise InputError(f"speeds = {self.speeds}; allowed: from {self.nominal_speed / 10:g} rad/s, a tenth of Ω0")
@@ -79,7 +79,7 @@ class InvarianceResult:
     deviating: Array
 
     def to_json(self) -> dict[str, Any]:
-        """Return the results for JSON: responses, and the largest difference at the same angle within each kind."""
+        """Return the results for JSON: responses, and the largest difference at the same angle within each group."""
         swing = _spread(self.deviating)
         return {
             "speeds": self.parameters.speeds,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table of paper 001: steady error of four structures for a unit harmonic, printed, analytic and simulated.
+"""Table of paper 001: steady error of four structures for a unit harmonic (printed, analytic and simulated).
 
 The simulation runs the cells of ``config/``, one harmonic per run, with a whole number of waves per revolution.
 """
@@ -51,7 +51,7 @@ class MultichannelResult:
 
     Attributes:
         parameters: parameters of the study.
-        printed: values printed in the paper; NaN for columns that it lacks.
+        printed: values printed in the paper; NaN for columns that the paper lacks.
         analytic: values of the formulas with continuous responses.
         simulated: values in the last simulated revolution.
         rates: sample rate of each column [Hz].
@@ -122,7 +122,7 @@ class MultichannelResult:
 
 
 def analytic(tuning: Tuning, frequency: Array) -> Complex:
-    """Return the steady error over the profile of the four structures at ``frequency`` [rad/s], shape (4, n)."""
+    """Return the ratio of steady error to profile for the four structures at ``frequency`` [rad/s], shape (4, n)."""
     coarse, fine = tuning.coarse.steady_error(frequency), tuning.fine.steady_error(frequency)
     direct = direct_compensation(coarse, tuning.fine.drive(frequency))
     return np.stack((coarse, direct, iterative(coarse, coarse), iterative(coarse, fine)))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Oval-barrel piston in the four structures of paper 001: remaining form error, analytic and simulated.
+"""Oval-barrel piston turned with the four structures of paper 001: remaining form error, analytic and simulated.
 
-At a fixed height the profile is periodic, and the error is the product of its harmonics and the steady errors of the
-structure. With feed, the form changes from revolution to revolution, which a memory of one revolution cannot
-anticipate; this case is only simulated.
+At a fixed height the profile is periodic, and each harmonic of the error is the profile's harmonic times the steady
+error of the structure. With feed, the form changes from revolution to revolution, which a memory of one revolution
+cannot anticipate, so this case is only simulated.
 """
 
 from dataclasses import dataclass
@@ -47,8 +47,8 @@ class PistonResult:
 
     Attributes:
         parameters: parameters of the study.
-        expected: error over the angle by the formulas, shape (4, n).
-        simulated: simulated error over the angle, shape (4, n).
+        expected: error against the angle according to the formulas, shape (4, n).
+        simulated: simulated error against the angle, shape (4, n).
         with_feed: largest and RMS error of the worst revolution after the first fifty, shape (4, 2).
     """
 
@@ -66,7 +66,7 @@ class PistonResult:
         return found
 
     def table(self) -> RichTable:
-        """Return a table with one row per structure; the paper expects at least a tenfold improvement by a piezo."""
+        """Return a table with one row per structure; the paper expects a piezo to reduce the error tenfold or more."""
         rows = []
         for row, name in enumerate(ROWS):
             expected, simulated, feed = self.expected[row], self.simulated[row], self.with_feed[row]
@@ -77,7 +77,7 @@ class PistonResult:
         return comparison("Form error of the oval-barrel piston after learning", columns, rows)
 
     def draw(self, figure: "Figure") -> None:
-        """Draw the error over the angle by formula and by simulation."""
+        """Draw the error against the angle, by formula and by simulation."""
         degrees = np.arange(_POINTS) * 360 / _POINTS
         for row, (axes, name) in enumerate(zip(figure.subplots(2, 2, sharex=True).flat, ROWS, strict=True)):
             axes.plot(degrees, self.simulated[row], color=_COLOURS[row], lw=2.5, alpha=0.5, label="run")

@@ -2,7 +2,7 @@
 """Robustness of the laws against varying speed, force and drive parameters.
 
 The cell of ``config/robust_cutting.yaml`` runs under each condition, with the nominal drive that the laws assume and
-with drives of different natural frequency, damping, stiffness and delay: at all corners of the range, and inside it.
+with drives that differ in natural frequency, damping, stiffness and delay: at all corners of the range, and inside.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ _MASS = 1.2  # [kg] moving mass of the nominal drive
 _MODEL = ("model_natural_frequency", "model_damping", "model_delay")
 _FREQUENCIES = np.geomspace(1.0, 3e4, 4000)  # [rad/s] frequency grid of the margin
 
-# Overrides that switch off single disturbances of spindle and cut; the scenario itself combines all of them.
+# Overrides that switch off individual disturbances of spindle and cut; the scenario itself combines all of them.
 _STEADY: Values = {"spindle_encoder.random_rms": 0.0}
 _WHOLE: Values = {"loaded_drive.cut_gap_start": [], "loaded_drive.cut_gap_width": []}
 _EVEN: Values = {
@@ -86,14 +86,14 @@ _INVERSE: cells.Values = {
 }
 _ANY: cells.Values = {"allow_unstable": True, "stop_ratio": 0.0}  # divergence shows in the error
 _LEARNING: cells.Values = {**_ANY, "stage": "learning_controller", "identify": False}
-#: by name: parameters of the node ``controller``
+#: parameters of the node ``controller``, by law
 LAWS: dict[str, cells.Values] = {
     "000": {**_LEARNING, "lead_time": 2e-3, "q_time": 130e-6},
     "001": {**_LEARNING, "lead_time": 1.425e-3, "q_time": 67e-6},
     "adapt.": {**_LEARNING, **_INVERSE, "identify": True},
     "comp.": {
         **_ANY, "stage": "compound_controller",
-        # tuned for unknown drives: the feedback of the error has to contribute more
+        # tuned for unknown drives, so the error feedback must contribute more
         "proportional": 1.9, "integral": 28.0, "derivative": 1.4e-4, "derivative_bandwidth": 19_000.0,
     },
     "told": {**_ANY, "stage": "compound_controller"},
@@ -135,9 +135,9 @@ class RobustResult:
         largest, rms: form error of the last ten revolutions, outside gaps in the material [µm]; NaN for a stopped run.
         settled: revolution from which the error stays within the tolerance; inf if it never does.
         effort: RMS current of the drive [A].
-        margin: margin of the loop, shape (laws, drives): 1 - sup|factor per revolution| of a learning law, minimum
-            |1 + L| of a law in the time domain.
-        curves: largest error by revolution under the last condition for the worst drive of each law [µm].
+        margin: margin of the loop, shape (laws, drives): 1 - sup|factor per revolution| for a learning law, minimum
+            |1 + L| for a time-domain law.
+        curves: largest error by revolution under the last condition, for the worst drive of each law [µm].
     """
 
     conditions: list[str]
@@ -223,7 +223,7 @@ def _figure(value: float) -> str:
 
 @dataclass(frozen=True)
 class _Judged:
-    """Evaluated results of a run: largest error by revolution [µm], RMS of the last ones [µm], RMS current [A]."""
+    """Evaluated run: largest error by revolution [µm], RMS error of the last revolutions [µm], RMS current [A]."""
 
     largest: Array
     rms: float
@@ -265,7 +265,7 @@ class Judge:
             error[np.mod(self._angle - start, _TURN) < width] = 0.0
         revolution = np.floor(self._angle / _TURN)
         starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
-        # The run ends within a revolution: the start of the last revolution only closes the previous one.
+        # The run ends within a revolution, whose start only marks the end of the previous one.
         largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
         last = error[starts[-1 - _LAST] : starts[-1]]
         return _Judged(
@@ -274,7 +274,7 @@ class Judge:
 
 
 def drives_near(count: int) -> list[tuple[float, float, float, float]]:
-    """Return factors of natural frequency, damping, stiffness and delay for each drive; the nominal drive first."""
+    """Return factors of natural frequency, damping, stiffness and delay for each drive, the nominal drive first."""
     ends = (1.0 - _SPREAD, 1.0 + _SPREAD)
     corners = [*product(ends, repeat=4)]
     # With few drives, opposite corners come first.
@@ -290,13 +290,13 @@ def machine(frequency: float, damping: float, stiffness: float, delay: float) ->
         "loaded_drive.coarse_natural_frequency": natural_frequency * frequency,
         "loaded_drive.coarse_damping": own_damping * damping,
         "loaded_drive.coarse_delay": own_delay * delay,
-        # the force bends the drive by its stiffness, which is the mass times the square of the natural frequency
+        # the force deflects the drive by its stiffness, which is the mass times the square of the natural frequency
         "loaded_drive.coarse_moving_mass": _MASS * stiffness / frequency**2,
     }
 
 
 def model(frequency: float = 1.0, damping: float = 1.0, delay: float = 1.0) -> Values:
-    """Return the model parameters of the law: the nominal drive times these error factors."""
+    """Return the law's model parameters: those of the nominal drive times these error factors."""
     factors = zip(_MODEL, TOLD, (frequency, damping, delay), strict=True)
     return {f"controller.{name}": value * factor for name, value, factor in factors}
 

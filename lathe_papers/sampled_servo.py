@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sampled position servo of paper 003: its table, Figs 2-4 and series, compared with the simulated servo.
 
-The table of the paper is the step response of the desired function with the pseudo-frequency read as a frequency. It is
-compared with the drive and the link that produces this function, including the motion between the samples. The link of
-the paper is compared with a ripple-free link, both on a drive with backlash.
+The table of the paper gives the step response of the desired function with the pseudo-frequency treated as a frequency.
+It is compared with the drive and the link that produces this function, including the motion between samples. The link
+of the paper is compared with a ripple-free link, both on a drive with backlash.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Group
 
-_BACKLASH_PERIODS = 60  # a loop with backlash has no pole that gives its settling time
+_BACKLASH_PERIODS = 60  # number of periods; the poles do not give the settling time of a loop with backlash
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class SampledServoResult(SampledServoNumbers):
 
 
 def _as_continuous(function: PseudoFrequency, time: Array) -> Measures | None:
-    """Return the measures of the closed loop with jλ read as p; None if it is unstable."""
+    """Return the measures of the closed loop with jλ replaced by p; None if it is unstable."""
     response = sampled_loop.continuous_step(*function.as_continuous(), time)
     return None if response is None else sampled_loop.measures(time, response)
 

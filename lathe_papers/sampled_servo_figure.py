@@ -42,7 +42,7 @@ def draw(result: "SampledServoNumbers", figure: "Figure") -> None:
 
 
 def _middle(result: "SampledServoNumbers") -> int:
-    """Return the index of the period for the single-period figures: 0.16 s, or the nearest."""
+    """Return the index of the period for figures with a single period: 0.16 s, or the nearest one."""
     return int(np.argmin(np.abs(np.array(result.parameters.t) - 0.16)))
 
 
@@ -69,7 +69,7 @@ def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> No
     ripple_free_loop = sampled_loop.open_loop(drive, ripple_free(drive))
     curves.append(("ripple-free link", np.asarray(ripple_free_loop(1j * frequency)), _COLOURS[3]))
     for label, response, colour in curves:
-        # Each phase starts at -90°, due to the integrator.
+        # Each phase starts at -90° because of the integrator.
         angle = np.degrees(np.unwrap(np.angle(1j * response))) - 90.0
         gain.semilogx(frequency, 20.0 * np.log10(np.abs(response)), color=colour, label=label)
         phase.semilogx(frequency, angle, color=colour, label=label)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers of paper 003 on the sampled position servo: parameters and results of the study.
 
-The table of the paper is the step response of the desired function with the pseudo-frequency read as a frequency. It is
-compared with the drive and the link that produces this function, including the motion between the samples. The link of
-the paper is compared with a ripple-free link, both on a drive with backlash.
+The table of the paper gives the step response of the desired function with the pseudo-frequency treated as a frequency.
+It is compared with the drive and the link that produces this function, including the motion between samples. The link
+of the paper is compared with a ripple-free link, both on a drive with backlash.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from lathe_rc.study import StudyParameters
 Array = npt.NDArray[np.float64]
 
 RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.775, 1.0, 1.125, 1.25, 1.5)
-#: overshoot [%] and settling time [s] of the paper's table by T/2 [s], None for the entry "unstable"
+#: overshoot [%] and settling time [s] in the paper's table, by T/2 [s]; None for the entry "unstable"
 PRINTED: dict[float, tuple[tuple[float, float] | None, ...]] = {
     0.04: (
         (2.5, 0.28), (2.0, 0.29), (1.2, 0.3), (0.5, 0.31), (0.0, 0.33),
@@ -41,7 +41,7 @@ PRINTED_SERIES = (
     (0.0, 0.89, 1.1, 1.02, 0.99, 0.905, 0.897, 0.903, 0.903),
     (0.0, 0.19, 0.62, 1.1, 1.45, 1.57, 1.47),
 )
-TERMS = 9  #: displayed terms of the series, including X[0]
+TERMS = 9  #: number of displayed terms of the series, including X[0]
 _POINTS = 8000  # points of the continuous responses
 FEEDBACKS: tuple[Feedback, Feedback] = ("motor", "load")
 
@@ -73,7 +73,7 @@ class Row:
     Attributes:
         half_period: half of the sampling period, T/2 [s].
         ratio: ratio ρ = Te/(T/2).
-        continuous: measures of the desired function with jλ read as p; None if it is unstable.
+        continuous: measures of the desired function with jλ replaced by p; None if it is unstable.
         true: measures of the drive with the link of this function; None if it is unstable.
         printed: printed overshoot [%] and settling time [s]; None if not printed.
     """
@@ -94,7 +94,7 @@ class LinkRow:
         step: step response of a drive without backlash; None if the loop is unstable.
         motor, load: step responses with backlash, with the position measured at the motor or the load.
         late: measures with a delayed measurement; None if the loop is unstable.
-        late_known: like ``late``, with a link designed for the delay; None if there is none.
+        late_known: like ``late``, with a link designed for the delay; None if there is no such link.
     """
 
     design: DesignReport
@@ -110,7 +110,7 @@ class LinkRow:
         return None if self.step is None else sampled_loop.measures(self.step.time, self.step.load)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers of the link for JSON; with backlash, for measurement at the motor and at the load."""
+        """Return the results of the link for JSON; with backlash, for measurement at the motor and at the load."""
         found = numbers(self.measures)
         return {
             "t": self.design.drive.period,
@@ -142,9 +142,9 @@ class SampledServoNumbers:
         parameters: parameters of the study.
         analog: time [s] and step response of the loop without sampling, shape (2, n).
         rows: rows of the table, by period and ratio.
-        uncorrected: results of the drive without a link, at each period.
-        misread: like ``uncorrected``, with jλ read as p; None if it is unstable.
-        links: results of the links ``paper`` and ``ripple_free``, at each period.
+        uncorrected: results of the drive without a link, one for each period.
+        misread: like ``uncorrected``, with jλ replaced by p; None if unstable.
+        links: results of the links ``paper`` and ``ripple_free``, one for each period.
         computed: series of eqs 5-7, each of shape (10,).
     """
 
@@ -196,7 +196,7 @@ class SampledServoNumbers:
 
 
 def numbers(found: Measures | None) -> tuple[float | None, float | None]:
-    """Return overshoot [%] and settling time [s] of a response; None for both if there is none."""
+    """Return overshoot [%] and settling time [s] of a response; None for both if there is no response."""
     return (None, None) if found is None else (100.0 * found.overshoot, found.settling)
 
 

@@ -38,7 +38,7 @@ def _cell(found: Measures | None, place: int) -> str:
 
 
 def _beside(printed: Sequence[float], n: int, computed: float) -> str:
-    """Format the printed term, in brackets if it is wrong."""
+    """Format a printed term, in brackets if it is wrong."""
     if n >= len(printed):
         return ""
     return f"{printed[n]:g}" if abs(printed[n] - computed) <= _SERIES_TOLERANCE else f"[{printed[n]:g}]"

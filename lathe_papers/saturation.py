@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Periodic control of a drive with input saturation (paper 002, Figs 2-4), and conditions of its long-term stability.
 
-The study covers the example of the paper, its conditions of hyperstability, and runs that show the purpose of the
-memory filter, the anti-windup and the choice of gains.
+The study covers the example of the paper, its hyperstability conditions, and runs that show the purpose of the memory
+filter, of anti-windup and of the choice of gains.
 """
 
 from dataclasses import asdict, dataclass
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_SHORT = 0.8  # fraction of the input that the nominal drive requires
+_SHORT = 0.8  # input limit as a fraction of the input that the nominal drive requires
 _COARSE = 1e-4  # quantisation step in the table
 _REFERENCE_PERIODS = 400  # periods of the run with the filter
-_LEVELS = (0.0, 0.5, 1.0)  # of y_F in the figure
-_FREQUENCIES = np.geomspace(0.5, 50.0, 400)  # in the figure [rad/s]
+_LEVELS = (0.0, 0.5, 1.0)  # levels of y_F in the figure
+_FREQUENCIES = np.geomspace(0.5, 50.0, 400)  # frequencies in the figure [rad/s]
 _COLOURS = ("#1f6f8b", "#c0392b", "#e08e0b", "#7b5ea7")
 
 
@@ -60,7 +60,7 @@ class SaturationParameters(StudyParameters):
 
 @dataclass(frozen=True)
 class Check:
-    """Comparison of a number expected by spec/feed-and-force.md with its computed value."""
+    """Comparison of a number from spec/feed-and-force.md with its computed value."""
 
     name: str
     expected: str
@@ -293,7 +293,7 @@ def _checks(step: float, needed: tuple[float, float], without_filter: Outcome, w
         case = Case(periods=100, step=step, quantisation=_COARSE, gains=PRESETS[preset])
         return float(simulate(case, NOMINAL).period_max_error[50:].max())
 
-    switch = short(anti_windup=False)  # its error alternates between periods, so its mean is compared
+    switch = short(anti_windup=False)  # the error alternates between periods, so its mean is compared
     return [
         Check("needed |u|, nominal drive", "0.891", needed[0]),
         Check("needed |u|, worst corner", "1.10", needed[1]),

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effect of encoder and position-sensor errors on a law that does not know the speed, against the variable lead.
+"""Effect of encoder and position-sensor errors on a law that does not know the speed, compared with the variable lead.
 
 The cell of `lathe_papers.speed_deviation` runs with a frozen memory, with the variable lead of paper 000 (eq. 20) and
-with ``disturbance_controller``, for combinations of encoder counts, noise, frequency of the deviation, harmonic of the
-profile and seed. Some encoder counts give a small-integer ratio of counts per sample; the check before a start warns
-of them.
+with ``disturbance_controller``, for combinations of encoder counts, resolution of the edges' times, noise, frequency of
+the deviation, harmonic of the profile and seed. Some encoder counts give a small-integer ratio of counts per sample:
+the pre-start check warns about them, unless the encoder gives the times of its edges.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 
 _BEGINS = 3.0  # [s] start of the deviation, after 50 revolutions at constant speed
 _SHOWN = 1.0  # [s] duration of the deviation
-_GOLDEN = 0.6180339887  # fraction of a revolution by which the start of the deviation shifts per seed
+_GOLDEN = 0.6180339887  # shift of the deviation's start from seed to seed, in revolutions
 _PLAIN, _OURS = "speed_deviation", "robust"  # scenarios
 _FREE: Mapping[str, Value] = {  # the study assumes the linear drive, without its limits
     "electrodynamic_actuator.max_velocity": 1e3,
@@ -48,8 +48,11 @@ class SensorMapParameters(StudyParameters):
     """Parameters of the sensor-map study: sensors, deviations and profiles."""
 
     counts: list[Annotated[int, Ge(0), Le(2**31 - 1)]] = parameter(
-        [1000, 2048, 3000, 3500, 4096, 5000, 7000, 8192, 10_000, 100_000, 1_000_000],
+        [1000, 2048, 3000, 3500, 3840, 4096, 4200, 5000, 7000, 8192, 10_000, 100_000, 1_000_000],
         "of the encoder per revolution; 0: ideal",
+    )
+    edge_clock_us: list[Annotated[float, Ge(0), Le(1000)]] = parameter(
+        [0.0, 1.0], "resolutions of the times of the encoder's edges; 0: they have none", "µs"
     )
     noise_nm: list[Annotated[float, Ge(0), Le(10_000)]] = parameter([20.0], "RMS noise of the position sensor", "nm")
     wd: list[Annotated[float, Gt(0), Le(2000)]] = parameter(
@@ -67,14 +70,14 @@ class SensorMapParameters(StudyParameters):
 class SensorMapResult:
     """Results of the sensor-map study: largest errors during the speed deviation [µm].
 
-    Arrays have the shape (counts, noise, harmonics, wd · seeds) unless noted.
+    Arrays have the shape (counts, edge clocks, noise, harmonics, wd · seeds) unless noted.
 
     Attributes:
         parameters: parameters of the study.
         plain: errors of the variable lead.
         ours: errors of ``disturbance_controller``.
-        floor: errors of the variable lead at constant speed, shape (counts, noise, harmonics).
-        warned: whether the check before a start warns of the encoder counts, shape (counts,).
+        floor: errors of the variable lead at constant speed, shape (counts, edge clocks, noise, harmonics).
+        warned: whether the pre-start check warns about the encoder, shape (counts, edge clocks).
     """
 
     parameters: SensorMapParameters
@@ -92,7 +95,10 @@ class SensorMapResult:
         """Return all errors for JSON."""
         given = self.parameters
         return {
-            **{name: getattr(given, name) for name in ("counts", "noise_nm", "harmonics", "wd", "seeds")},
+            **{
+                name: getattr(given, name)
+                for name in ("counts", "edge_clock_us", "noise_nm", "harmonics", "wd", "seeds")
+            },
             "warned": self.warned.tolist(),
             "variable_lead_um": self.plain.tolist(),
             "disturbance_controller_um": self.ours.tolist(),
@@ -105,7 +111,14 @@ class SensorMapResult:
         """Return tables of the worst ratio and the worst error over frequencies and seeds."""
         given = self.parameters
         tables: list[RichTable | str] = []
-        columns = ("counts", "a sample", "warning", "nm", *(f"{harmonic} waves" for harmonic in given.harmonics))
+        columns = (
+            "counts",
+            "a sample",
+            "edges",
+            "warning",
+            "nm",
+            *(f"{harmonic} waves" for harmonic in given.harmonics),
+        )
         shared = cells.load(_OURS).shared
         passed = shared.nominal_speed * shared.step / (2.0 * np.pi)  # revolutions per sample
         for title, values in (
@@ -116,32 +129,42 @@ class SensorMapResult:
                 (
                     str(counts or "ideal"),
                     f"{counts * passed:.3g}",
-                    "yes" if self.warned[i] else "no",
+                    f"{clock:g} µs" if clock else "no",
+                    "yes" if self.warned[i, e] else "no",
                     f"{noise:g}",
-                    *(f"{value:.2f}" for value in values[i, j]),
+                    *(f"{value:.2f}" for value in values[i, e, j]),
                 )
-                for (i, counts), (j, noise) in product(enumerate(given.counts), enumerate(given.noise_nm))
+                for (e, clock), (i, counts), (j, noise) in product(
+                    enumerate(given.edge_clock_us), enumerate(given.counts), enumerate(given.noise_nm)
+                )
             ]
             tables += [comparison(title, columns, rows), ""]
-        told = [f"largest ratio of all {self.ratio.size}: {self.ratio.max():.2f}"]
-        if (others := self.ratio[~self.warned]).size and self.warned.any():
-            told.append(f"of the {others.size} without a warning: {others.max():.2f}")
+        told = []
+        for e, clock in enumerate(given.edge_clock_us):
+            ratio, warned = self.ratio[:, e], self.warned[:, e]
+            edges = f"edges to {clock:g} µs" if clock else "no times of edges"
+            told.append(f"{edges}: largest ratio of all {ratio.size}: {ratio.max():.2f}")
+            if (others := ratio[~warned]).size and warned.any():
+                told.append(f"of the {others.size} without a warning: {others.max():.2f}")
         return Group(*tables, *told)
 
     def draw(self, figure: "Figure") -> None:
-        """Draw one map per harmonic, counts over frequency, at the middle of the given noise levels."""
+        """Draw a map of counts against frequency for each edge clock and harmonic, at the middle noise level."""
         given = self.parameters
         noise = len(given.noise_nm) // 2
-        panels = np.atleast_1d(figure.subplots(1, len(given.harmonics), sharey=True))
-        for k, axes in enumerate(panels):
-            shown = self.ratio[:, noise, k].reshape(len(given.counts), len(given.wd), -1).max(axis=-1)
+        shape = len(given.edge_clock_us), len(given.harmonics)
+        panels = np.atleast_1d(figure.subplots(1, shape[0] * shape[1], sharey=True))
+        for axes, (e, k) in zip(panels, np.ndindex(shape), strict=True):
+            shown = self.ratio[:, e, noise, k].reshape(len(given.counts), len(given.wd), -1).max(axis=-1)
             image = axes.imshow(shown, vmin=0.0, vmax=1.0, cmap="viridis_r", aspect="auto")
             for (i, w), value in np.ndenumerate(shown):
                 ink = "white" if value > 0.4 else "black"
                 axes.text(w, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
             axes.set_xticks(range(len(given.wd)), [f"{wd:g}" for wd in given.wd], fontsize=7)
             axes.set_yticks(range(len(given.counts)), [str(counts or "ideal") for counts in given.counts], fontsize=7)
-            axes.set_title(f"{given.harmonics[k]} waves, {given.noise_nm[noise]:g} nm", fontsize=10)
+            clock = given.edge_clock_us[e]
+            edges = f"edges to {clock:g} µs" if clock else "no times of edges"
+            axes.set_title(f"{given.harmonics[k]} waves, {given.noise_nm[noise]:g} nm, {edges}", fontsize=9)
             axes.set_xlabel("deviation [rad/s]")
         panels[0].set_ylabel("counts per revolution")
         figure.colorbar(image, ax=list(panels), label="error over that of the variable lead")
@@ -157,7 +180,7 @@ class _Largest:
         self._largest = 0.0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Update the largest error with a chunk, from the start of the deviation."""
+        """Update the largest error with a chunk; samples before the start of the deviation are ignored."""
         error = dense[self._tool]["error"][max(self._begins - first, 0) :]
         self._largest = max(self._largest, float(np.abs(error).max(initial=0.0)) * 1e6)
 
@@ -167,7 +190,7 @@ class _Largest:
 
 
 def _cells(parameters: SensorMapParameters) -> list[Scenario]:
-    """Return the scenarios for all combinations of counts, noise and harmonics.
+    """Return the scenarios for all combinations of counts, edge clock, noise and harmonics.
 
     Each combination contains the plain law at constant speed, then both laws for each frequency and seed.
     """
@@ -179,10 +202,13 @@ def _cells(parameters: SensorMapParameters) -> list[Scenario]:
         for seed in {0, *parameters.seeds}
     }
     made = []
-    for counts, noise, harmonic in product(parameters.counts, parameters.noise_nm, parameters.harmonics):
+    for counts, clock, noise, harmonic in product(
+        parameters.counts, parameters.edge_clock_us, parameters.noise_nm, parameters.harmonics
+    ):
         changes: dict[str, Value] = {
             **_FREE,
             "spindle_encoder.counts_per_revolution": counts,
+            "spindle_encoder.edge_clock": clock * 1e-6,
             "electrodynamic_actuator.noise_rms": noise * 1e-9,
             "tool.harmonic_order": [harmonic],
             "tool.harmonic_amplitude": [parameters.amplitude_um * 1e-6],
@@ -199,7 +225,8 @@ def _cells(parameters: SensorMapParameters) -> list[Scenario]:
 
 def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapResult:
     """Run all scenarios and collect the largest errors."""
-    shape = len(parameters.counts), len(parameters.noise_nm), len(parameters.harmonics), -1
+    clocks = parameters.edge_clock_us
+    shape = len(parameters.counts), len(clocks), len(parameters.noise_nm), len(parameters.harmonics), -1
     found = np.reshape(
         [np.nan if kept is None else kept for kept in cells.kept(_cells(parameters), _Largest, track)], shape
     )
@@ -209,16 +236,17 @@ def run(parameters: SensorMapParameters, track: Track = untracked) -> SensorMapR
         found[..., 1 : several + 1],
         found[..., several + 1 :],
         np.ascontiguousarray(found[..., 0]),
-        np.array([_warned(parameters, counts) for counts in parameters.counts]),
+        np.array([[_warned(parameters, counts, clock) for clock in clocks] for counts in parameters.counts]),
     )
 
 
-def _warned(parameters: SensorMapParameters, counts: int) -> bool:
-    """Whether the check before a start warns of an encoder with this number of counts."""
+def _warned(parameters: SensorMapParameters, counts: int, clock: float) -> bool:
+    """Whether the pre-start check warns about an encoder with this number of counts and edge clock [µs]."""
     cell = Cell(cells.load(_OURS).nodes)
     nominal, law = cell.master.shared.nominal_speed, cell.stages["disturbance_controller"]
     assert isinstance(law, Learner), "it commands the drive"
-    return bool(law.encoder_warnings(nominal - parameters.deviation, nominal + parameters.deviation, counts))
+    slowest, fastest = nominal - parameters.deviation, nominal + parameters.deviation
+    return bool(law.encoder_warnings(slowest, fastest, counts, clock * 1e-6))
 
 
 STUDY = Study(
@@ -226,5 +254,5 @@ STUDY = Study(
     "what encoder and sensor leave of a law that does not know the speed, against the variable lead",
     SensorMapParameters,
     run,
-    size=(16.0, 3.6),
+    size=(18.0, 4.2),
 )

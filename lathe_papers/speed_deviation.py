@@ -2,7 +2,7 @@
 """Effect of an oscillating spindle speed on the error of each learning law (paper 000, Fig. 6).
 
 The cell of ``config/speed_deviation.yaml`` learns a harmonic profile at constant speed; then the speed oscillates. The
-protocol ``frozen`` freezes the memory at this point, and ``learning`` continues learning.
+protocol ``frozen`` freezes the memory at this point; with ``learning``, the law continues to learn.
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ COLOURS = {
     "disturbance_controller": "#1e8449",
 }
 LAWS = tuple(COLOURS)
-OURS = "disturbance_controller"  #: the last of the laws: a separate stage in a separate cell
+OURS = "disturbance_controller"  #: last of the laws, a separate stage in a separate cell
 _TRACES = ("constant_lead", "variable_lead", "adaptive_inverse", OURS)
 
 
@@ -76,8 +76,8 @@ class SpeedDeviationResult:
     Attributes:
         parameters: parameters of the study.
         largest, rms: largest and RMS error by law, one value per frequency [µm].
-        traces: curves by law of the figure, one pair (revolutions since the start of the deviation, error [µm]) per
-            frequency.
+        traces: curves of the figure by law, one pair (revolutions since the start of the deviation, error [µm]) for
+            each frequency.
     """
 
     parameters: SpeedDeviationParameters
@@ -90,7 +90,7 @@ class SpeedDeviationResult:
         return {"wd": self.parameters.wd, "max_um": self.largest, "rms_um": self.rms}
 
     def table(self) -> Group:
-        """Return a table of largest and RMS errors, one row per law; the paper prints curves and this ordering."""
+        """Return a table of largest and RMS errors, one row per law; the paper gives curves and this ordering."""
         given = self.parameters
         columns = ("law", *(f"{wd:g} rad/s" for wd in given.wd))
         title = f"{given.amplitude_um:g} µm, {given.harmonic} waves, ±{given.deviation:g} rad/s, {given.protocol}"
@@ -152,9 +152,9 @@ def _models(parameters: SpeedDeviationParameters) -> list[Overrides]:
 
 
 def settings(parameters: SpeedDeviationParameters) -> dict[str, list[Overrides]]:
-    """Return the parameters of the learning controller by law, with several variants if the worst counts."""
+    """Return the learning controller's parameters by law, with several variants where the worst one counts."""
     lead, q = parameters.t0_ms * 1e-3, parameters.q_us * 1e-6
-    delay = 0.36e-3  # of the drive: the only part that an inverse leaves to the lead
+    delay = 0.36e-3  # delay of the drive, the only part that an inverse leaves to the lead
     inverse: Overrides = {"lead_time": delay, "q_time": q}
     adaptive: Overrides = {
         "correction": _DYNAMIC,
@@ -186,7 +186,7 @@ def _run_cell(parameters: SpeedDeviationParameters, wd: float, name: str, contro
     start = round(_CYCLES * parameters.cycle_revolutions * 2 * np.pi / nominal * rate) / rate
     shown = max(_SHOWN, 3 * np.pi / wd)
     frozen = parameters.protocol == "frozen"
-    deviating = shown if frozen else 2 * shown  # the evaluation starts after one pass of the deviation
+    deviating = shown if frozen else 2 * shown  # while learning, one pass precedes the evaluation
     law = {
         "deviation_amplitude": [parameters.deviation / nominal],
         "deviation_frequency": [wd],
@@ -236,7 +236,7 @@ def run(parameters: SpeedDeviationParameters, track: Track = untracked) -> Speed
         largest[law].append(float(np.abs(error).max()))
         rms[law].append(float(np.sqrt(np.mean(error**2))))
         if law in traces:
-            every = max(error.size // 4000, 1)  # points beyond the pixels of the figure only cost memory
+            every = max(error.size // 4000, 1)  # more points than the figure has pixels would only cost memory
             traces[law].append((turns[::every], error[::every]))
     return SpeedDeviationResult(parameters, largest, rms, traces)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps for studies: computed on all cores, with the progress display of a study."""
+"""Sweeps for studies, computed on all cores with a study's progress display."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ def table(
     Args:
         asked: name, scenario and space of each sweep; sweeps with the same name share a folder.
         folder: parent folder of the sweep folders; empty to discard the rows.
-        columns: columns to read; a target that a sweep does not vary has the value of the scenario.
+        columns: columns to read; a target that a sweep does not vary has the scenario's value.
         track: progress display, in cells.
         options: further arguments of `lathe_rc.run_sweep`.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control cell of a CNC lathe for non-circular turning, offline and as ROS 2 nodes.
+"""Control cell of a CNC lathe for non-circular turning, emulated offline or as ROS 2 nodes.
 
     import lathe_rc
 
@@ -16,7 +16,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# The matrices are small, and waiting BLAS threads keep cores busy that other nodes need.
+# The matrices are small, and waiting BLAS threads would occupy cores that other nodes need.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Permissions for code and files named by untrusted data: a bag, a scenario inside a bag, a member's announcement.
+"""Permissions for code and files named by untrusted data: a bag, a scenario inside a bag, or a member's announcement.
 
-Code is imported only if an installed package offers it through an entry point of lathe_rc, or if the user has allowed
-its package: with ``--allow-code``, or through a scenario of the user's own in ``lathe run`` or in a Python program.
-Data may only name files in its own folder.
+Code is imported only if an installed package offers it through a lathe_rc entry point, or if the user has allowed its
+package, either with ``--allow-code`` or through the user's own scenario in ``lathe run`` or in a Python program.
+Untrusted data may only name files in its own folder.
 
-This module holds the list of allowed packages, one list per command call; child processes get the same list.
+This module holds the list of allowed packages, one list per command call; child processes are given the same list.
 """
 
 import contextlib
@@ -31,10 +31,10 @@ class _Call:
 
     Attributes:
         allowed: packages that may be imported.
-        here: allowed packages that are also searched in the current folder, after all installed packages.
-        folder: the current folder at the time when the first of these packages was allowed.
+        here: allowed packages that are also searched for in the current folder, after all installed packages.
+        folder: current folder when the first of these packages was allowed.
         own: whether packages named by the user's own scenarios are allowed.
-        own_is_here: whether these packages are also searched in the current folder.
+        own_is_here: whether packages named by these scenarios are also searched for in the current folder.
         named: function that returns the strings of the user's parameter files and command line, including paths.
     """
 
@@ -46,17 +46,17 @@ class _Call:
     named: Callable[[], Collection[str]] = tuple
 
 
-_calls = [_Call(own=True)]  # the first entry is for Python programs outside of a command
+_calls = [_Call(own=True)]  # the first entry is for Python programs outside a command
 
 
 class _CurrentFolder(MetaPathFinder):
     """Import finder for allowed packages in the current folder.
 
-    The folder itself is not added to Python's path: its other files would replace missing modules, metadata in it would
-    count as that of an installed package, and a ``sitecustomize.py`` would run in child processes.
+    The folder itself is not added to Python's path: its other files would replace missing modules, metadata in the
+    folder would count as that of an installed package, and a ``sitecustomize.py`` would run in child processes.
     """
 
-    importing = False  #: whether an allowed package is being imported, so that modules beside it may be imported, too
+    importing = False  #: whether an allowed package is being imported, so that the modules beside it are allowed too
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -73,7 +73,7 @@ _finder = _CurrentFolder()
 
 @contextlib.contextmanager
 def call(*, own: bool = False) -> Iterator[None]:
-    """Begin a command call with an empty list of allowed packages; permissions granted in the block end with it.
+    """Begin a command call with an empty list of allowed packages; permissions granted in the block end with the block.
 
     Args:
         own: whether packages named by the user's own scenarios are allowed, as in a Python program.
@@ -99,7 +99,7 @@ def allow(package: str) -> None:
     """Allow a package, which may be in the current folder.
 
     Raises:
-        InputError: the string is no package name.
+        InputError: the string is not a package name.
     """
     if not package.isidentifier():
         raise InputError(f"{OPTION} {shown(package)!r}; allowed: the name of a package, without dots, like my_law")
@@ -107,7 +107,7 @@ def allow(package: str) -> None:
 
 
 def allow_named(name: object) -> None:
-    """Allow the package of a class ``package.module:Class`` in a user's own scenario, if this call permits it."""
+    """Allow the package of a class ``package.module:Class`` named in a user's own scenario, if this call permits it."""
     module, colon, _ = str(name).partition(":")
     if colon and _calls[-1].own:
         _allow(module.partition(".")[0], here=_calls[-1].own_is_here)
@@ -124,7 +124,7 @@ def _allow(package: str, *, here: bool) -> None:
 
 
 def allow_own_code() -> None:
-    """Allow packages named by the user's own scenarios, also from the current folder unless it belongs to a bag."""
+    """Allow packages named by the user's own scenarios, also from the current folder unless this folder is in a bag."""
     _calls[-1].own, _calls[-1].own_is_here = True, bag_around(Path.cwd()) is None
 
 
@@ -142,7 +142,7 @@ def taken_from(words: Sequence[str]) -> list[str]:
     """Allow the packages of all ``--allow-code`` options, and return the command line without these options.
 
     Raises:
-        InputError: an option has no package.
+        InputError: an option names no package.
     """
     rest, waiting = list[str](), iter(words)
     for word in waiting:
@@ -155,16 +155,16 @@ def taken_from(words: Sequence[str]) -> list[str]:
 
 
 def interpreter(module: str) -> list[str]:
-    """Return the command that runs a module like ``python -m``, without the current folder on its path."""
+    """Return the command that runs a module as ``python -m`` does, but without the current folder on the path."""
     # Python 3.10 has no -P.
     run = "import sys; sys.path[:] = filter(None, sys.path); from runpy import run_module; "
     return [sys.executable, "-c", f"{run}run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)", module]
 
 
 def bag_around(folder: Path) -> Path | None:
-    """Return the bag that a folder is or belongs to; None: none.
+    """Return the bag that a folder is or belongs to; None if there is none.
 
-    A folder counts as a bag if it has storage files or metadata of ROS 2 bags.
+    A folder counts as a bag if it contains storage files or metadata of a ROS 2 bag.
     """
     try:
         here = folder.resolve()
@@ -185,11 +185,11 @@ def _is_bag(metadata: Path) -> bool:
 def user_names(texts: Callable[[], Collection[str]]) -> None:
     """Set the function that returns the strings of the user's parameter files and command line.
 
-    Members may announce the files that are named there.
+    Members may announce files that these strings name.
     """
     _calls[-1].named = texts
 
 
 def is_named(path: str) -> bool:
-    """Return whether the user's parameter files or command line name a file, see `user_names`."""
+    """Return whether the user's parameter files or command line name a file (see `user_names`)."""
     return path in _calls[-1].named()

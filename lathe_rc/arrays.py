@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array statements as functions for kernels.
+"""Array operations as functions for kernels.
 
 For statements on slices, Numba also compiles error messages about shapes, which takes seconds.
 """

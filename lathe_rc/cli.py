@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command line ``lathe``: commands are listed by name and imported only when called or completed.
 
-A list of the commands needs only their names and summaries, so that it is printed without delay.
+Listing the commands takes only their names and summaries, so the list is printed without delay.
 """
 
 import io
@@ -29,17 +29,17 @@ class _Command(click.Command):
 
 
 class Group(click.Group):
-    """Command group that prints each error of lathe_rc as one line and ends with its exit code."""
+    """Command group that prints a lathe_rc error as one line and exits with the error's exit code."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete command names, including the commands of a checkout's launcher, which the environment lists."""
+        """Complete command names, including those of a checkout's launcher, listed in an environment variable."""
         also = os.environ.get("_LATHE_ALSO", "").split()
         own = [CompletionItem(name) for name in also if name.startswith(incomplete) and not incomplete.startswith("-")]
         return [*super().shell_complete(ctx, incomplete), *own]
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; an error of lathe_rc is printed as one line and sets the exit code."""
-        # SIGTERM ends a command like Ctrl-C: children are terminated and bags are closed.
+        """Run a command; a lathe_rc error is printed as one line and sets the exit code."""
+        # SIGTERM ends a command as Ctrl-C does: child processes are terminated and bags are closed.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):

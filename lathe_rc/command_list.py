@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of ``lathe`` by name, with their summaries; the module of a command is imported on demand."""
+"""Names and summaries of the ``lathe`` commands; a command's module is imported on demand."""
 
 from typing import TYPE_CHECKING, cast
 
@@ -9,29 +9,31 @@ if TYPE_CHECKING:  # the first ./lathe --help runs before any package is install
     import click
 
 COMMANDS = {
-    "bag": "Ask bags what is in them; check and recover them; take a tachogram out.",
-    "budget": "Tell what the form error of a scenario is made of.",
-    "completion": "Make the shell complete the command line.",
+    "bag": "Show, check, copy and recover bags; extract a tachogram.",
+    "budget": "Split the form error of a scenario by its causes.",
+    "completion": "Print the shell completion script.",
     "container": "Run several nodes in one process.",
+    "correct": "Correct the programmed form of the next part.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
+    "design": "Find the learning law of a scenario for a measured drive.",
     "export": "Export a recording as CSV, Parquet or NPZ.",
     "fit": "Fit models to measurements.",
-    "measure": "Measure the part that a recorded run has turned.",
-    "new": "Begin a law, drive, stage or study of your own.",
+    "measure": "Measure the part turned in a recorded run.",
+    "new": "Create a law, drive, stage or study of your own.",
     "node": "Run one node, or list its parameters.",
-    "policy": "Make the SROS2 policy of a scenario.",
+    "policy": "Write the SROS2 policy of a scenario.",
     "record": "Record any topics into a new bag.",
     "reference": "Print the reference of nodes and topics.",
-    "replay": "Send the messages of a bag again.",
-    "report": "Write a recording as one HTML page.",
-    "resim": "Run a recorded cell again, also with changes.",
+    "replay": "Publish the messages of a bag again.",
+    "report": "Write a recording as an HTML page.",
+    "resim": "Re-simulate a recorded cell, optionally with changes.",
     "run": "Run a scenario to its end.",
     "study": "Compute a table or figure of the papers.",
     "sweep": "Compute many variations of a scenario into a table.",
-    "tune": "Search the parameters of a scenario that meet goals best.",
+    "tune": "Search for the parameters that best meet given goals.",
     "view": "Show a bag in Rerun.",
-}  #: their summaries
-_BESIDES = {"container": "node"}  # commands in the module of another command
+}  #: summaries of the commands, by name
+_BESIDES = {"container": "node"}  # commands defined in another command's module
 
 
 def imported(name: str) -> "click.Command":

@@ -12,7 +12,7 @@ class LatheError(Exception):
 
 
 class InputError(LatheError):
-    """Unusable input of the user: a parameter, a file, a path, an unstable setting."""
+    """Unusable user input: a parameter, a file, a path or an unstable setting."""
 
     exit_code: ClassVar[int] = 2
 
@@ -22,7 +22,7 @@ class UnpublishedError(InputError):
 
 
 class DivergedError(LatheError):
-    """Divergence of a run: not-finite numbers, or growth beyond a law's ``stop_ratio``."""
+    """Divergence of a run: non-finite numbers, or growth beyond a law's ``stop_ratio``."""
 
 
 class LossyRunError(LatheError):
@@ -38,14 +38,14 @@ def shown(text: object, longest: int = 200) -> str:
 
 
 def at_most(value: float, digits: int = 6) -> str:
-    """Format an upper limit, rounded down if it is rounded, so that the value in an error message is itself allowed."""
+    """Format an upper limit, rounded down if necessary, so that the value in an error message is itself allowed."""
     text = f"{value:.{digits}g}"
     rounded = Context(digits, ROUND_FLOOR).create_decimal(Decimal(value))
     return text if float(text) <= value else f"{float(rounded):.{digits}g}"
 
 
 def at_least(value: float, digits: int = 6) -> str:
-    """Format a lower limit, rounded up if it is rounded, so that the value in an error message is itself allowed."""
+    """Format a lower limit, rounded up if necessary, so that the value in an error message is itself allowed."""
     text = f"{value:.{digits}g}"
     rounded = Context(digits, ROUND_CEILING).create_decimal(Decimal(value))
     return text if float(text) >= value else f"{float(rounded):.{digits}g}"

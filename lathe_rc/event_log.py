@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readable event log of a run: events of the nodes, and messages of the supervisor."""
+"""Human-readable event log of a run: node events and supervisor messages."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Third-party plug-ins: registries of classes by name, built-in and from other packages.
+"""Third-party plug-ins: registries of built-in classes and classes from other packages, by name.
 
-A class is named by a built-in name, by the name of an installed package's entry point, or by its location
-``package.module:Class``, if an entry point offers that location or the user has allowed the package, see
-`lathe_rc.allowed_code`.
+A class is identified by a built-in name, by the name of an installed package's entry point, or by its location
+``package.module:Class`` if an entry point offers that location or the user has allowed the package (see
+`lathe_rc.allowed_code`).
 """
 
 import ast
@@ -32,7 +32,7 @@ V = TypeVar("V")
 
 
 class PluginRegistry(Mapping[str, V], Generic[V]):
-    """Registry of objects of one sort by name, built-in and from other packages.
+    """Registry of objects of one kind by name, both built-in and from other packages.
 
     Iteration yields the built-in names and the entry points of installed packages; ``package.module:Name`` can be
     looked up as well if `permits` allows it.
@@ -40,7 +40,7 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
     Args:
         what: description of one such object.
         own: built-in objects, or their locations ``package.module:Class``; a location is imported on first use.
-        group: group of the entry points.
+        group: entry-point group.
 
     Attributes:
         group: see above.
@@ -59,11 +59,11 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> V:
-        """Return the object of a name.
+        """Return the object with a given name.
 
         Raises:
             KeyError: no package offers the name.
-            InputError: its import is not allowed or fails, or it is no object of this sort.
+            InputError: importing the object is not allowed or fails, or the object is not of this kind.
         """
         own = self.own.get(name)
         if own is not None and not isinstance(own, str):
@@ -82,7 +82,7 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
 
     def permits(self, name: str) -> bool:
-        """Return whether a name may be looked up: data cannot name code that is neither offered nor allowed."""
+        """Return whether a name may be looked up; a location must be offered by a package or allowed by the user."""
         module, colon, _ = name.partition(":")
         if not colon or allowed_code.is_allowed(module):
             return True
@@ -101,14 +101,14 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return InputError(f"{self._what} {shown(name)!r} is {shown(repr(found))}; allowed: {wanted}")
 
     def offered_by(self, name: str) -> str:
-        """Return distribution and version of the package that offers a name; empty for built-in and unknown names."""
+        """Return the distribution that offers a name, with its version; empty for built-in and unknown names."""
         if name in self.own or name not in _offered(self.group) or is_ours(_offered(self.group)[name].module):
             return ""
         return _distribution(_offered(self.group)[name].dist)
 
 
 class Objects(PluginRegistry[V]):
-    """Registry of instances of one class, see `PluginRegistry`.
+    """Registry of instances of one class (see `PluginRegistry`).
 
     Args:
         what, own, group: see `PluginRegistry`.
@@ -126,7 +126,7 @@ class Objects(PluginRegistry[V]):
 
 
 class Registry(PluginRegistry[type[T]], Generic[T]):
-    """Registry of classes with a common base, see `PluginRegistry`.
+    """Registry of classes with a common base class (see `PluginRegistry`).
 
     Args:
         what, own, group: see `PluginRegistry`.
@@ -143,11 +143,11 @@ class Registry(PluginRegistry[type[T]], Generic[T]):
         raise self._refused(name, found, f"a class that derives from {self._base.__module__}.{self._base.__name__}")
 
     def allowed(self) -> str:
-        """The allowed names as readable text."""
+        """Return the allowed names as readable text."""
         return in_words(self)
 
     def origin(self, name: str) -> Mapping[str, str] | None:
-        """Return the origin of a third-party class: distribution, version, hash of its source; None: it is built in."""
+        """Return a third-party class's origin: distribution, version and source hash; None for a built-in class."""
         if name in self.own:
             return None
         module = self[name].__module__
@@ -156,13 +156,13 @@ class Registry(PluginRegistry[type[T]], Generic[T]):
 
 @contextmanager
 def code_of_others(what: str) -> Iterator[None]:
-    """Convert any exception of third-party code into a one-line error.
+    """Convert any exception from third-party code into a one-line error.
 
     Args:
         what: purpose of the code, in words.
 
     Raises:
-        InputError: the code raised an exception; the message contains it, with the file and line.
+        InputError: the code raised an exception; the message states the exception, the file and the line.
     """
     try:
         yield
@@ -193,7 +193,7 @@ def _attribute(module: str, attribute: str, what: str) -> Any:
 
 
 def _offered(group: str) -> Mapping[str, importlib.metadata.EntryPoint]:
-    """Return the entry points of installed packages by name.
+    """Return the entry points that installed packages offer in a group, by name.
 
     Raises:
         InputError: two packages offer the same name.
@@ -214,7 +214,7 @@ def _offered_along(group: str, path: tuple[str, ...]) -> Mapping[str, importlib.
 
 
 def in_words(names: Iterable[str]) -> str:
-    """Format the allowed names where ``names`` are known, and the forms of third-party names."""
+    """Return known names and the form of third-party names as readable text."""
     listed = ", ".join(names)
     return f"{listed}, or PACKAGE.MODULE:CLASS" if listed else "PACKAGE.MODULE:CLASS"
 
@@ -224,15 +224,16 @@ def _distribution(dist: importlib.metadata.Distribution | None) -> str:
 
 
 def search_path() -> str:
-    """Return the module search path for the ``PYTHONPATH`` of another interpreter; its present entries stay first."""
+    """Return this interpreter's module search path as a ``PYTHONPATH`` value; existing entries stay first."""
     given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     return os.pathsep.join(dict.fromkeys([*given, *(str(Path(folder).absolute()) for folder in sys.path)]))
 
 
 def is_ours(module: str) -> bool:
-    """Return whether a module belongs to lathe_rc, whose source the version of the compiled-code folder covers.
+    """Return whether a module belongs to lathe_rc.
 
-    The source of third-party modules is not covered there, but by the cache of their steps (`lathe_rc.compiled.step`).
+    The name of the compiled-code folder contains a hash of lathe_rc's own source. The source of third-party modules is
+    covered by the cache of their steps instead (`lathe_rc.compiled.step`).
     """
     return module.startswith(("lathe_rc.", "lathe_papers."))
 
@@ -243,11 +244,11 @@ def source_hash(module: str, *, imports: bool = False) -> str:
 
     Args:
         module: the module.
-        imports: whether to include imported packages, except lathe_rc and the dependencies of kernels. Of installed
-            packages, the direct imports of sources outside count, but not their own imports.
+        imports: whether to include imported packages, except lathe_rc and the dependencies of kernels. The imports of
+            installed packages other than the module's own are not followed further.
 
     Raises:
-        InputError: the module has no file.
+        InputError: the module is ``__main__``, which other processes cannot import.
     """
     if module == "__main__":
         raise InputError("__main__ is no module that other processes can import; put the class into a file of its own")
@@ -301,7 +302,7 @@ def _packages() -> Mapping[str, list[str]]:
 
 
 def origin(module: str) -> Mapping[str, str]:
-    """Return the origin of an imported module: distribution and version, if it has one, and the hash of its source."""
+    """Return the origin of an imported module: its distribution and version, if any, and the hash of its source."""
     names = _packages().get(module.partition(".")[0], [])
     dist = importlib.metadata.distribution(names[0]) if names else None
     told = {"distribution": dist.name, "version": dist.version} if dist else {}
@@ -309,10 +310,10 @@ def origin(module: str) -> Mapping[str, str]:
 
 
 class Named(Generic[T]):
-    """Annotation of a parameter whose value names an entry of a registry: ``Annotated[str, Named(REGISTRY)]``.
+    """Annotation for a parameter whose value names a registry entry: ``Annotated[str, Named(REGISTRY)]``.
 
     Args:
-        registry: registry in which a value is looked up when it is read.
+        registry: registry in which the value is looked up when it is read.
         special: further allowed names.
     """
 
@@ -321,7 +322,7 @@ class Named(Generic[T]):
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """Return the names that can be listed without an import."""
+        """Names that can be listed without importing anything."""
         return (*self.special, *self.registry.own)
 
     def allowed(self) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports of commands and executables, and of optional packages (extras)."""
+"""Import of command modules, executables and optional packages (extras)."""
 
 import importlib.util
 import signal
@@ -11,7 +11,7 @@ from types import ModuleType
 from lathe_rc.errors import LatheError
 
 _MODULES = {
-    "formats": ("asammdf", "nptdms"),
+    "formats": ("asammdf", "nptdms", "x3pio"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),
@@ -32,7 +32,7 @@ _CHECKOUT = {
 
 
 def refusal(module: str | None) -> LatheError | None:
-    """Return the error for a module that cannot be imported; None: the module belongs to no extra."""
+    """Return the error for a module that cannot be imported; None if the module belongs to no extra."""
     extra = _EXTRAS.get((module or "").partition(".")[0])
     if extra is None:
         return None
@@ -41,7 +41,7 @@ def refusal(module: str | None) -> LatheError | None:
 
 @contextmanager
 def named() -> Iterator[None]:
-    """Convert the import error of a missing extra into one line that says how to install it.
+    """Convert the import error for a missing extra into one line that says how to install the extra.
 
     Raises:
         LatheError: a module of an extra is missing.
@@ -69,8 +69,8 @@ def require(module: str) -> None:
 def load(name: str) -> ModuleType:
     """Import a module; Ctrl-C during the import ends the process at once.
 
-    An interrupted import needs no cleanup, and a KeyboardInterrupt in the middle of it would print the whole import
-    chain, or a library would convert it into another error.
+    An interrupted import needs no cleanup, whereas a KeyboardInterrupt during an import would print the whole import
+    chain or be converted into another error by a library.
     """
     if threading.current_thread() is not threading.main_thread():
         return importlib.import_module(name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounded reads, atomic writes, and checksums of files that lathe_rc reads again.
+"""Bounded reads, atomic writes, and checksums for files that lathe_rc reads back.
 
-The checksum is part of its file, so that both are written at once: at the end, or in the `ROOM` that the writer of a
-format has reserved for it in a text that other programs can still read.
+The checksum is part of the file, so that both are written at once: it is stored at the end, or in the `ROOM` that the
+writer reserves for it if other programs must still be able to read the file.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ def contents(path: Path, most: int = MOST) -> bytes:
     """Return the content of a file; pipes and system files, which can block a reader forever, are rejected.
 
     Raises:
-        OSError: the file cannot be read; EFBIG: it is longer than ``most`` bytes.
+        OSError: the file cannot be read, or it is longer than ``most`` bytes (EFBIG).
     """
     found = bytearray()
     with open(path, "rb", opener=open_file) as stream:
@@ -56,7 +56,7 @@ def open_file(name: str, flags: int) -> int:
 
 
 def sealed(content: bytes) -> bytes:
-    """Return the content of a file with its checksum in the last `ROOM`, or at the end if there is none."""
+    """Return the content of a file with its checksum in the last `ROOM`, or at the end if no room is reserved."""
     place = content.rfind(ROOM)
     head, tail = (content, b"") if place < 0 else (content[:place], content[place + len(ROOM) :])
     return head + _MARK + _checksum(head, tail) + tail
@@ -92,7 +92,7 @@ def check_place(option: str, path: Path) -> None:
     """Check that a file can be written at a path, before any computation.
 
     Raises:
-        InputError: the path is a folder, or its folder does not exist; the message names ``option``.
+        InputError: the path is a folder, or its parent folder does not exist; the message names ``option``.
     """
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise InputError(f"{option} {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
@@ -100,10 +100,10 @@ def check_place(option: str, path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file atomically: yield a temporary path beside ``path``, which replaces ``path`` at the end of the block.
+    """Write a file atomically: yield a temporary file in the same folder, which replaces ``path`` after the block.
 
-    The temporary file is flushed to the disk and then renamed. After an error the old file is unchanged, and the
-    temporary file is removed.
+    The temporary file is flushed to disk and then renamed. After an error, the old file is unchanged and the temporary
+    file is removed.
 
     Raises:
         OSError: the file cannot be written.
@@ -129,7 +129,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """Return the umask of this process; temporary files are created without permissions for other users."""
+    """Return the umask of this process, needed to give a temporary file the permissions of an ordinary file."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

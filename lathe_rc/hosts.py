@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of a cell across all hosts, as a test of a user's own stage."""
+"""Comparison of a cell's digests across all hosts, for testing a user's own stage."""
 
 import importlib.util
 import os
@@ -13,21 +13,21 @@ from lathe_rc.cell import batch
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 
-Digests = Mapping[str, str]  #: of each signal topic
+Digests = Mapping[str, str]  #: digest of each signal topic
 
-_OTHER_BLOCK = 23  # samples: divides neither a revolution nor a second
+_OTHER_BLOCK = 23  # [sample]; divides neither a revolution nor a second
 
 
 def digests_by_host(scenario: Scenario, folder: str | os.PathLike[str]) -> dict[str, Digests]:
-    """Return the digests of a scenario's signals in every host of this machine; they differ only if a stage is wrong.
+    """Return a scenario's signal digests in every host on this computer; they differ only if a stage is wrong.
 
     Args:
         scenario: the scenario; it should be short, since it runs seven times.
         folder: folder for the bag.
 
     Returns:
-        The digests by host: ``offline`` (also re-simulated from its bag), offline with another block length, as a cell
-        of a batch, and, if ROS 2 is installed, composed in one process and with one process per node.
+        Digests by host: ``offline`` (also re-simulated from its bag), offline with another block length, as a cell of
+        a batch and, if ROS 2 is installed, composed in one process and with one process per node.
 
     Raises:
         LatheError: a run failed.

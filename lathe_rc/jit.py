@@ -2,9 +2,9 @@
 # mypy: allow-untyped-calls
 """Compilation of inner loops: one decorator with common settings, and one cache.
 
-Numba stores compiled code in two kinds of files: an index of the signatures of a kernel, and the code of each. It does
-not verify them: a flipped bit changes a number or crashes the process. So each file of this cache has a checksum, and a
-damaged file is removed and written again. A cache that is not writable stops no run.
+Numba stores compiled code in two kinds of files: an index of a kernel's signatures, and the code for each signature. It
+does not verify these files, so a flipped bit can change a number or crash the process. Each file of this cache
+therefore has a checksum, and a damaged file is removed and written again. An unwritable cache does not stop a run.
 """
 
 import contextlib
@@ -53,7 +53,7 @@ _KERNELS = (
 
 
 def _source_hash() -> str:
-    """Return the hash of every file that may hold a kernel."""
+    """Return one hash of all files that may contain a kernel."""
     digest = hashlib.sha256(Path(__file__).read_bytes())
     for pattern in _KERNELS:
         for path in sorted(_PACKAGE.glob(pattern)):
@@ -65,23 +65,23 @@ _SOURCES = _source_hash()
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled code.
+    """Return the folder for compiled code.
 
-    Numba detects changes in the file of a kernel, but not in the kernels that it calls: a cache shared between versions
-    of the source would run outdated code. So each version of the source has its own folder.
+    Numba detects changes in a kernel's own file, but not in the kernels that it calls, so with a cache shared between
+    versions of the source, outdated code would run. Each version of the source therefore has its own folder.
     """
     return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / _SOURCES
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    setattr(numba.config, "CACHE_DIR", str(cache_folder()))  # noqa: B010 - for kernels of other packages; the module makes its names at run time
+    setattr(numba.config, "CACHE_DIR", str(cache_folder()))  # noqa: B010 - for third-party kernels; the attributes of numba.config are created at run time
 
 
 # ---- the cache -----------------------------------------------------------------------------------------------------
 
 
 def read_kept(path: Path) -> memoryview | None:
-    """Return the content of a file of the cache; None if it is missing or damaged.
+    """Return the content of a cache file; None if the file is missing, unreadable or damaged.
 
     A damaged file is reported and removed.
     """
@@ -123,10 +123,10 @@ def can_keep() -> bool:
 
 
 class _Place(_CacheLocator):
-    """Cache location of a kernel, whose folder need not exist or be writable; the kernel needs no source file."""
+    """Cache location of a kernel; the folder need not exist or be writable, and the kernel needs no source file."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._py_file = file  # Numba names it in its warnings
+        self._py_file = file  # shown in Numba's warnings
         self._line = function.__code__.co_firstlineno
 
     @classmethod
@@ -144,7 +144,7 @@ class _Place(_CacheLocator):
 
 
 class _Implementation(CompileResultCacheImpl):
-    _locator_classes = [_Place]  # noqa: RUF012 - as Numba has it
+    _locator_classes = [_Place]  # noqa: RUF012 - as in Numba
 
 
 class _Files(IndexDataCacheFile):
@@ -185,7 +185,7 @@ class _Cache(FunctionCache):
 
 
 def _kept(compiled: Any, function: Callable[..., Any]) -> Any:
-    compiled._cache = _Cache(function)  # noqa: SLF001 - Numba's own would be unchecked
+    compiled._cache = _Cache(function)  # noqa: SLF001 - Numba's own cache does not verify its files
     return compiled
 
 
@@ -197,8 +197,8 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Any:
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function of scalars and arrays with Numba; compiled code is cached between runs.
 
-    Neither reassociation nor contraction is allowed (``fastmath`` off), so the same arithmetic gives bit-identical
-    results for every block length. Division by zero gives inf or NaN as in NumPy. The kernel releases the GIL.
+    Neither reassociation nor contraction is allowed (``fastmath`` is off), so the same arithmetic gives bit-identical
+    results for every block length. Division by zero gives inf or NaN, as in NumPy. The kernel releases the GIL.
 
     Example:
         >>> import lathe_rc
@@ -214,13 +214,13 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a `kernel` that is inlined into the kernels that call it.
 
-    It suits functions called once per sample, since passing an array costs as much as ten operations.
+    This suits functions called once per sample, since passing an array costs as much as ten operations.
     """
     return cast("Callable[P, R]", _compiled(function, forceinline=True))
 
 
 def entry(function: Callable[..., int]) -> Any:
-    """Compile a function of six addresses or integers to an integer; other kernels `call` its ``address``."""
+    """Compile a function from six addresses or integers to an integer; other kernels `call` it by its ``address``."""
     signature = (types.int64,) * 6, types.int64
     compiled = _kept(CFunc(function, signature, locals={}, options={"error_model": "numpy"}), function)
     compiled.compile()

@@ -32,12 +32,12 @@ SAFETY_STATUS = f"{PACKAGE}/msg/SafetyStatus"
 MEMBER = f"{PACKAGE}/msg/Member"
 CELL_STATE = f"{PACKAGE}/msg/CellState"
 JOINTS = "sensor_msgs/msg/JointState"
-ALIVE = "alive"  #: topic of each node without messages, used for its liveliness
+ALIVE = "alive"  #: topic on which each node asserts its liveliness; it carries no messages
 
 START_NS = 1_000_000_000  #: simulated time of sample 0 [ns]; a stamp of 0 means "not set" in ROS
-MAX_BLOCK = 8192  #: bound of the arrays of a block [sample]; the .msg files say the same
+MAX_BLOCK = 8192  #: maximum length of the arrays of a block [sample], as in the .msg files
 
-NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}  #: fields of sparse messages that digests leave out
+NOT_SIGNALS = {"header", "run_id", "source", "__msgtype__"}  #: fields of sparse messages that are excluded from digests
 
 Samples = npt.NDArray[Any]
 Signals = dict[str, Samples]  #: the arrays of a block by field name
@@ -54,9 +54,9 @@ def _own() -> "Typesdict":
 
 @cache
 def store() -> Typestore:
-    """Return the type store with the types of ROS 2 and lathe_rc.
+    """Return the type store with the message types of ROS 2 and lathe_rc.
 
-    Loading it takes a while, and a run without a bag does not need it.
+    Loading the store takes a while, and a run without a bag does not need it.
     """
     types = get_typestore(Stores.ROS2_JAZZY)
     types.register(_own())
@@ -64,7 +64,7 @@ def store() -> Typestore:
 
 
 def fields(msgtype: str) -> list[tuple[str, Any]]:
-    """Return the names and kinds of a type's fields, in order, in the form that rosbags uses."""
+    """Return the names and kinds of a message type's fields, in order, in the format of rosbags."""
     return list((_own() if msgtype in _own() else store().fielddefs)[msgtype][1])
 
 
@@ -103,7 +103,7 @@ def sample_fields(msgtype: str) -> dict[str, np.dtype[Any]]:
 
 
 def full(topic: str) -> str:
-    """Return the fully qualified name of a topic; topic names of the engine have no leading slash."""
+    """Return the fully qualified name of a topic; the engine's topic names have no leading slash."""
     return "/" + topic.lstrip("/")
 
 
@@ -127,22 +127,22 @@ def stamp_ns(message: Any) -> int:
 
 
 def stamp_of(data: bytes | memoryview) -> int:
-    """Return the simulated time [ns] of an encoded message by decoding the time stamp of its leading header alone."""
+    """Return the simulated time [ns] of an encoded message, decoding only the time stamp of its header."""
     stamp = decode("builtin_interfaces/msg/Time", bytes(data[:12]))  # the header's first field
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def encode(msgtype: str, message: Any) -> bytes:
-    """Encode a message as CDR bytes, padded to a multiple of four as in DDS."""
+    """Encode a message as CDR bytes, padded to a multiple of four bytes as in DDS."""
     data = bytes(store().serialize_cdr(message, msgtype))
     return data + bytes(-len(data) % 4)
 
 
 def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
-    """Return the fields of a message, without its header, sender and run.
+    """Return the fields of an encoded message, without its header, source and run ID.
 
     Raises:
-        ValueError: the bytes are no message of this type.
+        ValueError: the bytes are not a message of this type.
     """
     return {name: value for name, value in vars(decode(msgtype, data)).items() if name not in NOT_SIGNALS}
 
@@ -151,9 +151,9 @@ def decode(msgtype: str, data: bytes) -> Any:
     """Decode a message from CDR bytes; its arrays are views of the bytes.
 
     Raises:
-        ValueError: the bytes are no message of this type.
+        ValueError: the bytes are not a message of this type.
     """
     try:
         return store().deserialize_cdr(data, msgtype)
-    except Exception as error:  # noqa: BLE001 - rosbags' generated code raises whatever broken bytes lead to
+    except Exception as error:  # noqa: BLE001 - rosbags' generated code can raise any exception on damaged bytes
         raise ValueError(f"{msgtype} cannot be decoded ({type(error).__name__})") from None

@@ -23,7 +23,7 @@ def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
     Args:
         name: the unknown name.
         known: all known names.
-        listing: command or place that lists all names; empty: none.
+        listing: command or place that lists all names; empty if there is none.
     """
     names = list(known)
     close = dict.fromkeys([*get_close_matches(name, names, _MOST_CLOSE), *(each for each in names if _in(name, each))])
@@ -37,10 +37,10 @@ def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
 
 
 def checked_namespace(namespace: str) -> str:
-    """Return the ROS namespace after checking it.
+    """Check a ROS namespace and return it.
 
     Raises:
-        InputError: the string is no valid namespace.
+        InputError: the string is not a valid namespace.
     """
     if not _NAMESPACE.fullmatch(namespace):
         raise InputError(f"namespace {namespace!r}; allowed: / or /NAME or /NAME/NAME, of letters, digits and _")
@@ -48,5 +48,5 @@ def checked_namespace(namespace: str) -> str:
 
 
 def absolute(namespace: str, name: str) -> str:
-    """Return the absolute name in a namespace."""
+    """Return a name as an absolute name in a namespace."""
     return name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"

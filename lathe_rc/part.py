@@ -20,8 +20,8 @@ from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
 
-_CUTOFF = 50.0  # of the filters for roundness and roughness [undulations per revolution]
-_TOGETHER = 16  # revolutions that are evaluated together
+_CUTOFF = 50.0  # cutoff of the roundness and roughness filters [undulations per revolution]
+_TOGETHER = 16  # number of revolutions evaluated together
 
 
 def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
@@ -29,10 +29,10 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
 
     Args:
         recording: recording of the run, with an encoder and a tool.
-        cutoff: of the filters for roundness and roughness [undulations per revolution].
+        cutoff: cutoff of the roundness and roughness filters [undulations per revolution].
 
     Raises:
-        InputError: the recording has no encoder or tool, or not one complete revolution.
+        InputError: the recording has no encoder, no tool, or no complete revolution.
     """
     if not {messages.TOOL, messages.ENCODER} <= set(recording.types.values()):
         raise InputError("nothing to measure: the recording has no encoder and tool; record both")
@@ -52,7 +52,7 @@ def tolerances(scenario: Scenario) -> dict[str, float]:
 
 
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
-    """Judge whether the part of a run is in tolerance; None if its tool has no tolerance."""
+    """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
@@ -61,7 +61,7 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
 
 
 def error_growth(recording: Recording) -> Growth | None:
-    """Return the growth of the form error of a run (see `lathe_rc.analysis.tolerance.growth`)."""
+    """Return the growth of a run's form error (see `lathe_rc.analysis.tolerance.growth`)."""
     return growth(recording.errors.largest, _turns_before(recording))
 
 
@@ -76,7 +76,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
     Args:
         recording: recording of the run.
         found: measurement of the same recording by `measured`.
-        nose_radius: radius of the tool in the plane of the feed [m].
+        nose_radius: nose radius of the tool in the plane of the feed [m].
     """
     angle = recording.of_type(messages.ENCODER)["angle_true"]
     height = evenly(angle - 2.0 * np.pi * turns_before(angle), recording.of_type(messages.TOOL)["height"])
@@ -84,7 +84,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
 
 
 def along(found: Lay) -> dict[str, Any]:
-    """Return the figures of the surface along the part; lengths in µm, the feed in µm per revolution."""
+    """Return the surface figures along the part; lengths in µm, the feed in µm per revolution."""
     rt, ra = found.rt * 1e6, found.ra * 1e6
     return {
         "revolutions": found.revolutions,
@@ -97,7 +97,7 @@ def along(found: Lay) -> dict[str, Any]:
 
 
 def along_in_words(found: Lay) -> str:
-    """Format the figures of the surface along the part as one line of text."""
+    """Format the surface figures along the part as one line of text."""
     told = along(found)
     return (
         f"along the part, last {told['revolutions']} revolutions at {told['feed']:.4g} µm/rev: Ra {told['ra']:.3g} µm, "
@@ -106,9 +106,9 @@ def along_in_words(found: Lay) -> str:
 
 
 def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
-    """Return the figures of one revolution, counted from 0; lengths in µm."""
+    """Return the figures for one revolution, counted from 0; lengths in µm."""
     around, waves = found.roundness, found.undulations.amplitude[revolution]
-    largest = int(np.argmax(waves[2:])) + 2  # 0 is the size of the part, 1 its eccentricity
+    largest = int(np.argmax(waves[2:])) + 2  # harmonic 0 is the size of the part, 1 its eccentricity
 
     def um(values: np.ndarray) -> float:
         return float(values[revolution]) * 1e6
@@ -127,13 +127,13 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
 
 
 def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
-    """Return the first topics of encoder and tool; None where there is none."""
+    """Return the first encoder topic and the first tool topic; None for a missing one."""
     kinds = (messages.ENCODER, messages.TOOL)
     return [next((topic for topic, found in types.items() if found == kind), None) for kind in kinds]
 
 
 class ErrorsByRevolution:
-    """Form error of each revolution, chunk by chunk; a sink of the engine and of `lathe_rc.bag.reading.stream`.
+    """Form error of each revolution, collected chunk by chunk; a sink of the engine and `lathe_rc.bag.reading.stream`.
 
     Args:
         types: message type by fully qualified topic.
@@ -163,7 +163,7 @@ class FirstAndLast:
     """Sink of the engine that collects the first and the last revolutions of a run, chunk by chunk.
 
     Args:
-        types: message type by fully qualified topic; with an encoder and a tool.
+        types: message type by fully qualified topic; includes an encoder and a tool.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
@@ -172,7 +172,7 @@ class FirstAndLast:
         assert tool is not None, "its caller has looked"
         self._encoder, self._tool = encoder, tool
         self._head = self._tail = np.empty((2, 0))  # angle and error
-        self._start = 0.0  # angle of the first revolution [rad]
+        self._start = 0.0  # angle at the start of the first revolution [rad]
         self._before = 0  # revolutions before the tail
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -186,14 +186,14 @@ class FirstAndLast:
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)
         self._tail = np.concatenate([self._tail, piece], axis=1)
-        # Filters need the revolutions before the last one; older ones are dropped to bound the memory.
+        # Filters need the revolutions before the last one; older ones are dropped to limit memory use.
         past = int(self._tail[0, -1] / (2.0 * np.pi)) - _TOGETHER
         if past > self._before:
             self._before = past
             self._tail = self._tail[:, int(np.searchsorted(self._tail[0], past * 2.0 * np.pi)) :]
 
     def numbers(self) -> dict[str, Any] | None:
-        """Return the number of revolutions and the figures of first and last; None without a complete revolution."""
+        """Return the revolution count and the figures for the first and last one; None without a complete one."""
         head = measure(self._head[0] - self._start, self._head[1], roundness_cutoff=_CUTOFF)
         if not head.form.rms.size:
             return None
@@ -207,7 +207,7 @@ class FirstAndLast:
 
 
 def write_profile(path: Path, recording: Recording, found: Measurement, revolutions: list[int]) -> None:
-    """Write the radius deviations of revolutions as CSV, with the heights along the part if it was fed."""
+    """Write the radius deviations of revolutions as CSV, with the heights along the part if there was a feed."""
     heights = None
     if len(revolutions) > 1:
         height = recording.of_type(messages.TOOL)["height"]

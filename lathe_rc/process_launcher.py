@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Process start through a fork server, see `lathe_rc.nodes.fork_server`; this module does not import ROS.
+"""Start of processes through a fork server (see `lathe_rc.nodes.fork_server`); this module does not import ROS.
 
-The fork server of `multiprocessing` imports the user's main module anew in each process: a script without
-``if __name__ == "__main__"`` would run itself again, and so would a notebook. It also cannot load kernels on request.
+The fork server of `multiprocessing` imports the user's main module again in each process: a script without
+``if __name__ == "__main__"`` would rerun itself, and so would a notebook. It also cannot load kernels on request.
 """
 
 import atexit
@@ -24,9 +24,9 @@ from typing import Literal
 from lathe_rc import allowed_code, extras
 from lathe_rc.errors import LatheError
 
-Start = Literal["fork", "spawn"]  #: start of a process: as a fork of one with all imports, or as a new interpreter
+Start = Literal["fork", "spawn"]  #: start of a process: forked from one with all imports, or as a new interpreter
 
-_MOST = 2**16  # [B] of an answer
+_MOST = 2**16  # longest answer [B]
 
 
 class Child:
@@ -78,7 +78,7 @@ class Child:
 
 
 class ForkServer:
-    """Fork server of this process, which ends together with it.
+    """Fork server of this process; it ends when this process does.
 
     Raises:
         LatheError: ROS 2 is not installed.
@@ -106,7 +106,7 @@ class ForkServer:
         atexit.register(self.close)
 
     def preload(self, nodes: Mapping[str, tuple[str, Mapping[str, object]]]) -> None:
-        """Load the modules and kernels of nodes in the server, without waiting for it.
+        """Load the modules and kernels of nodes in the server, without waiting for it to finish.
 
         Args:
             nodes: kind and parameters of each node.
@@ -128,9 +128,9 @@ class ForkServer:
         Args:
             arguments: command-line arguments of `lathe_rc.nodes.container`, which the process runs.
             environment: complete environment of the process.
-            report: socket for its `lathe_rc.nodes.report.Reporter`; the caller may close it after the call.
-            log: descriptor of the file for its output.
-            command: command to run in place of the container.
+            report: socket for the new process's `lathe_rc.nodes.report.Reporter`; may be closed after the call.
+            log: descriptor of the file for the new process's output.
+            command: command to run instead of the container.
 
         Raises:
             LatheError: the server has ended.
@@ -152,7 +152,7 @@ class ForkServer:
         return child
 
     def _listen(self) -> None:
-        """Process the server's answers; at its end its processes are killed, since exit codes would be unknown."""
+        """Process the server's answers; when it ends, kill its children, whose exit codes would be unknown."""
         with contextlib.suppress(OSError):
             while (answer := socket.recv_fds(self._line, _MOST, 1))[0]:
                 pid, code = json.loads(answer[0])
@@ -181,7 +181,7 @@ def _server_of(_pid: int) -> ForkServer:
 
 
 def server() -> ForkServer:
-    """Return the fork server of this process, and start it on the first call."""
+    """Return the fork server of this process; start one on the first call, or if the last one has ended."""
     if _server_of(os.getpid()).lost:
         _server_of.cache_clear()
     return _server_of(os.getpid())

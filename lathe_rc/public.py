@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lazy public names of a package: its stub lists them, also for type checkers, and each is imported on first use.
+"""Lazily imported public names of a package, listed in its stub, which type checkers read as well.
 
-So a package can export names of many modules without import costs (PEP 562).
+A name is imported on first use (PEP 562), so a package can export names from many modules without import costs.
 """
 
 import ast
@@ -14,7 +14,7 @@ from typing import Any
 
 @cache
 def homes(package: str) -> dict[str, tuple[str, str]]:
-    """Return the module of each public name of a package, and its name there."""
+    """Return the module of each of a package's public names, and the object's name in that module."""
     stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi")
     lines = ast.parse(stub.read_text(encoding="utf-8")).body
     imports = [line for line in lines if isinstance(line, ast.ImportFrom)]

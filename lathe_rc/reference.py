@@ -75,7 +75,7 @@ def _parameters(rows: Mapping[str, Row]) -> str:
 
 
 def _only(table: type[NodeParameters], base: type[SharedParameters]) -> dict[str, Row]:
-    """Return the parameters that a table adds to those of its base."""
+    """Return the parameters that a table adds to those of a base class."""
     return {name: row for name, row in table.rows().items() if name not in base.model_fields}
 
 
@@ -169,7 +169,7 @@ def _messages() -> str:
 
 
 def _definition(text: str) -> Iterator[str]:
-    """Return the comment at the head of a message or service definition, and one table for each of its parts."""
+    """Yield the leading comment of a message or service definition, and a table of fields for each of its parts."""
     about: list[str] = []
     rows: list[list[str]] = []
     for line in map(str.strip, text.splitlines()):

@@ -10,21 +10,20 @@ from lathe_rc.names import instead
 
 
 def config_folders() -> list[Path]:
-    """Return the configuration folders, nearest first: a checkout, ament prefixes, the Python environment."""
+    """Return the configuration folders in order of precedence: checkout, ament prefixes, Python environment."""
     prefixes = [prefix for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
     shared = [Path(prefix) / "share" / "lathe_rc" / "config" for prefix in [*prefixes, sys.prefix]]
     return [folder for folder in [Path(__file__).parents[1] / "config", *shared] if folder.is_dir()]
 
 
 def scenario(path: Path) -> Path:
-    """Return the file of a scenario: `find` of ``path``, or of the same name with ``.yaml``.
+    """Return the file of a scenario: `find` applied to ``path``, or to the same name with ``.yaml``.
 
     Raises:
-        InputError: there is no such file; the message names similar ones. Or the current folder and lathe_rc both have
-        a
-            scenario of this name.
+        InputError: there is no such file (the message names similar ones), or the current folder and lathe_rc both
+            have a scenario of this name.
     """
-    # A folder of that name, such as a package of lathe new, is no scenario.
+    # A folder of that name, such as a package created by lathe new, is not a scenario.
     folder = path.is_dir() and bool(path.name.strip(".")) and find(path.with_suffix(".yaml")).exists()
     if not path.suffix and (folder or not path.exists()):
         path = path.with_suffix(".yaml")
@@ -39,7 +38,7 @@ def scenario(path: Path) -> Path:
 
 
 def find(path: Path) -> Path:
-    """Return ``path`` itself if it exists or is absolute; otherwise the same name in a configuration folder, if any."""
+    """Return ``path`` if it exists or is absolute; otherwise the same name in a configuration folder, if one has it."""
     if path.exists() or path.is_absolute():
         return path
     return next((folder / path for folder in config_folders() if (folder / path).exists()), path)

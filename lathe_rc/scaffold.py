@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New user packages from the templates in lathe_rc/templates: a law, a drive, a stage or a study."""
+"""Creation of user packages from the templates in lathe_rc/templates: a law, a drive, a stage or a study."""
 
 import keyword
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ class Kind:
 
     Attributes:
         summary: description of the package.
-        group: group of its entry point.
-        members: nodes of its scenario beside spindle and recorder; ``{}`` is the new node; empty: no scenario.
+        group: entry-point group of the package.
+        members: nodes of the scenario besides spindle and recorder, with ``{}`` for the new node; empty: no scenario.
     """
 
     summary: str
@@ -51,7 +51,7 @@ def begin(kind: str, name: str, place: Path, *, compiled: bool) -> list[str]:
         compiled: whether the package has a compiled step.
 
     Returns:
-        The written files.
+        Names of the files written.
 
     Raises:
         InputError: the name is not allowed, or the folder exists or cannot be written.
@@ -82,7 +82,7 @@ def begin(kind: str, name: str, place: Path, *, compiled: bool) -> list[str]:
 
 
 def _check_name(name: str) -> None:
-    """Reject a name that is not allowed for a package and a node."""
+    """Reject a name that is not allowed for both a package and a node."""
     if not (name.isascii() and name.isidentifier() and name == name.lower()) or name.startswith("_"):
         raise InputError(f"{name!r}; allowed: small letters, digits and _, a letter first")
     if keyword.iskeyword(name) or name in COMMON:
@@ -97,7 +97,7 @@ def _write(folder: Path, files: dict[str, str], words: dict[str, object]) -> Non
         undefined=StrictUndefined,
         trim_blocks=False,
         keep_trailing_newline=True,
-        autoescape=False,  # noqa: S701 - they are no pages
+        autoescape=False,  # noqa: S701 - the files are not web pages
     )
     try:
         for file, template in files.items():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """SROS2 policies: the topics and services that each node of a cell may use, derived from the wiring without ROS.
 
-DDS security applies to processes, not to nodes: an enclave holds the permissions of one process, the union of its
-nodes' profiles. No name is denied explicitly, since everything outside the profiles of an enclave is denied.
+DDS security applies to processes, not to nodes: an enclave holds the permissions of one process, which are the union of
+its nodes' profiles. No name is denied explicitly, since everything outside the profiles of an enclave is denied.
 """
 
 import xml.etree.ElementTree as ET
@@ -21,7 +21,7 @@ from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.rerun_signals import is_drawn
 
-OPERATOR = "operator"  #: operator with the ROS command-line tools, who may read every topic and call every service
+OPERATOR = "operator"  #: user of the ROS command-line tools, who may read every topic and call every service
 
 _LOG, _PARAMETER_EVENTS, _CLOCK = "/rosout", "/parameter_events", "/clock"
 _PARAMETERS = (
@@ -40,9 +40,9 @@ _LIFECYCLE = (
     "get_state",
     "get_transition_graph",
 )
-_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # of single kinds of nodes
-_RECORDED = ("/diagnostics", "cell_state")  # host topics that a bag holds
-_COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes of ros2 topic, ros2 service and so on
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # services of some kinds of nodes
+_RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
+_COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +64,11 @@ class Profile:
     request: frozenset[str] = frozenset()
 
 
-Policy = dict[str, list[Profile]]  #: profiles of each enclave, by its path
+Policy = dict[str, list[Profile]]  #: profiles of each enclave, by enclave path
 
 
 class _Maker:
-    """Builder of the profiles for the nodes of a cell and for tools beside it.
+    """Builder of the profiles for the nodes of a cell and for the tools used alongside it.
 
     Args:
         scenario: scenario with a recorder.
@@ -82,7 +82,7 @@ class _Maker:
         self.members: list[Profile] = []
 
     def member(self, name: str, group: Sequence[str]) -> Profile:
-        """Return the profile of a node that shares its process with ``group``, whose topics it reads in memory."""
+        """Return the profile of a node that shares a process with ``group`` and reads the group's topics in memory."""
         kind, stage = self._scenario.kind(name), self._cell.stages.get(name)
         own = {topic for topic, source in self._signals.items() if source.node == name}
         reads = {topic for topic in self._signals if stage is None or stage in self._cell.readers(topic)}
@@ -114,7 +114,7 @@ class _Maker:
         services: Iterable[str] = (),
         logs: bool = True,
     ) -> Profile:
-        """Return a profile with the permissions common to all rclpy nodes and those of the arguments."""
+        """Return a profile with the permissions common to all rclpy nodes and those in the arguments."""
         return Profile(
             namespace=self._namespace,
             node=name,
@@ -128,7 +128,7 @@ class _Maker:
         return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
 
     def replayer(self) -> Profile:
-        """Return the profile of the replayer, which alone publishes the topics of a recorded cell."""
+        """Return the profile of the replayer, the only publisher of a recorded cell's topics."""
         topics = [*self._signals, *_RECORDED, _CLOCK]
         return self._node(REPLAYER, publish=topics, services=_SERVICES[REPLAYER], logs=False)
 
@@ -137,7 +137,7 @@ class _Maker:
         return self._node(TOPIC_RECORDER, subscribe=self._published() - {_LOG, _PARAMETER_EVENTS}, logs=False)
 
     def operator(self) -> Profile:
-        """Return the profile of an operator with the ROS command-line tools, which generate their own node names."""
+        """Return the profile for the ROS command-line tools, which generate their own node names."""
         return Profile(
             namespace=self._namespace,
             node=OPERATOR,
@@ -157,7 +157,7 @@ _BESIDE: Mapping[str, Callable[[_Maker], Profile]] = {
     RERUN_BRIDGE: _Maker.rerun_bridge,
     TOPIC_RECORDER: _Maker.topic_recorder,
 }
-BESIDE = tuple(_BESIDE)  #: tools that may be admitted beside the members of a cell
+BESIDE = tuple(_BESIDE)  #: tools that can be given permissions in addition to the members of a cell
 
 
 def policy(
@@ -171,15 +171,15 @@ def policy(
 
     Args:
         scenario: the scenario; a recorder is added if it has none.
-        groups: names of nodes that share a process; all other nodes have their own; None: as in the scenario.
+        groups: groups of nodes that share a process; every other node has its own; None: as in the scenario.
         namespace: namespace of the cell, ``/`` or ``/a/b``.
-        beside: further tools with permissions, out of `BESIDE`.
+        beside: additional tools that are given permissions, from `BESIDE`.
 
     Returns:
-        The profiles of each enclave. Its path is the fully qualified name of its process's first node.
+        The profiles of each enclave. An enclave's path is the fully qualified name of the first node in its process.
 
     Raises:
-        InputError: the scenario cannot be wired, ``groups`` has an unknown node, or the namespace is not valid.
+        InputError: the scenario cannot be wired, ``groups`` names an unknown node, or the namespace is invalid.
     """
     checked_namespace(namespace)
     # The bag's folder does not affect the policy.
@@ -222,6 +222,6 @@ def _append(element: ET.Element, profile: Profile) -> None:
 
 
 def _expression(profile: Profile, name: str) -> str:
-    """Return a name in the notation of policies, where ~ stands for the node's own name."""
+    """Return a name in policy notation, where ~ stands for the node's own name."""
     own = f"{profile.node}/"
     return f"~/{name.removeprefix(own)}" if name.startswith(own) else name

@@ -22,7 +22,7 @@ P = TypeVar("P", bound="StudyParameters")
 
 
 class StudyParameters(Table):
-    """Parameters of a study: a parameter table as of a node, in which lists must not be empty."""
+    """Parameters of a study: a parameter table like that of a node, in which lists must not be empty."""
 
     listing: ClassVar[str] = "lathe study {} --help"
 
@@ -34,7 +34,7 @@ class StudyParameters(Table):
 
 
 class Track(Protocol):
-    """Progress display for a loop: yields the items and shows the number of finished ones."""
+    """Progress display for a loop: yields the items and shows how many are finished."""
 
     def __call__(self, items: Sequence[T], /) -> Iterable[T]:
         """Yield the items one by one."""
@@ -52,14 +52,14 @@ class Result(Protocol):
         """Return all numbers of the result for JSON, each finite or None."""
 
     def table(self) -> "RenderableType":
-        """Return a table of the computed numbers beside those of the paper, at most 80 columns wide."""
+        """Return a table of the computed numbers next to those of the paper, at most 80 columns wide."""
 
     def draw(self, figure: "Figure") -> None:
         """Draw the result into an empty figure."""
 
 
 class Run(Protocol[P_contra]):
-    """Function of a study; pure: equal parameters give equal results."""
+    """Function that computes a study; it is pure: equal parameters give equal results."""
 
     def __call__(self, parameters: P_contra, track: Track = ...) -> Result:
         """Compute the study; its longest loop iterates over ``track(items)``."""
@@ -67,14 +67,14 @@ class Run(Protocol[P_contra]):
 
 @dataclass(frozen=True)
 class Study(Generic[P]):
-    """Reproduction of a table or figure of a paper, or of a question that a paper raises.
+    """Reproduction of a table or figure of a paper, or investigation of a question that a paper raises.
 
     Attributes:
         name: name on the command line.
-        doc: summary in one line.
-        parameters: class of its parameters.
+        doc: one-line summary.
+        parameters: class of the parameters.
         run: function that computes the study.
-        size: width and height of its figure [in].
+        size: width and height of the figure [in].
     """
 
     name: str
@@ -85,7 +85,7 @@ class Study(Generic[P]):
 
 
 def comparison(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> RichTable:
-    """Return a table in the common style of the studies; the first column has text, the others have numbers."""
+    """Return a table in the common style of the studies; the first column contains text, the others numbers."""
     table = RichTable(title=Text(title), title_justify="left", show_edge=False, header_style="bold")
     for number, column in enumerate(columns):
         table.add_column(Text(column), justify="right" if number else "left")
@@ -95,5 +95,5 @@ def comparison(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
     return table
 
 
-#: studies by name: of the papers, in `lathe_papers`, and of other packages, by their entry points
+#: studies by name: those of the papers, from `lathe_papers`, and those that other packages offer as entry points
 STUDIES: Objects[Study[Any]] = Objects("study", Study, {}, "lathe_rc.studies")

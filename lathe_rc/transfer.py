@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear systems given by transfer functions: a rational function of p, stepped sample by sample.
+"""Linear systems given by rational transfer functions of p, stepped sample by sample.
 
-Blocks of any length give bit-identical results. Inner loops with nonlinear elements (a limit, a play operator) step a
-`System` themselves with `step`.
+Results are bit-identical for every block length. Inner loops with nonlinear elements (a limit, a play operator) advance
+a `System` themselves with `step`.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class TransferFunction:
     """Proper rational transfer function numerator(p)/denominator(p).
 
     Attributes:
-        numerator, denominator: coefficients by falling powers of p, as for numpy.polyval.
+        numerator, denominator: coefficients in descending powers of p, as for numpy.polyval.
 
     Raises:
         InputError: the function is not proper, or a coefficient is not finite.
@@ -50,7 +50,7 @@ class TransferFunction:
             )
 
     def __str__(self) -> str:
-        """Return the coefficients as a string, by falling powers of p."""
+        """Return the coefficients as a string, in descending powers of p."""
         return f"{list(map(float, self.numerator))}/{list(map(float, self.denominator))}"
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
@@ -120,11 +120,11 @@ def _block(system: System, state: Array, command: Array, output: Array) -> None:
 def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
     """Return a balanced realisation x' = a·x + b·u, y = c·x + d·u, shapes (m, m), (m,), (m,).
 
-    The matrix a is a scaled companion matrix. `scipy.signal` provides this function as tf2ss, but its import takes half
-    as long as everything else before the start of a cell.
+    The matrix a is a scaled companion matrix. `scipy.signal` provides this function as tf2ss, but importing that module
+    takes half as long as everything else before a cell starts.
     """
     top, bottom = (np.trim_zeros(np.array(part), "f") for part in (transfer.numerator, transfer.denominator))
-    if bottom.size == 1 or not top.size:  # a gain alone
+    if bottom.size == 1 or not top.size:  # a pure gain
         return np.empty((0, 0)), np.empty(0), np.empty(0), float(top[0] / bottom[0]) if top.size else 0.0
     top = np.concatenate((np.zeros(bottom.size - top.size), top)) / bottom[0]
     bottom = bottom / bottom[0]
@@ -137,7 +137,7 @@ def realise(transfer: TransferFunction) -> tuple[Array, Array, Array, float]:
 
 
 def hold_response(a: Array, b: Array, step_s: float) -> tuple[Array, Array, Array]:
-    """Return Φ of a step of x' = a·x + b·u, and the response to a held u = 1 and to a ramp from 0 to 1; step in s."""
+    """Return Φ of x' = a·x + b·u over a step [s], and the responses to a constant u = 1 and to a ramp from 0 to 1."""
     order = a.shape[0]
     block = np.zeros((order + 2, order + 2))
     block[:order, :order], block[:order, order] = a, b
@@ -147,7 +147,7 @@ def hold_response(a: Array, b: Array, step_s: float) -> tuple[Array, Array, Arra
 
 
 def bilinear(a: Array, b: Array, step_s: float) -> tuple[Array, Array]:
-    """Discretise x' = a·x + b·u by the bilinear rule: return Φ and the weight of u at both ends of a step [s]."""
+    """Discretise x' = a·x + b·u by the bilinear rule: return Φ and the weight of u at each end of a step [s]."""
     one = np.eye(a.shape[0])
     left = np.linalg.inv(one - a * step_s / 2.0)
     return left @ (one + a * step_s / 2.0), left @ b * (step_s / 2.0)
@@ -179,7 +179,7 @@ def discretise(transfer: TransferFunction, step_s: float, hold: Hold) -> System:
 
 
 def rest(system: System) -> Array:
-    """Return the state for `step` of a system at rest at 0."""
+    """Return the state of a system at rest at 0, as used by `step`."""
     return np.zeros(2 * system.now.size + 1)
 
 
@@ -200,5 +200,5 @@ class LinearSystem:
         self._state = rest(self.system)
 
     def block(self, command: Array, output: Array) -> None:
-        """Step the system through a block, shape (n,) each; at rest at 0 before the first block."""
+        """Step the system through a block, with arrays of shape (n,); it is at rest at 0 before the first block."""
         _block(self.system, self._state, command, output)

@@ -32,9 +32,9 @@ TURN = 2 * np.pi
 LAW = speed.harmonic(104.72, np.array([0.05]), np.array([60.0]), np.array([0.0]))
 
 
-def filled(times, counts, **changed):
+def filled(times, counts, of=COUNTS, **changed):
     """The angle by readings; whole counts as integers, for a double would round them."""
-    given_ = {"counts": COUNTS, "step_ns": STEP_NS, "wraps": 0, "inverted": False, "max_reverse": 2.0, "max_gap": 0.01}
+    given_ = {"counts": of, "step_ns": STEP_NS, "wraps": 0, "inverted": False, "max_reverse": 2.0, "max_gap": 0.01}
     angle = CountedAngle(**{**given_, **changed})
     for time, count in zip(np.asarray(times).tolist(), np.asarray(counts, dtype=object).tolist(), strict=True):
         angle.add(time, count)
@@ -237,6 +237,78 @@ def test_the_end_is_the_first_sample_that_has_reached_the_angle(wanted, seed):
     assert found == (int(past[0]) if past.size else None)
 
 
+# --- times of edges
+
+CLOCK_NS = 1000
+
+
+def read_out(every_ns, seconds=0.1, counts=COUNTS, law=LAW):
+    """Readings of an encoder with edge times: time, count, and the last edge rounded down to the clock, both in ns."""
+    edges = np.arange(0.0, seconds, 1e-6)
+    passed = np.floor(law.at(edges)[0] * counts / TURN)
+    # The law is inverted on a grid of 1 µs, then by its speed: to much less than the clock.
+    first = np.searchsorted(passed, np.arange(1, passed[-1] + 1))
+    angle, rate, _ = law.at(edges[first])
+    stamps = edges[first] - (angle - np.arange(1, passed[-1] + 1) * TURN / counts) / rate
+    stamps = np.append(0.0, stamps) * 1e9
+    times = np.arange(0, round(stamps[-1]), every_ns)
+    shown = np.searchsorted(stamps, times, side="right") - 1
+    return times, shown, (np.floor(stamps[shown] / CLOCK_NS) * CLOCK_NS).astype(int)
+
+
+def timed(times, counts, edges, **changed):
+    """The angle by readings with edge times."""
+    angle = filled([], [], **changed, edge_clock=CLOCK_NS * 1e-9)
+    for reading in zip(times.tolist(), counts.tolist(), edges.tolist(), strict=True):
+        angle.add(*reading)
+    return angle
+
+
+@pytest.mark.parametrize(("every_ns", "counts"), [(STEP_NS, 1000), (STEP_NS, 4096), (100_000, 4096)])
+def test_edge_times_replace_the_rounding_to_a_count(every_ns, counts):
+    """The angle errs by two ticks of the clock in place of a count."""
+    times, shown, edges = read_out(every_ns, counts=counts)
+    plain, better = filled(times, shown, counts), timed(times, shown, edges, of=counts)
+    true = LAW.at(np.arange(plain.available) * STEP_NS * 1e-9)[0]
+    errors = [np.abs(angle.take(0, plain.available) - true)[64:].max() for angle in (plain, better)]
+    assert errors[0] > 0.9 * TURN / counts
+    assert errors[1] < 2.2 * 105.0 * 1e-6
+
+
+def test_edge_times_of_a_counter_that_wraps_and_counts_down():
+    times, shown, edges = read_out(STEP_NS)
+    plain = timed(times, shown, edges)
+    other = timed(times, (5 - shown) % 2**16, edges, wraps=2**16, inverted=True)
+    difference = other.take(0, plain.available) - plain.take(0, plain.available)
+    assert_allclose(difference, difference[0], atol=1e-9)
+
+
+def test_angle_stays_within_a_count_of_a_spindle_that_stops_or_trembles():
+    """The edge of a counter that goes back and forth is passed again later: the angle does not fall."""
+    times = np.arange(10) * STEP_NS
+    counts, edges = np.array([0, 1, 2, 3, 2, 3, 3, 3, 3, 3]), times - 5000
+    edges[6:] = edges[5]
+    angle = timed(times, counts, edges).take(0, 10) * COUNTS / TURN
+    assert np.all(np.diff(angle) >= 0.0)
+    assert np.all((angle >= np.maximum.accumulate(counts)) & (angle < 4.0))
+
+
+def test_an_edge_after_its_reading_is_an_error():
+    with pytest.raises(LatheError, match=r"^last edge at 20 ns in a reading at 10 ns; allowed: not after the reading$"):
+        timed(np.array([10]), np.array([1]), np.array([20]))
+
+
+def test_lines_and_files_have_a_third_column_with_the_edge(path):
+    text = b"time_ns,counts,edge_ns\n10,1,8\n20; 2; 15\n"
+    assert list(LineReader(io.BytesIO(text), "line", timed=True).read()) == [(10, 1, 8), (20, 2, 15)]
+    lacking = LineReader(io.BytesIO(b"10,1\n"), "line", timed=True)
+    assert_refused(lambda: list(lacking.read()), "'10,1'; allowed: .* its last edge, as time_ns,counts,edge_ns")
+    path.write_text("time_s,counts,edge_s\n1e-8,1,0.000000008\n2e-8,2,1.5e-8\n")
+    reader = CsvReader(path)
+    assert reader.timed
+    assert list(reader.read()) == [(10, 1, 8), (20, 2, 15)]
+
+
 # --- a cell that follows a file
 
 
@@ -321,6 +393,27 @@ EVENT = {"allow_faults": True, "events": ["revolution 1: repair encoder"]}
 def test_what_cannot_work_is_refused_in_one_line(path, changed, message):
     write_counts(path, 0.1)
     assert_refused(lambda: harness.run(follower(path, **{"revolutions": 1.0, **changed})), message)
+
+
+def write_edges(path, every_ns):
+    """The readings of an encoder with edge times."""
+    rows = [f"{time},{count},{edge}" for time, count, edge in zip(*read_out(every_ns, 0.2), strict=True)]
+    path.write_text("\n".join(["time_ns,counts,edge_ns", *rows]))
+
+
+def test_a_cell_follows_a_file_with_edge_times_in_blocks_of_any_size(path):
+    write_edges(path, STEP_NS)
+    cell = follower(path, revolutions=0.0, edge_clock=CLOCK_NS * 1e-9)
+    whole = harness.run(cell)
+    error = encoder(whole)["angle"] - LAW.at(np.arange(whole.samples) * STEP_NS * 1e-9)[0]
+    assert np.abs(error[64:]).max() < 2.2 * 105.0 * 1e-6
+    other = Scenario("device", {n: t.model_copy(update={"block_size": 37}) for n, t in cell.nodes.items()})
+    assert harness.run(other).digest == whole.digest
+    unresolved = r"edge_clock = 0, and .*counts.csv has times of edges; allowed: their resolution, such as 1e-6"
+    assert_refused(lambda: harness.run(follower(path, revolutions=0.0)), unresolved)
+    write_counts(path, 0.1)
+    untimed = r"edge_clock = 1e-06 s, and .*counts.csv has no times of edges; allowed: 0, or a third column edge_ns"
+    assert_refused(lambda: harness.run(follower(path, revolutions=0.0, edge_clock=1e-6)), untimed)
 
 
 def test_what_its_file_or_its_controller_cannot_have_is_refused(path):

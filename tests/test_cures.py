@@ -215,6 +215,7 @@ def test_a_folder_does_not_hide_a_scenario_of_its_name(tmp_path, monkeypatch):
 
 BAD, GOOD = (1280, 2048, 3500, 3840, 4096, 4200, 5760, 7000, 8192, 11520), (3000, 3400, 4500, 5000, 10000, 100_000)
 NOMINAL = 1000 * np.pi / 30
+STEP = 1 / 64_000
 
 
 def warnings(name, counts, *changes):
@@ -243,6 +244,30 @@ def test_the_named_sample_rate_is_clear_of_them_at_other_speeds_and_rates(counts
     changes = (*changes, "spindle_encoder.deviation_start=0.0")
     (said,) = warnings("robust", counts, *changes)
     assert warnings("robust", counts, *changes, f"sample_rate={rate_of(said)}") == []
+
+
+def test_edge_times_cure_the_counts_that_are_warned_of():
+    """A clock of 1 µs does, as one that the warning names; a clock of about a count or more does not."""
+    law, speeds = Cell(load("robust").nodes).stages["disturbance_controller"], (0.9 * NOMINAL, 1.1 * NOMINAL)
+    for counts in BAD:
+        (said,) = law.encoder_warnings(*speeds, counts)
+        clock = float(re.search(r"\(edge_clock = ([\d.e-]+)\)", said)[1])
+        assert clock == 1e-6
+        assert not law.encoder_warnings(*speeds, counts, clock)
+    for clock in (4e-6, 14e-6, 20e-6, 1e-3):
+        (said,) = law.encoder_warnings(*speeds, 4096, clock)
+        assert "near 1:" in said
+    for counts in GOOD:
+        assert not law.encoder_warnings(*speeds, counts, 1e-6)
+    (said,) = law.encoder_warnings(*speeds, 3000, STEP / 2)
+    assert "times of edges to 7.81e-06 s, more than 1/4 of a sample" in said
+    assert said.endswith("cure: times of edges (edge_clock = 1e-06)")
+    assert not law.encoder_warnings(*speeds, 0, 1e-3)
+    assert not law.encoder_warnings(*speeds, 10_000, STEP / 2)  # coarser than a count: as without
+    for change in ("edge_clock=1e-6", "reads_per_sample=16"):
+        cell = Cell(load("robust", "spindle_encoder.counts_per_revolution=4096", f"spindle_encoder.{change}").nodes)
+        cell.check()
+        assert cell.warnings == []
 
 
 def test_laws_without_an_angle_filter_are_not_warned_of():

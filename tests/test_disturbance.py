@@ -52,11 +52,12 @@ def largest(found, since=0.0, gaps=()):
 # --- the angle filter
 
 
-def tracked(law, counts, samples):
+def tracked(law, counts, samples, clock=0.0):
     """Angle and speed as measured, true angle, and what the filter says of the end of the drive's delay."""
     angle, rate, true, told, told_rate, unused = np.empty((6, samples))
-    Encoder(law, STEP, counts, 64).block(0, angle, rate, np.empty(samples, np.uint8), true, unused)
-    spindle = angle_filter(STEP, counts, NOMINAL, 0.1, 300.0)
+    encoder = Encoder(law, STEP, counts, 64, edge_clock=clock)
+    encoder.block(0, angle, rate, np.empty(samples, np.uint8), true, unused)
+    spindle = angle_filter(STEP, counts, NOMINAL, 0.1, 300.0, clock)
     for k in range(samples):
         follow(spindle, angle[k])
         told[k], told_rate[k], _ = at(spindle, DELAY)
@@ -82,6 +83,19 @@ def test_filter_without_a_deviation_finds_the_middle_of_the_counts():
     late, off = (np.mean((found - true)[10_000:]) * 1000 / TURN for found in (angle, told - NOMINAL * DELAY))
     assert abs(off) < 0.03
     assert_allclose(late, -0.5, rtol=0.05)
+
+
+@pytest.mark.parametrize("counts", [1000, 2048, 3500, 4096, 7000])
+@pytest.mark.parametrize("frequency", [20.0, 300.0])
+def test_edge_times_make_every_count_as_good_as_fifty_thousand(counts, frequency):
+    law = speed.harmonic(NOMINAL, np.array([0.1]), np.array([frequency]), np.zeros(1), 0.1)
+    ahead = law.at(np.arange(24_000) * STEP + DELAY)[0]
+    timed, fine, plain = (
+        np.abs(tracked(law, *encoder)[2][0] - ahead)[12_000:].max()
+        for encoder in ((counts, 24_000, 1e-6), (50_000, 24_000), (counts, 24_000))
+    )
+    assert timed < 2.0 * fine
+    assert timed < 0.5 * plain
 
 
 # --- the form ahead
@@ -303,11 +317,14 @@ def test_the_suite_has_it_within_the_tolerance_and_ahead_of_its_peer_with_everyt
 
 def test_the_map_compares_each_sensor_with_the_variable_lead():
     study = STUDIES["sensor-map"]
-    result = study.run(study.parameters(counts=[1000], noise_nm=[20.0], wd=[106.0, 213.0], harmonics=[2], seeds=[1]))
-    assert result.ratio.shape == (1, 1, 1, 2)
+    given = study.parameters(counts=[4096], edge_clock_us=[0.0, 1.0], wd=[20.0, 213.0], harmonics=[2], seeds=[1])
+    result = study.run(given)
+    assert result.ratio.shape == (1, 2, 1, 1, 2)
+    assert result.warned.tolist() == [[True, False]]
     found = result.to_json()
-    assert found["worst_ratio"] == result.ratio.max() < 0.5
-    assert 0.0 < found["floor_um"][0][0][0] < found["variable_lead_um"][0][0][0][0]
+    assert found["worst_ratio"] == result.ratio.max() > 0.8
+    assert found["worst_ratio_unwarned"] == result.ratio[0, 1].max() < 0.3
+    assert 0.0 < found["floor_um"][0][0][0][0] < found["variable_lead_um"][0][0][0][0][0]
 
 
 def test_a_study_that_has_a_quick_form_has_an_option_for_it():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import cuts, in_blocks, same
+from cells import config, cuts, in_blocks, same
 from hypothesis import given
 from hypothesis import strategies as st
 from machines import assert_refused, refusals
@@ -14,9 +14,10 @@ from numpy.testing import assert_allclose
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import undulations
 from lathe_rc.cell import scenario
+from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
-from lathe_rc.signals.encoder_errors import EncoderErrors
+from lathe_rc.signals.encoder_errors import EncoderErrors, seen_along
 
 TURN = 2 * np.pi
 STEP = 1 / 64000
@@ -26,10 +27,10 @@ laws = st.sampled_from([speed.constant(NOMINAL), swinging])
 counts = st.one_of(st.integers(1, 100), st.integers(101, 2**31 - 1))
 
 
-def measure(law, counts=0, window=64, lengths=(12000,), errors=EncoderErrors()):  # noqa: B008 - it never changes
+def measure(law, counts=0, window=64, lengths=(12000,), errors=EncoderErrors(), **kwargs):  # noqa: B008 - it never changes
     """Signals of an encoder that works in blocks of ``lengths``."""
     signals = messages.allocate(messages.ENCODER, sum(lengths))
-    encoder = Encoder(law, STEP, counts, window, errors)
+    encoder = Encoder(law, STEP, counts, window, errors, **kwargs)
     in_blocks(lengths, encoder.block, *signals.values())
     return signals
 
@@ -160,3 +161,101 @@ def test_learning_leaves_what_the_encoder_misreads():
     found = undulations((profiles[1] - profiles[0])[None, :], 6).amplitude[0]
     assert_allclose(found[[1, 3]], 225e-6 * 2e-3, rtol=0.02)
     assert max(found[2], *found[4:]) < 0.02 * found[1]
+
+
+# --- times of the edges
+
+CLOCK = 1e-6  # [s]
+RESOLVED = st.integers(200, 200_000)
+
+
+def timed(law, counts, clock=CLOCK, **kwargs):
+    """Signals of an encoder that gives the times of its edges."""
+    return measure(law, counts, edge_clock=clock, **kwargs)
+
+
+@given(laws, RESOLVED)
+def test_angle_with_edge_times_errs_by_ticks_of_their_clock_instead_of_counts(law, counts):
+    """The stamp is up to a tick early; the rate between two edges errs by up to a tick on the way from edge to edge."""
+    signals, begins = timed(law, counts), 4 + round(4 * TURN / counts / NOMINAL / STEP)  # two edges after sample 0
+    lag = (signals["angle_true"] - signals["angle"])[begins:]
+    tick, bent = 1.1 * NOMINAL * CLOCK, 0.1 * NOMINAL * 10.7 * max(STEP, TURN / counts / NOMINAL) ** 2
+    assert -tick - 2 * bent < lag.min()
+    assert lag.max() < min(2 * tick + 2 * bent, TURN / counts + 1e-12)
+
+
+@given(laws, st.one_of(st.integers(1, 199), RESOLVED), st.sampled_from([1e-8, CLOCK, STEP / 2, 1e-3]))
+def test_edge_times_keep_the_count_and_the_index_pulse(law, counts, clock):
+    """The angle is between the count and the next one, and never falls."""
+    plain, signals = measure(law, counts), timed(law, counts, clock)
+    assert np.array_equal(signals["index_pulse"], plain["index_pulse"])
+    parts = (signals["angle"] - plain["angle"]) * counts / TURN
+    assert -1e-9 < parts.min() <= parts.max() < 1.0
+    assert np.diff(signals["angle"]).min() >= 0.0
+
+
+def test_a_clock_coarser_than_a_count_adds_nothing_wrong():
+    signals = timed(swinging, 100_000, clock=5e-6)
+    lag = signals["angle_true"] - signals["angle"]
+    assert -1e-12 < lag.min() <= lag.max() < TURN / 100_000
+
+
+@given(laws, RESOLVED, cuts)
+def test_cuts_change_no_bit_of_an_angle_with_edge_times(law, counts, lengths):
+    assert same(timed(law, counts, lengths=lengths), timed(law, counts, lengths=[sum(lengths)]))
+
+
+def test_an_edge_is_known_only_after_it():
+    """A later change of the speed changes no earlier sample."""
+    later = speed.harmonic(NOMINAL, np.array([0.1]), np.array([300.0]), np.zeros(1), 0.1)
+    both = [timed(law, 4096)["angle"] for law in (speed.constant(NOMINAL), later)]
+    until = round(0.1 / STEP)
+    assert np.array_equal(both[0][:until], both[1][:until])
+    assert not np.array_equal(*both)
+
+
+@pytest.mark.parametrize("counts", [900, 4096, 30_000])
+@pytest.mark.parametrize("errors", [EncoderErrors(), ALL_WRONG])
+def test_stamp_is_the_time_at_which_the_disc_passes_its_edge(counts, errors):
+    """Compared with bisection of the speed law through the errors of disc and signals."""
+    clock, law = 1e-10, speed.harmonic(NOMINAL, np.array([0.1]), np.array([300.0]), np.zeros(1))
+    encoder, table = Encoder(law, STEP, counts, 64, errors, clock), errors.table
+    signals = messages.allocate(messages.ENCODER, 40_030)  # the speed changes quickly there
+    encoder.block(0, *signals.values())
+    stamp, count, _ = encoder.table.edges.last
+    low, high = 39_000 * STEP, 40_029 * STEP
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        true = law.at(middle)[0]
+        reading = np.empty(1)
+        seen_along(table, true, reading)
+        low, high = (middle, high) if reading[0] < count * TURN / counts else (low, middle)
+    assert stamp - clock <= high <= stamp + 2 * clock
+
+
+@pytest.mark.parametrize("reads", [2, 16])
+def test_counter_read_several_times_a_sample_times_its_edges(reads):
+    """The stamp is that of the last reading without the edge, as of an encoder read at so many times the rate."""
+    encoder, fast = Encoder(swinging, STEP, 4096, 64, edge_clock=STEP / reads), measure_at(STEP / reads, 4096, 64_000)
+    changed = np.flatnonzero(np.diff(fast)) + 1  # the first reading with the new count
+    for n in range(600):
+        encoder.block(n, *messages.allocate(messages.ENCODER, 1).values())
+        last = changed[changed <= n * reads]
+        if last.size:
+            assert encoder.table.edges.last[0] == pytest.approx((last[-1] - 1) * STEP / reads, abs=1e-12)
+
+
+def measure_at(step, counts, samples):
+    """Counts of an encoder without edge times, at another sampling step."""
+    return np.floor(swinging.at(np.arange(samples) * step)[0] * counts / TURN)
+
+
+def test_edge_clock_and_several_reads_are_not_both_given():
+    with pytest.raises(InputError, match=r"spindle_encoder\.reads_per_sample = 4 with edge_clock = 1e-06 s; allowed"):
+        config("robust", "spindle_encoder.reads_per_sample=4", "spindle_encoder.edge_clock=1e-6")
+    with pytest.raises(
+        InputError, match=r"spindle_encoder\.edge_clock = 1e-13 s; allowed: 0, or from 1e-12 s up to 1 s"
+    ):
+        config("robust", "spindle_encoder.edge_clock=1e-13")
+    law = config("robust", "spindle_encoder.reads_per_sample=16").nodes["disturbance_controller"]
+    assert law.encoder_edge_clock == STEP / 16

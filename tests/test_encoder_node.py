@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_counts import COUNTS, TURN, follower, write_counts
+from test_counts import COUNTS, TURN, follower, write_counts, write_edges
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
@@ -63,20 +63,23 @@ def serial_line(text):
 
 def lines(path):
     """As an encoder that has been sending all the time: the first line is not whole."""
-    return "23,4\n" + "".join(f"{time},{count}\n" for time, count in readings(path))
+    return "23,4\n" + "".join(f"{','.join(map(str, reading))}\n" for reading in readings(path))
 
 
-@pytest.mark.parametrize("mode", ["composed", "processes"])
-def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(tmp_path, mode):
+@pytest.mark.parametrize(("mode", "edge_clock"), [("composed", 1e-6), ("processes", 0.0)])
+def test_a_serial_line_leads_a_cell_and_gives_the_bits_of_a_file_of_its_counts(tmp_path, mode, edge_clock):
     """A serial line leads a cell with the bits of a file of its counts; its bag is simulated again to the bit.
 
     The received readings are in the bag: run again from that, every bit comes out.
     """
     path = tmp_path / "counts.csv"
-    write_counts(path, 0.2)
+    if edge_clock:
+        write_edges(path, 200_000)
+    else:
+        write_counts(path, 0.2)
     with serial_line(lines(path)) as (line, watch, _):
-        live = harness.run(device(device=line), mode=mode, bag=tmp_path / "bag", watch=watch)
-    of_file = harness.run(follower(path, revolutions=2.0))
+        live = harness.run(device(device=line, edge_clock=edge_clock), mode=mode, bag=tmp_path / "bag", watch=watch)
+    of_file = harness.run(follower(path, revolutions=2.0, edge_clock=edge_clock))
     assert live.digest == of_file.digest
     assert live.samples == of_file.samples
     assert live.lateness.blocks == live.blocks

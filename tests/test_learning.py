@@ -7,12 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cells import command, encoder, form_error, run, same, scenario
+from cells import command, config, encoder, form_error, run, same, scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import messages
+from lathe_rc.analysis import learning
 from lathe_rc.analysis.learning import LearningLoop, supremum
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
@@ -96,6 +97,54 @@ def test_supremum_is_computed_once_for_loops_that_are_alike(monkeypatch):
 
 
 # --- the simulated cell
+
+
+@pytest.mark.parametrize(
+    "name", ["piston", "lead_lag", "adaptive_inverse", "exact_invariance", "series", "robust", "robust_cutting"]
+)
+def test_an_error_of_the_drive_margin_is_the_smallest_with_which_learning_diverges(name):
+    """Brute force at the frequency where it is lost: errors of all phases, at the margin and 3 % below it."""
+    cell = Cell(config(name).nodes)
+    cell.check()
+    phases = np.exp(2j * np.pi * np.arange(720) / 720)
+    assert cell.drive_margins.keys() == cell.factors.keys()
+    for node, margin in cell.drive_margins.items():
+        loop = cell.loops[node]
+        at = np.array([margin.waves])
+
+        def largest(error, loop=loop, at=at, speed=margin.speed):
+            each = (
+                np.abs(loop.stage.factors(lambda f, d=drive, p=phase: (1.0 + error * p) * d(f), at, speed)).max()
+                for drive in loop.responses
+                for phase in phases
+            )
+            return max(each)
+
+        assert largest(margin.error) == pytest.approx(1.0, abs=1e-4)
+        assert largest(0.97 * margin.error) < 1.0
+        # Nowhere else a smaller error suffices.
+        waves = np.linspace(0.0, loop.stage.highest_waves(margin.speed), 4001)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(learning, "_waves_up_to", lambda _, waves=waves: waves)
+            assert loop.drive_margin().error == pytest.approx(margin.error, rel=1e-3)
+
+
+@pytest.mark.parametrize(("part", "diverges"), [(0.97, False), (1.03, True)])
+def test_a_drive_in_error_by_the_margin_diverges_in_a_run(part, diverges):
+    """Gain and lead scale the response by 1 + Δ at the frequency of the form's harmonic."""
+    waves, loop = np.array([7.0]), learning_loop()
+    operator, given = loop.operator(waves, NOMINAL)[0], loop.corrected_drive(waves, NOMINAL)[0]
+    error = part * (1.0 - abs(operator)) / abs(given)
+    scale = 1.0 - error * operator / abs(operator) / (given / abs(given))
+    changed = {"learning_gain": abs(scale), "lead_time": LEAD + np.angle(scale) / (waves[0] * NOMINAL)}
+    found = run(
+        spindle_encoder={"revolutions": 16.0},
+        learning_controller={**changed, "allow_unstable": True},
+        tool={"profile": "harmonics", "harmonic_order": [7], "harmonic_amplitude": [1e-6]},
+    )
+    harmonic = abs(np.fft.rfft(form_error(found)[: 16 * 3840].reshape(16, -1))[:, 7])
+    contraction = harmonic[-1] / harmonic[-2]
+    assert (contraction > 1.0) == diverges
 
 
 def test_last_revolution_agrees_with_the_formula():

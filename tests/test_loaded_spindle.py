@@ -51,7 +51,7 @@ def interrupted(samples):
 
 
 CUT = {"depth": 0.3e-3, "lag": 2e-3, "elasticity": "rigid", "gap_start": [1.0], "gap_width": [0.4]}
-LAW = {"deviation_amplitude": [0.02], "deviation_frequency": [30.0], "counts_per_revolution": 20000}
+LAW = {"deviation_amplitude": [0.02], "deviation_frequency": [30.0], "counts_per_revolution": 20000, "edge_clock": 1e-7}
 SAME = ("/encoder", "/tool", "/cut", "/coarse/command")
 
 

@@ -127,7 +127,7 @@ class Raising(Halving):
 
     @property
     def memory(self):
-        return FormTable(np.zeros(1), np.zeros((1, 2, 4)), np.zeros((1, 2, 4)), True, 0, 0.0, 0.0, 0)  # noqa: FBT003
+        return FormTable(np.zeros(1), np.zeros((1, 2, 4)), np.zeros((1, 2, 4)), True, 0, 0.0, 0.0, 0, np.zeros(1))  # noqa: FBT003
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -103,7 +103,9 @@ class TestAsking:
         with pytest.raises(InputError, match=rf"^.*{said}.*$"):
             objectives(piston, goals, subjects)
 
-    @pytest.mark.parametrize(("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "nobody learns")])
+    @pytest.mark.parametrize(
+        ("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "there is no learning controller")]
+    )
     def test_a_column_that_a_cell_never_has_is_refused(self, goal, why):
         with pytest.raises(InputError, match=f"{why} in interrupted_cut"):
             objectives(load("interrupted_cut", 3), [goal])

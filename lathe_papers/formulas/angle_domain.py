@@ -29,7 +29,7 @@ Coefficients = Literal["exact", "quasi_static", "linearised"]
 
 COEFFICIENTS: tuple[Coefficients, ...] = ("exact", "quasi_static", "linearised")
 
-_LONGEST_STEP = 0.2  # of the integration, in time constants of the fastest pole and of the fastest deviation
+_LONGEST_STEP = 0.2  # longest integration step, in time constants of the fastest pole and of the fastest deviation
 
 
 def speed_derivatives(law: SpeedLaw, time: Array, count: int) -> Array:
@@ -196,11 +196,11 @@ class AngleDomain:
 
     @cached_property
     def _time(self) -> Array:
-        """Times at which the spindle reaches these angles [s], computed by Newton's method from a table."""
+        """Times at which the spindle reaches the angles of `_nodes` [s], computed by Newton's method from a table."""
         step = float(np.diff(self._nodes).max()) / self.law.nominal
         table = np.arange(self.law.samples_until(float(self.angle[-1]), step) + 2) * step
         time = np.interp(self._nodes, self.law.at(table)[0], table)
-        for _ in range(4):  # each doubles the correct digits; the table has a few, so four leave only rounding
+        for _ in range(4):  # each doubles the table's few correct digits; four leave only rounding error
             angle, speed, _ = self.law.at(time)
             time -= (angle - self._nodes) / speed
         return np.asarray(time)
@@ -245,7 +245,7 @@ class AngleDomain:
         Σ a_i·pⁱ w = Y, the response is X = Σ b_k·pᵏ w.
         """
         ends = self._time[::2]
-        # The midpoint of a step in time is not the midpoint of the step in angle: Runge-Kutta needs its own.
+        # The midpoint of a step in time is not that of the step in angle, so Runge-Kutta needs separate midpoints.
         time = np.empty_like(self._time)
         time[::2], time[1::2] = ends, (ends[1:] + ends[:-1]) / 2.0
         forcing = signal(self.law.at(time)[0], 0) / self.denominator[-1]
@@ -263,7 +263,7 @@ def harmonic_errors(domain: AngleDomain, order: float, settled: float) -> dict[C
     """
     signals = Harmonic(order), Harmonic(order, np.pi / 2)
     truth = [domain.truth(signal) for signal in signals]
-    # A phase mixes the errors of sine and cosine; the worst phase at an angle gives their root sum of squares.
+    # Each phase mixes the errors of sine and cosine; at an angle, the worst phase gives their root sum of squares.
     errors = {
         kind: np.hypot(*(domain.response(signal, kind) - true for signal, true in zip(signals, truth, strict=True)))
         for kind in COEFFICIENTS

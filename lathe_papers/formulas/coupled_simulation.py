@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sample-by-sample simulation of the coupled force and position loops of paper 004.
 
-It adds the effects that the linear system of `lathe_papers.formulas.coupled_loops` omits: limits at the controllers and
-at the drives, converters, smooth set points, and a delay of whole samples from a measurement to its command.
+It adds the effects that the linear system of `lathe_papers.formulas.coupled_loops` omits: limits of the controllers and
+of the drives, converters, smooth set points, and a delay of whole samples from a measurement to its command.
 Controllers and compensators use the same arithmetic as the cell. The plant is discretised exactly with a zero-order
 hold of commands and noise.
 """
@@ -70,7 +70,8 @@ def _advance(
 ) -> int:
     """Simulate one block and return the number of commands limited by the drives.
 
-    ``state`` holds x and space for the next x; ``line`` is a ring buffer of F and y: sample n at n modulo its length.
+    ``state`` holds x and space for the next x; ``line`` is a ring buffer of F and y, with sample n at n modulo its
+    length.
     """
     order, size = table.transition.shape[0], line.shape[1]
     cut = 0
@@ -94,7 +95,7 @@ def _advance(
             for column in range(order):
                 value += table.transition[row, column] * state[column]
             state[order + row] = value
-        # Only now: every row of the next x depends on the complete old x.
+        # The next x is copied only now, because each of its rows depends on the complete old x.
         for row in range(order):
             state[row] = state[order + row]
     return cut

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conditions of hyperstability of the periodic law over the box of drives (paper 002, eqs 1 and 12-15).
 
-A drive is a row K, a1, a2, a3, a4 of eq. 1; an array of m drives has the shape (m, 5). With the filter on y it is
+A drive is a row K, a1, a2, a3, a4 of eq. 1; an array of m drives has the shape (m, 5). With the filter on y, a drive
+has the transfer function
 
     G(p) = K·(T·p + 1)³/((p⁴ + a4·p³ + a3·p² + a2·p + a1)·(T*·p + 1)³)
 
-and closed by χ* it is G/(1 + χ*·G), the linear part of eq. 13. Its real part has the sign of Re(1/G) + χ*. At any
-frequency Re(1/G) is linear in a1 ... a4 and in 1/K, so its minimum over the box is at a corner.
+and with the feedback χ* it becomes G/(1 + χ*·G), the linear part of eq. 13, whose real part has the sign of Re(1/G) +
+χ*. At any frequency Re(1/G) is linear in a1 ... a4 and in 1/K, so its minimum over the box is at a corner.
 
 The paper neglects T*, so that G is of first order at high frequencies. With T* it is of fourth order.
 """
@@ -30,7 +31,7 @@ NOMINAL = np.array([19.0, 21.5, 48.0, 46.9, 10.2])  #: eq. 19
 BOX = np.array([[18.6, 19.5], [18.4, 23.5], [41.4, 64.0], [45.7, 50.0], [8.5, 16.5]])  #: minimum and maximum, eq. 1
 
 _FREQUENCIES = np.geomspace(1e-2, 1e5, 7001)  # [rad/s]
-_LEVELS = np.linspace(0.0, 1.0, 11)  # of sat(y_F)
+_LEVELS = np.linspace(0.0, 1.0, 11)  # levels of sat(y_F)
 
 
 def corners() -> Array:
@@ -62,7 +63,7 @@ class Positivity:
     Attributes:
         least_gain: smallest χ* with Re(1/G) + χ* > 0 for all drives and frequencies [1].
         drive: drive that requires ``least_gain``, shape (5,).
-        frequency: frequency that requires it [rad/s]; infinite if only the high-frequency limit does.
+        frequency: frequency that requires ``least_gain`` [rad/s]; infinite if only the high-frequency limit does.
         hurwitz_gain: largest χ* up to which A* is Hurwitz for all drives [1].
     """
 
@@ -78,12 +79,12 @@ class Positivity:
 
 
 def _largest_hurwitz_gain(drive: Array, lead: float, lag: float) -> float:
-    """Return χ* from which on A* has a pole in the right half-plane; infinite if there is none."""
+    """Return the χ* beyond which A* has a pole in the right half-plane; infinite if there is none."""
     gain, a1, a2, a3, a4 = drive
     bottom = np.polymul([1.0, a4, a3, a2, a1], np.poly([-1.0 / lag] * 3) * lag**3 if lag else [1.0])
     loop = control.TransferFunction(gain * lead**3 * np.poly([-1.0 / lead] * 3), bottom)
     margins, *_ = control.stability_margins(loop, returnall=True)
-    # Above the last crossing nothing changes any more; of first order at high frequencies, all large χ* do.
+    # Stability does not change beyond the last margin. With first order at high frequencies, all large χ* are stable.
     return float(np.max(margins)) if lag and len(margins) else np.inf
 
 
@@ -115,7 +116,7 @@ def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Arr
         disturbance: disturbance f, shape (n,).
 
     Returns:
-                Array of shape (m, n).
+        Array of shape (m, n).
     """
     # a1 ... a4 belong to r ... r''', and the fourth derivative has the factor 1.
     weights = np.column_stack((drives[:, 1:], np.ones(len(drives)))) / drives[:, :1]
@@ -123,10 +124,10 @@ def required_input(drives: Array, derivatives: Array, disturbance: Array) -> Arr
 
 
 def popov_bound(gains: PeriodicGains, reference_gain: float, theta: Array, step_s: float) -> float:
-    """Return -η0 of eq. 15 for a switch that stays at 1 [s].
+    """Return -η0 of eq. 15 [s] for a switch that stays at 1.
 
-    With w = u1 - θ the memory gives ∫w·v = (∫w² over the last period - ∫θ² over one)/(2·h0) + h0/2·∫v², and the
-    adaptive gain ∫(h11·I + χ*) dI ≥ -χ*²/(2·h11); the other terms are not negative.
+    With w = u1 - θ, the memory contributes ∫w·v = (∫w² over the last period - ∫θ² over one period)/(2·h0) + h0/2·∫v²,
+    and the adaptive gain ∫(h11·I + χ*) dI ≥ -χ*²/(2·h11); the other terms are not negative.
 
     Args:
         gains: gains of the law, of which h0 and h11 are used.
@@ -151,7 +152,7 @@ def learning_factor(drives: Array, gains: PeriodicGains, level: float, memory_fi
         frequency: frequencies [rad/s], shape (n,).
 
     Returns:
-                Array of shape (m, n).
+        Array of shape (m, n).
     """
     inner = gains.h0 + level**2 * (gains.h12 + gains.h11 / (1j * frequency))
     inverse = inverse_response(drives, gains.lead, gains.lag, frequency)
@@ -164,8 +165,8 @@ class Learning:
     """Learning behaviour of the memory over all drives and all levels of y_F.
 
     Attributes:
-        grows_from: smallest and largest onset frequency over drives and levels [rad/s]; above it, the memory without
-            filter grows.
+        grows_from: smallest and largest onset frequency over drives and levels [rad/s]; above the onset, the memory
+            grows without the filter.
         largest: largest factor per period with the filter [1].
         drive: drive with the largest factor, shape (5,).
         level: sat(y_F) of the largest factor.
@@ -182,7 +183,7 @@ class Learning:
 def learning(drives: Array, gains: PeriodicGains, memory_filter: float) -> Learning:
     """Evaluate the learning behaviour of the memory over all levels of y_F; arguments as in `learning_factor`."""
     bare = np.stack([learning_factor(drives, gains, level, 0.0, _FREQUENCIES) for level in _LEVELS])
-    # The factor approaches 1 from above or below at high frequencies, where rounding would decide.
+    # At high frequencies the factor approaches 1 from above or below, and rounding would decide the comparison.
     above = bare > 1.0 + 1e-6
     first = _FREQUENCIES[np.argmax(above, axis=-1)][above.any(axis=-1)]
     factor = bare * np.exp(-0.5 * (memory_filter * _FREQUENCIES) ** 2)

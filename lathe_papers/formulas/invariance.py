@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correction that makes the response of a first-order plant over the angle independent of the spindle speed.
 
-The plant is 1/(1 + T0·p). Two elements precede it, the substitute first (paper 000, eqs 13-17):
+The plant is 1/(1 + T0·p). Two elements precede the plant, the substitute first (paper 000, eqs 13-17):
 
     Wk2:  (θ0/Ω)·dv/dt + v = Y          the desired plant, 1/(1 + θ0·s) in the angle domain
     Wk1:  u = v + T0·dv/dt              the inverse of the actual plant
 
 so that the output of the plant is v itself for any variation of the speed. dv/dt = (Ω/θ0)·(Y - v) is known from Wk2, so
-nothing is differentiated. Operators with varying parameters do not commute: Wk1 before Wk2 is not the same.
+nothing is differentiated. Operators with varying parameters do not commute: Wk1 before Wk2 gives a different output.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def _advance(
     substitute: Array,
     command: Array,
 ) -> int:
-    """Compute one block; return the sample at which the spindle turns back, or the number of samples.
+    """Compute one block; return the sample at which the spindle reverses, or the number of samples.
 
     ``state`` holds v and the angle and Y of the previous sample; the angle is NaN before the first sample.
     """
@@ -56,7 +56,8 @@ class FirstOrderInvariance:
 
     Args:
         time_constant: T0 of the plant [s].
-        angle_constant: θ0 of the substitute [rad]; with T0·Ω0 it equals the plant at the nominal speed.
+        angle_constant: θ0 of the substitute [rad]; with θ0 = T0·Ω0 the substitute equals the plant at the nominal
+            speed.
     """
 
     def __init__(self, time_constant: float, angle_constant: float) -> None:

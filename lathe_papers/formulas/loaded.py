@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compliance of the tool drives: x/F of `lathe_rc.plants.tool_drive` in continuous time.
 
-Its inverse is the dynamic stiffness, and at p = 0 the static stiffness. Multiplied by the radial part of the cutting
-force, it is the deflection for `lathe_papers.formulas.regeneration`.
+Its inverse is the dynamic stiffness, and at p = 0 the static stiffness. The compliance, multiplied by the radial part
+of the cutting force, is the deflection for `lathe_papers.formulas.regeneration`.
 """
 
 import numpy as np
@@ -62,9 +62,9 @@ def compliance_in_series(
         natural_frequency: natural frequency ω1 of the position loop of the carriage [rad/s].
         damping: damping ratio ζ1 of the position loop.
         moving_mass: mass M of the carriage [kg].
-        tool_frequency: natural frequency ω2 of the tool on a blocked carriage [rad/s].
+        tool_frequency: natural frequency ω2 of the tool on a fixed carriage [rad/s].
         tool_damping: damping ratio ζ2 of the tool.
-        mass_ratio: mass of the tool over mass of the carriage.
+        mass_ratio: ratio of the tool's mass to the carriage's.
     """
     tool = mass_ratio * moving_mass
     stack = tool * np.array([2.0 * tool_damping * tool_frequency, tool_frequency**2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulation runs of the example of paper 002: one drive of its box, from rest, evaluated period by period."""
+"""Simulation runs of the example of paper 002: one drive of the box, from rest, evaluated period by period."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,9 @@ from lathe_rc.transfer import LinearSystem
 
 Array = npt.NDArray[np.float64]
 
-SHOWN = 3  #: periods in the curves
-_POINTS = 250  # of each of them
-_SETTLING = 4  # periods until the drive alone settles
+SHOWN = 3  #: number of periods in the curves
+_POINTS = 250  # points per period in the curves
+_SETTLING = 4  # periods until the drive without the loop settles
 
 
 def times(step: float) -> Array:

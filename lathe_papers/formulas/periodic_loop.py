@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Example of paper 002, as in `lathe_rc.signals.example_002`: its terms, their derivatives, the loop without delay."""
+"""Example from paper 002, as in `lathe_rc.signals.example_002`: terms, derivatives, and the loop without delay."""
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +52,7 @@ def _run(
 ) -> None:
     """Simulate one block, filling output and command."""
     for k in range(wanted.size):
-        # The input acts from this sample to the next, so the output of this sample is known first.
+        # The input acts from this sample to the next, so the output at this sample is known before it.
         output[k] = step(plant, plant_state, 0.0)
         command[k] = advance(law, state, first + k, wanted[k], output[k])
         plant_state[plant.now.size] = command[k] + load[k]

@@ -23,8 +23,8 @@ from lathe_rc.transfer import TransferFunction
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-_POINTS = 20_000  # of a frequency grid
-_SPAN = 30.0  # of the grid to either side of the outermost poles
+_POINTS = 20_000  # points of a frequency grid
+_SPAN = 30.0  # ratio of the grid's ends to the outermost poles
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Limit:
     """Stability limit of regenerative cutting.
 
     Attributes:
-        stiffness: K, smallest force over depth of cut that is unstable [N/m]; inf if none is.
+        stiffness: K, smallest unstable ratio of force to depth of cut [N/m]; inf if there is none.
         frequency: chatter frequency [rad/s]; 0 if the edge is drawn in without oscillation.
         phase: phase lag of the returning surface, ωT modulo 2π [rad], from 0 to 2π.
     """
@@ -42,7 +42,7 @@ class Limit:
     phase: float
 
     def period(self, waves: int) -> float:
-        """Return the revolution time [s] with ``waves`` whole waves plus the phase around the part."""
+        """Return the revolution time [s] for ``waves`` whole waves plus the phase around the part."""
         if self.frequency == 0.0:
             return np.inf
         return float((self.phase + 2.0 * np.pi * waves) / self.frequency)
@@ -53,8 +53,8 @@ class Regeneration:
     """Regenerative cut: deflection of the edge, direction of the force and overlap.
 
     Attributes:
-        deflection: G, deflection over the static force of the chip [m/N]: W3 times the lag of the force.
-        away: True if the force pushes the edge away from the part (σ = 1); False if it draws it in (σ = -1).
+        deflection: G, deflection per static force of the chip [m/N]: W3 times the lag of the force.
+        away: True if the force pushes the edge away from the part (σ = 1); False if the force draws it in (σ = -1).
         overlap: overlap factor µ.
 
     Raises:
@@ -88,9 +88,9 @@ class Regeneration:
         return together[together > 0.0]
 
     def critical(self, frequency: npt.ArrayLike) -> Array:
-        """Return the smallest K [N/m] that chatters at ``frequency`` [rad/s] at some speed; inf if there is none."""
+        """Return the smallest K [N/m] with chatter at ``frequency`` [rad/s] at some speed; inf if there is none."""
         g = self._signed(frequency)
-        # |1/K + G| = µ·|G|: the surface may return at any phase.
+        # |1/K + G| = µ·|G|, because the surface may return at any phase.
         inside = g.real**2 - (1.0 - self.overlap**2) * np.abs(g) ** 2
         inverse = -g.real + np.sqrt(np.maximum(inside, 0.0))
         with np.errstate(divide="ignore"):
@@ -98,7 +98,7 @@ class Regeneration:
 
     def worst(self) -> Limit:
         """Return the limit at the worst of all speeds; below it, every speed is stable."""
-        grid = np.append(0.0, self._grid())  # 0: the limit of ever slower oscillation, at a nearly stationary spindle
+        grid = np.append(0.0, self._grid())  # 0: limit of ever slower oscillation, with the spindle nearly at rest
         values = self.critical(grid)
         k = int(np.argmin(values))
         if not np.isfinite(values[k]):

@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
-Response = Callable[[Array], Complex]  #: of frequencies [rad/s], shape (n,)
+Response = Callable[[Array], Complex]  #: function of frequencies [rad/s], shape (n,)
 
 
 def second_order(frequency: npt.ArrayLike, natural_frequency: float, damping: float, delay: float = 0.0) -> Complex:
-    """Return e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), a drive closed by its own loops (spec of papers 000 and 001).
+    """Return e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), a drive with its own loops closed (spec of papers 000 and 001).
 
     Args:
         frequency: frequencies [rad/s], any shape; the result has the same shape.
@@ -56,7 +56,7 @@ def in_series(
     carriage_natural_frequency: float,
     carriage_damping: float,
 ) -> Complex:
-    """Return tool motion over piezo command for a piezo mounted on the coarse carriage (paper 001, Fig. 1b).
+    """Return the ratio of tool motion to piezo command for a piezo on the coarse carriage (paper 001, Fig. 1b).
 
     The piezo pushes the tool of mass m off the carriage of mass M. The position loops of the carriage act like a spring
     and a damper. With Δ the piezo's stroke, x1 the carriage, μ = m/M and u the command:
@@ -64,7 +64,7 @@ def in_series(
         Δ'' + x1'' + 2ζωn·Δ' + ωn²·Δ = ωn²·u
         x1'' + 2ζ1ω1·x1' + ω1²·x1 = -μ·(Δ'' + x1'')
 
-    The result is (Δ + x1)/u. With μ = 0 it is the parallel arrangement (Fig. 1a), the piezo alone.
+    The result is (Δ + x1)/u. With μ = 0 this is the parallel arrangement (Fig. 1a), the piezo alone.
 
     Args:
         frequency: frequencies [rad/s], any shape; the result has the same shape.

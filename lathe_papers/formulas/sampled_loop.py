@@ -3,7 +3,7 @@
 
     z = (1 + jλ·T/2)/(1 - jλ·T/2),   λ = (2/T)·tan(ωT/2)
 
-In the pseudo-frequency λ the drive behind its hold is W = K·(1 - jλ·T/2)·(1 + jλ·T2)/(jλ·(1 + jλ·T3)).
+In the pseudo-frequency λ, the drive with its hold is W = K·(1 - jλ·T/2)·(1 + jλ·T2)/(jλ·(1 + jλ·T3)).
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 _BAND = 0.05  # settling band, relative to the step
-STEPS = 400  #: of the simulation per period, to resolve the motion between samples
-_POINTS = 400  # of a Bode plot
+STEPS = 400  #: simulation steps per period, to resolve the motion between samples
+_POINTS = 400  # points of a Bode plot
 _SETTLED = 1e-5  # allowed residue of the slowest pole at the end of a response
 _MOST_PERIODS = 2000
 _SAME = 1e-9  # roots closer than this count as equal
@@ -53,7 +53,7 @@ class PseudoFrequency:
         )
 
     def closed(self) -> tuple[Array, Array]:
-        """Return numerator and denominator of the closed loop in falling powers of z."""
+        """Return the numerator and denominator of the closed loop in descending powers of z."""
         half, two = self.half_period, np.array([1.0, -1.0])
         zero, pole = (np.array([1.0, 1.0]) + time / half * two for time in (self.zero, self.pole))
         top = 2.0 * self.gain * half * zero
@@ -61,7 +61,7 @@ class PseudoFrequency:
         return top / bottom[0], bottom / bottom[0]
 
     def as_continuous(self) -> tuple[Array, Array]:
-        """Return numerator and denominator of the closed loop with jλ read as p, in falling powers of p.
+        """Return the numerator and denominator of the closed loop with jλ replaced by p, in descending powers of p.
 
         The table of the paper was computed from this function.
         """
@@ -70,7 +70,7 @@ class PseudoFrequency:
 
 
 def pseudo_frequency(drive: SampledDrive) -> PseudoFrequency:
-    """Return the drive behind its hold: T2 = (T/2)·(b1 - b0)/(b1 + b0), T3 = (T/2)·(1 + d)/(1 - d)."""
+    """Return the drive with its hold: T2 = (T/2)·(b1 - b0)/(b1 + b0), T3 = (T/2)·(1 + d)/(1 - d)."""
     half = drive.period / 2.0
     zero = half * (drive.b1 - drive.b0) / (drive.b1 + drive.b0)
     return PseudoFrequency(drive.gain, half, zero, half * (1.0 + drive.d) / (1.0 - drive.d))
@@ -132,7 +132,7 @@ def _simulate(
     motor: Array,
     load: Array,
 ) -> None:
-    """Simulate a unit step at sample 0; each command acts from the sample of its measurement on."""
+    """Simulate a unit step at sample 0; each command acts from the sample of its measurement onwards."""
     for n in range(command.size):
         move(drive, drive_state)
         motor[n], load[n] = motor_of(drive_state), load_of(drive_state)
@@ -181,7 +181,7 @@ class StepResponse:
 
 def periods_to_settle(drive: SampledDrive, link: Link, delay: float = 0.0) -> int | None:
     """Return the number of periods until a loop is at rest; None if it is unstable."""
-    slowest = largest_pole(drive, link, delay)  # 0 for a dead-beat loop: hence max() below
+    slowest = largest_pole(drive, link, delay)  # 0 for a dead-beat loop, hence max() below
     if slowest >= 1.0:
         return None
     return int(np.clip(np.ceil(np.log(_SETTLED) / np.log(max(slowest, _SETTLED))), 10, _MOST_PERIODS))
@@ -292,7 +292,7 @@ def open_loop(drive: SampledDrive, link: Link) -> control.TransferFunction:
 def _gain_margin(loop: control.TransferFunction) -> float:
     """Return the factor by which the gain may increase; infinite without a limit."""
     found, *_ = control.stability_margins(loop, returnall=True)
-    # At an infinite pseudo-frequency, half the sampling rate, the response is real too.
+    # At an infinite pseudo-frequency, which is half the sampling rate, the response is real too.
     end = float(loop.num[0][0][0] / loop.den[0][0][0]) if loop.num[0][0].size == loop.den[0][0].size else 0.0
     candidates = np.append(found, -1.0 / end if end < 0.0 else np.inf)
     return float(np.min(candidates[candidates > 1.0], initial=np.inf))

@@ -3,7 +3,7 @@
 
     first order                1/(1 + p·T0)                               (18)
     delay                      e^{-p·T0}                                  (19)
-    second order               1/(1 + 2ζp/ωn + p²/ωn²)                    the next step that the paper recommends
+    second order               1/(1 + 2ζp/ωn + p²/ωn²)                    recommended by the paper as the next step
     second order with delay    e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²)
 
 All have Wi(0) = 1, as in the paper. A fit minimises the mean square of the residual over time.
@@ -29,7 +29,7 @@ Complex = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class StepResponse:
-    """Measured response to a step of 1 at time 0.
+    """Measured response to a unit step at time 0.
 
     Args:
         time: increasing times [s], shape (n,) with n >= 8.
@@ -63,7 +63,7 @@ class StepResponse:
     def residual(self, model: "Model") -> Array:
         """Return the residual of the model, weighted so that its sum of squares is the mean square over time."""
         between = np.diff(self.time)
-        # Trapezoids: without them, parts of the response with many samples would count more.
+        # Trapezoidal weights; otherwise densely sampled parts of the response would count more.
         weight = (np.append(between, 0.0) + np.append(0.0, between)) / 2.0
         return np.asarray((model.step(self.time) - self.response) * np.sqrt(weight / weight.sum()))
 
@@ -139,7 +139,7 @@ M = TypeVar("M", bound=Model)
 
 
 def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high: Array, starts: Iterable[Array]) -> M:
-    """Return the best of several bounded least-squares fits of ``build(x)``, one per start, shape (k,) each."""
+    """Return the best bounded least-squares fit of ``build(x)`` from several starting points, shape (k,) each."""
 
     def residual(x: Array) -> Array:
         return measured.residual(build(x))
@@ -152,7 +152,7 @@ def _best(measured: StepResponse, build: Callable[[Array], M], low: Array, high:
 
 
 def _half(measured: StepResponse) -> Array:
-    """Return the times at which the response rises through 1/2 [s], at least one, by linear interpolation."""
+    """Return the times [s], at least one, at which the linearly interpolated response rises through 1/2."""
     time, rest = np.append(0.0, measured.time), np.append(-0.5, measured.response - 0.5)
     at = np.flatnonzero((rest[:-1] < 0.0) & (rest[1:] >= 0.0))
     return np.asarray(time[at] - rest[at] * (time[at + 1] - time[at]) / (rest[at + 1] - rest[at]))

@@ -2,8 +2,8 @@
 """Steady errors and stability of the multi-channel structures of paper 001.
 
 Every formula takes complex responses at the same frequencies: Q of the smoothing filter, Z = Wi/W0 of the drive with
-its correction, Wpk of the piezo. The responses may be ideal (`lathe_papers.formulas.responses`) or those of difference
-equations. Wф of paper 001 is Q - 1.
+its correction, and Wpk of the piezo. The responses may be ideal (`lathe_papers.formulas.responses`) or those of
+difference equations. Wф of paper 001 is Q - 1.
 
 In the iterative structure (Fig. 6) the reference of each channel is the error of the previous channel, and no channel
 depends on later channels. Each channel therefore converges by itself, and the slowest determines the overall rate.
@@ -20,7 +20,7 @@ import scipy
 from lathe_papers.formulas.responses import Array, Complex, Response, lead, lead_lag, second_order, smoothing
 from lathe_rc.errors import InputError
 
-_GRID = 4097  # frequencies evaluated before the worst is refined
+_GRID = 4097  # number of frequencies evaluated before the worst one is refined
 
 
 def steady_error(q: npt.ArrayLike, z: npt.ArrayLike, gain: float = 1.0, cycle_phase: npt.ArrayLike = 0.0) -> Complex:
@@ -69,7 +69,7 @@ def iterative(*errors: npt.ArrayLike) -> Complex:
 
 
 def contraction(q: npt.ArrayLike, z: npt.ArrayLike, gain: float = 1.0) -> Array:
-    """Return |Q - γZ|, the factor by which each cycle reduces the learning error; shape as given."""
+    """Return |Q - γZ|, the factor by which each cycle multiplies the learning error; shape of the arguments."""
     return np.abs(np.asarray(q) - gain * np.asarray(z))
 
 
@@ -82,8 +82,8 @@ def cycles(factor: npt.ArrayLike, fraction: float) -> Array:
     if not 0.0 < fraction < 1.0:
         raise InputError(f"cycles to reach the fraction {fraction:g}; allowed: between 0 and 1, ends excluded")
     factors = np.asarray(factor, dtype=np.float64)
-    with np.errstate(divide="ignore"):  # a factor of 0 learns in one cycle, of 1 never
-        # Without 1e-9, rounding would add a cycle where a whole number of them suffices exactly.
+    with np.errstate(divide="ignore"):  # a factor of 0 learns in one cycle, a factor of 1 never
+        # Without 1e-9, rounding would add a cycle where a whole number of cycles is exactly enough.
         count = np.ceil(math.log(fraction) / np.log(factors) - 1e-9)
     return np.where(factors < 1.0, np.maximum(count, 1.0), np.inf)
 
@@ -97,7 +97,7 @@ class Peak:
 
 
 def supremum(response: Response, highest: float) -> Peak:
-    """Return the peak of a response from 0 to ``highest`` [rad/s]; for Q - γZ its magnitude has to be below 1.
+    """Return the peak of a response from 0 to ``highest`` [rad/s]; for Q - γZ, the magnitude must be below 1.
 
     The grid of 4097 frequencies resolves resonances wider than ``highest``/4096.
     """
@@ -106,7 +106,7 @@ def supremum(response: Response, highest: float) -> Peak:
     worst = int(np.argmax(magnitude))
     ends = float(grid[max(worst - 1, 0)]), float(grid[min(worst + 1, _GRID - 1)])
     near = scipy.optimize.minimize_scalar(lambda w: -abs(response(np.array([w]))[0]), bounds=ends, method="bounded")
-    # The bounded search never evaluates its ends, where a response without a resonance is largest.
+    # The bounded search never evaluates the ends, where a response without a resonance peaks.
     if -near.fun > magnitude[worst]:
         return Peak(float(near.x), float(-near.fun))
     return Peak(float(grid[worst]), float(magnitude[worst]))
@@ -138,7 +138,7 @@ def lead_errors(q: Response, z: Response, highest: float, gain: float = 1.0) -> 
         raise InputError(f"sup|Q - γZ| = {excess(0.0) + 1.0:.4g} with the lead as designed; allowed: below 1")
 
     def limit(sign: float) -> float:
-        # Steps of π/8 of phase at the highest frequency: no unstable range is missed.
+        # The phase at the highest frequency changes by π/8 per step, so that no unstable range is missed.
         step = sign * math.pi / 8.0 / highest
         for k in range(1, _GRID):
             if excess(k * step) >= 0.0:
@@ -152,7 +152,8 @@ def limit_frequency(compensator: Response, highest: float, level: float = 1.0) -
     """Return the frequency [rad/s] up to which direct compensation leaves less than ``level``: |1 - Wpk| < level.
 
     With a level of 1, compensation increases the vibration from this frequency on (paper 001, eq. 8; eq. 9, |Wpk| < 2,
-    is necessary but not sufficient). With a level of 0.5 and a drive, it is the bandwidth of paper 001.
+    is necessary but not sufficient). With a level of 0.5 and the response of a drive, the result is the bandwidth as in
+    paper 001.
 
     Args:
         compensator: response Wpk of the piezo.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning of the channel parameters to reproduce the table of steady errors of paper 001.
+"""Tuning of the channel parameters to reproduce the table of steady errors in paper 001.
 
 The paper prints amplitudes of the steady error to two digits, but no parameters. Both searches start from the
 parameters of an earlier identification (`START`), keep sup|Q - Z| of both channels below 1 and end at
-rounded digits:
+rounded parameters:
 
 - `nearest` changes as few digits as possible so that every entry lies within its limit;
 - `smallest_deviation` minimises the largest deviation of any entry.
@@ -36,7 +36,7 @@ PRINTED = np.array(
     ]
 )  #: the table of paper 001
 LIMITS = np.array([0.10, 0.10, 0.15, 0.10])  #: largest allowed deviation of each row
-HIGHEST = (3e4, 2e5)  #: [rad/s] up to which sup|Q - Z| of the coarse and the fine channel counts
+HIGHEST = (3e4, 2e5)  #: upper limit of the frequencies in sup|Q - Z|, coarse and fine channel [rad/s]
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ LEAD_LAG = Tuning(
     ),
 )  #: result of `smallest_deviation` with lead-lag
 
-# A channel as a vector: ωn, ζ, T0 - τ, time constant of Q, T1, T2. Each is scaled by the unit given here.
+# A channel as a vector: ωn, ζ, T0 - τ, time constant of Q, T1, T2, each scaled by the unit given here.
 _FIELDS = 6
-_LAG_UNIT = 1e-4  # [s] of T1 and T2
+_LAG_UNIT = 1e-4  # unit of T1 and T2 [s]
 _ROUNDING_ORDER = (5, 4, 11, 10, 0, 1, 6, 7, 2, 8, 3, 9)  # parameters that the others compensate best come first
 _STABILITY_GRIDS = (
     np.linspace(10.0, HIGHEST[0], 300),
@@ -117,7 +117,7 @@ def _vector(tuning: Tuning) -> Array:
 def _tuning(vector: Array) -> Tuning:
     def channel(part: Array, delay: float) -> Channel:
         natural_frequency, damping, net_lead, q_time, lead, lag = map(float, part)
-        # Sums and products of rounded numbers have rounding errors in the last digits: 15 digits are exact.
+        # Sums and products of rounded numbers have rounding errors in the last digits; 15 digits are exact.
         lead_time = float(f"{net_lead + delay:.15g}")
         return Channel(natural_frequency, damping, delay, lead_time, q_time, (lead, lag))
 
@@ -133,7 +133,7 @@ def _acceptable(tuning: Tuning, limits: Array, margin: float) -> bool:
 
 
 def _digit_changes(count: int) -> Iterator[Tuning]:
-    """Yield all tunings that differ from `START` by ``count`` steps of last digits, without lead-lag."""
+    """Yield all tunings that differ from `START` by ``count`` steps in last digits, without lead-lag."""
     places = [(i, step) for i, step in enumerate(_STEPS[0])]
     places += [(_FIELDS + i, step) for i, step in enumerate(_STEPS[1])]
     signed = [(place, sign * step) for place, step in places for sign in (-1.0, 1.0)]
@@ -145,7 +145,7 @@ def _digit_changes(count: int) -> Iterator[Tuning]:
 
 
 def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> Tuning:
-    """Return the tuning without lead-lag that meets the limits with the fewest steps of last digits from `START`.
+    """Return the tuning without lead-lag that meets the limits with the fewest last-digit steps from `START`.
 
     Args:
         limits: largest allowed relative deviation of each row, shape (4,).
@@ -153,7 +153,7 @@ def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> T
         changes: maximum number of steps to try.
 
     Returns:
-        Among tunings with equally few steps, the tuning with the smallest largest deviation relative to its limit.
+        Among tunings with equally few steps, the one that minimises the largest ratio of a deviation to its limit.
 
     Raises:
         LatheError: no tuning meets the limits within ``changes`` steps.
@@ -217,7 +217,7 @@ def smallest_deviation(
     Args:
         lead_lag: whether both channels have the correction (1 + pT1)/(1 + pT2), T1 and T2 from 0.1 to 2 ms.
         weights: weights of the rows, shape (4,); a row of weight 1.5 may deviate 1.5 times as much. Default: all 1.
-        spread: largest factor between ωn and ζ of the drives and `START`.
+        spread: largest factor by which ωn and ζ of the drives may differ from `START`.
         margin: smallest allowed 1 - sup|Q - Z| of both channels.
         digits: significant digits of each parameter.
         starts: number of starts.

@@ -21,7 +21,7 @@ from lathe_papers.formulas.structures import uncompensated
 
 Spectrum = Callable[[Array], Array]
 
-_GRID = 4097  # frequencies of the integral from which a band is read
+_GRID = 4097  # number of frequencies of the integral from which a band is determined
 
 
 def flat(frequency: Array) -> Array:
@@ -74,11 +74,11 @@ def widest_band(compensator: Response, wanted: float, highest: float, spectrum: 
 
 
 def describing_function(amplitude: float, thresholds: Array, weights: Array, proportional: float) -> complex:
-    """Return the describing function N of a Prandtl-Ishlinskii hysteresis: first harmonic of the output over the input.
+    """Return the describing function N of a Prandtl-Ishlinskii hysteresis.
 
-    The input is a sine.
+    N is the ratio of the output's first harmonic to a sinusoidal input.
 
-    For one play operator with the threshold r and the amplitude A, with c = 1 - 2r/A,
+    For one play operator with threshold r, at the amplitude A and with c = 1 - 2r/A,
 
         N = 1/2 + (asin c + c·sqrt(1 - c²))/π - j·(4/π)·(r/A)·(1 - r/A)      and 0 for r >= A
 

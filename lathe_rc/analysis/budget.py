@@ -8,10 +8,10 @@ of all causes. The form error e = f(N) is the sum of
     e_ij   = f({i, j}) - f({i}) - f({j}) + f({})        interaction of i and j
     e_0    = f({})                                      rest, without any of the causes
 
-and of the interactions of three causes or more. If a cause requires another one to have an effect, as the lead requires
-a varying speed, its effect is computed in addition to that one. The share of a contribution x in the power of e is the
-mean of x·e over that of e². The shares add up to 1, since the contributions add up to e; a share is negative if its
-contribution reduces the error.
+and of the interactions of three causes or more. If a cause acts only together with another one, as the lead acts only
+at varying speed, its effect is computed with the required cause active. The share of a contribution x in the power of e
+is the mean of x·e divided by that of e². The shares add up to 1, since the contributions add up to e; a share is
+negative if its contribution reduces the error.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Causes = frozenset[str]
 
-TOLD = 0.01  #: least share of the interactions that is reported pair by pair
+TOLD = 0.01  #: smallest share of the interactions at which they are reported pair by pair
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Part:
 
     def percent(self) -> str:
         """Format the share in per cent."""
-        return f"{round(self.share * 100.0, 1) + 0.0:.1f}"  # + 0.0: no -0.0
+        return f"{round(self.share * 100.0, 1) + 0.0:.1f}"  # + 0.0 turns -0.0 into 0.0
 
     def summary(self) -> dict[str, object]:
         """Return the contribution for JSON, lengths in µm."""
@@ -56,8 +56,8 @@ class Budget:
     """Error budget of a run: form error and its contributions.
 
     Attributes:
-        revolutions: number of last revolutions of the run that were evaluated.
-        rms, largest: RMS and largest magnitude of the form error in them [m].
+        revolutions: number of evaluated revolutions, the last ones of the run.
+        rms, largest: RMS and largest magnitude of the form error in these revolutions [m].
         causes: contribution of each cause alone.
         rest: form error without any of the causes.
         interactions: sum of all interactions; causes, rest and interactions add up to the form error.
@@ -81,7 +81,7 @@ class Budget:
 
     @property
     def explained(self) -> float:
-        """Return the share of causes, pairs and rest; 1 if there is no interaction of three or more causes."""
+        """Return the total share of causes, pairs and rest; 1 if there is no interaction of three or more causes."""
         return self.rest.share + sum(part.share for part in (*self.causes, *self.pairs))
 
     def summary(self) -> dict[str, object]:
@@ -103,14 +103,14 @@ class Decomposition:
     """Plan of the runs required for an error budget, and the evaluation of these runs.
 
     Args:
-        needs: required cause of each cause, empty for none; a required cause precedes the causes that need it.
+        needs: required cause of each cause, or an empty string; a required cause precedes the causes that need it.
     """
 
     def __init__(self, needs: Mapping[str, str]) -> None:
         self._needs = needs
 
     def acting(self, causes: Causes) -> Causes:
-        """Return the causes with an effect: causes whose required cause is also in ``causes``, or that need none."""
+        """Return the causes with an effect: those that need no other cause, or whose required cause is included."""
         return frozenset(cause for cause in causes if self._needs[cause] in ("", *causes))
 
     def _context(self, *causes: str) -> Causes:
@@ -118,7 +118,7 @@ class Decomposition:
         return frozenset(self._needs[cause] for cause in causes if self._needs[cause]) - set(causes)
 
     def _couples(self) -> Iterator[tuple[str, str]]:
-        """Yield the pairs of causes, except a cause with its required cause, which act together already."""
+        """Yield all pairs of causes except a cause and its required cause, which always act together."""
         return (pair for pair in combinations(self._needs, 2) if self._needs[pair[1]] != pair[0])
 
     def alone(self) -> set[Causes]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Form error of a run per revolution, computed chunk by chunk.
+"""Form error of a run for each revolution, computed chunk by chunk.
 
 A revolution begins with the first sample at or after its initial angle. The mean square is taken over the angle, not
 over time: each sample is weighted by the angle to the next one, so that slow parts of a revolution do not count more.
-An incomplete last revolution is left out, unless less than two samples are missing.
+An incomplete last revolution is omitted unless fewer than two samples are missing.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from lathe_rc.jit import inlined, kernel
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
-# The state: samples so far; turns at the last sample and at the one before, error of the last; number of the current
-# revolution and index of its first sample; its sums of squares and weights; its largest and smallest error.
+# State: samples so far; turns at the last sample and at the one before, error of the last; number of the current
+# revolution and index of its first sample; its sums of squares and of weights; its largest and smallest error.
 _SAMPLES, _TURNS, _BEFORE, _ERROR, _NUMBER, _START, _SQUARE, _WEIGHT, _HIGH, _LOW = range(10)
 _ROWS = 64  # initial capacity in complete revolutions
 
@@ -30,7 +30,7 @@ class FormErrors:
     Attributes:
         rms: root mean square over the angle [m].
         largest: largest magnitude [m].
-        peak_to_valley: largest less smallest value [m].
+        peak_to_valley: largest minus smallest value [m].
         starts: index of the first sample of each revolution, and of the sample after the last.
     """
 
@@ -56,15 +56,15 @@ def turns_before(angle: Array) -> int:
 
 
 def turns_at_end(before: float, last: float) -> int:
-    """Compute the number of revolutions complete at the end of a run, from the turns at its last two samples."""
+    """Compute the number of completed revolutions at the end of a run, from the turns at its last two samples."""
     return int(np.floor(last + min(2.0 * (last - before), 0.5)))
 
 
 def that_count(angle: Array, error: Array) -> npt.NDArray[np.intp] | slice:
     """Select the samples of a chunk, shape (n,), that determine the form errors.
 
-    For a chunk of pure standstill these are the first, the last and the extreme samples: a standstill of minutes
-    requires no memory.
+    If the spindle stands still for the whole chunk, these are the first, the last and the extreme samples, so that a
+    standstill of minutes requires no memory.
     """
     if angle.size < 5 or angle[0] != angle[-1]:
         return slice(None)
@@ -86,7 +86,7 @@ def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> t
     Returns:
         Number of samples processed; number of rows filled, or -1 if a revolution has no sample.
     """
-    # Locals, which the compiler keeps in registers; arrays might overlap.
+    # Local variables, because the compiler keeps them in registers; arrays might overlap.
     samples, last, before, held = state[_SAMPLES], state[_TURNS], state[_BEFORE], state[_ERROR]
     number, begin = state[_NUMBER], state[_START]
     square, weight, high, low = state[_SQUARE], state[_WEIGHT], state[_HIGH], state[_LOW]
@@ -94,7 +94,7 @@ def _add(state: Array, rows: Array, angle: Array, error: Array, start: int) -> t
     while k < angle.size and 0 <= found < rows.shape[0]:
         turns = angle[k] / _TURN
         if samples > 0.0:
-            # The last sample is added now, since its weight is known.
+            # The last sample is added now, because its weight is known.
             square += held * held * (turns - last)
             weight += turns - last
             high, low = max(high, held), min(low, held)
@@ -133,7 +133,7 @@ class RunningErrors:
     """Accumulator of the form errors per revolution, fed chunk by chunk.
 
     Args:
-        first: revolutions before the first one evaluated, see `turns_before`.
+        first: number of revolutions before the first evaluated one, see `turns_before`.
     """
 
     def __init__(self, first: int = 0) -> None:
@@ -165,7 +165,7 @@ class RunningErrors:
                 self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
 
     def found(self) -> FormErrors:
-        """Return the form errors of all complete revolutions, if the run ends after the samples so far."""
+        """Return the form errors of all complete revolutions, as if the run ended after the samples so far."""
         state, filled = self._state, self._filled
         if state[_SAMPLES] < 2.0:
             return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))

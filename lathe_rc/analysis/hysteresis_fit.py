@@ -6,10 +6,10 @@ the weights,
 
     y = y0 + p0·u + Σ p_i·F_i(u),    p0, p_i >= 0,
 
-and the weights follow from least squares with bounds. The initial states of the plays are unknown; the fit begins where
+and the weights follow from bounded least squares. The initial states of the plays are unknown; the fit begins where
 the input has passed through its full range for the first time, after which the state of every play is determined.
 
-The loop must be quasi-static: the lag of a fast drive would be taken for hysteresis.
+The loop must be quasi-static, because the lag during fast motion would be mistaken for hysteresis.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from lathe_rc.signals.measurement_file import Measurement
 
 Array = npt.NDArray[np.float64]
 
-_WHOLE = 0.95  # part of the range that counts as the full range
+_WHOLE = 0.95  # fraction of the range that counts as the full range
 _LEAST = 1e-9  # a slope below this cannot be inverted
 
 
@@ -64,7 +64,7 @@ class Identified:
     Attributes:
         model: hysteresis model.
         offset: offset of the displacement [m].
-        residual: RMS of the residual, over that of the displacement about its mean.
+        residual: RMS of the residual, relative to that of the displacement about its mean.
     """
 
     model: PrandtlIshlinskii

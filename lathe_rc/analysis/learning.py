@@ -9,6 +9,7 @@ up to the grid's Nyquist limit. Q, Z and the interpolators are modelled as imple
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,8 @@ Complex = npt.NDArray[np.complex128]
 Response = Callable[[Array], Complex]
 
 _COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each of the worst peaks
+_SCALE = 0.5  # change of the drive from which its effect on the factors is computed
+_ROUNDING = 1e-9  # a smaller effect is none
 
 
 def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[float, float]:
@@ -39,6 +42,59 @@ def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[floa
         return float("nan"), float(near[0])
     fine = np.abs(operator(near))
     return float(fine.max()), float(near[np.argmax(fine)])
+
+
+class DriveMargin(NamedTuple):
+    """Smallest error of a drive's response, at one frequency, with which learning diverges.
+
+    Attributes:
+        error: error relative to the response, of any phase [1]; inf if learning does not depend on the drive.
+        waves: waves per revolution where it occurs.
+        speed: speed of the spindle [rad/s].
+    """
+
+    error: float
+    waves: float
+    speed: float
+
+    def __str__(self) -> str:
+        """Return the error and the frequency where learning is lost."""
+        return f"{self.error:.4g} at {self.waves:.4g} waves ({self.waves * self.speed / (2.0 * np.pi):.4g} Hz)"
+
+
+def drive_margin(factors: Callable[[Array, float], Complex], highest: float, speed: float) -> DriveMargin:
+    """Compute the smallest relative error Δ of the drive with which a factor of a cycle reaches the magnitude 1.
+
+    A factor of a linear law is a quotient (F0 + βΔ)/(1 + δΔ) in the response of the drive at one frequency, for Q - γZ
+    with δ = 0. Over all phases of Δ its magnitude reaches 1 first at the smallest positive root m of
+
+        (|β|² - |δ|²)·m² + 2·|conj(F0)·β - δ|·m = 1 - |F0|²
+
+    which for δ = 0 is m = (1 - |F0|)/|β|. F0, β and δ follow from the factors with three drives.
+
+    Args:
+        factors: factors of a cycle at ``waves`` per revolution, with the drive scaled by a real number, shape (k, n).
+        highest: highest waves per revolution.
+        speed: speed of the spindle [rad/s].
+    """
+
+    def smallest(waves: Array) -> Array:
+        given, more, less = (factors(waves, 1.0 + scale) for scale in (0.0, _SCALE, -_SCALE))
+        with np.errstate(all="ignore"):
+            depends = np.abs(more - less) > _ROUNDING
+            delta = np.where(depends, (2.0 * given - more - less) / (_SCALE * (more - less)), 0.0)
+            beta = np.where(depends, (more * (1.0 + _SCALE * delta) - given) / _SCALE, 0.0)
+            square = np.abs(beta) ** 2 - np.abs(delta) ** 2
+            half, rest = np.abs(np.conj(given) * beta - delta), 1.0 - np.abs(given) ** 2
+            # The quotient without cancellation; it holds for a square of 0 or below, where one root is positive.
+            root = rest / (half + np.sqrt(half**2 + square * rest))
+        return np.asarray(np.where(root >= 0.0, root, np.where(rest > 0.0, np.inf, 0.0)).min(axis=0))
+
+    waves = _waves_up_to(highest)
+    near = _near_peaks(waves, -smallest(waves))
+    found = smallest(near)
+    worst = int(np.argmin(found))
+    return DriveMargin(float(found[worst]), float(near[worst]), speed)
 
 
 @kernel
@@ -72,6 +128,11 @@ def _waves_up_to(highest: float) -> Array:
     waves = np.linspace(0.0, highest, _COARSE)
     waves.setflags(write=False)
     return waves
+
+
+def highest_waves(grid: int, step: float, speed: float) -> float:
+    """Return the Nyquist limit of grid and sampling [waves per revolution], at ``speed`` [rad/s]."""
+    return float(min(grid / 2, np.pi / (step * speed)))
 
 
 @dataclass(frozen=True)
@@ -154,8 +215,7 @@ class LearningLoop:
 
 def _worst(loop: LearningLoop, speed: float) -> tuple[float, float]:
     """Compute the supremum of a loop at a speed, without a cache."""
-    highest = min(loop.grid / 2, np.pi / (loop.step * speed))
-    return supremum(lambda waves: loop.operator(waves, speed), highest)
+    return supremum(lambda waves: loop.operator(waves, speed), highest_waves(loop.grid, loop.step, speed))
 
 
 _worst_of_alike = lru_cache(maxsize=256)(_worst)

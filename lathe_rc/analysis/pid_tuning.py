@@ -5,12 +5,13 @@ At the crossover ωc the gain of the loop is 1, and its phase exceeds -π by the
 
     C(jωc) = e^{j(margin - π)}/P(jωc),   C = P + I/p + D·N·p/(p + N)
 
-two equations for the three gains; the third is I/ωc = |C(jωc)|/integral_ratio, which bounds the lag of the integral.
+These are two equations for the three gains. The third is I/ωc = |C(jωc)|/integral_ratio, which bounds the lag of the
+integral part.
 Paper 004 tuned with Matlab's PID Tuner.
 
-Systems are those of python-control. The companion form of paper 004's compensators has coefficients from 1 to 10¹², and
-the computed poles of a loop with it are wrong by several rad/s: therefore each system is balanced before it is
-connected to others.
+Systems are python-control systems. The companion form of paper 004's compensators has coefficients from 1 to 10¹², and
+the computed poles of a loop with it are wrong by several rad/s, so each system is balanced before it is connected to
+others.
 """
 
 from dataclasses import dataclass
@@ -27,10 +28,10 @@ from lathe_rc.transfer import TransferFunction, realise
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-Lti: TypeAlias = Any  # control.lti.LTI, which has no types
+Lti: TypeAlias = Any  # control.lti.LTI, which has no type annotations
 Plant: TypeAlias = TransferFunction | Lti
 
-_PADE = 4  # order: up to ωτ = 2 its phase is right to 1e-4 rad
+_PADE = 4  # order; the phase is accurate to 1e-4 rad up to ωτ = 2
 
 
 def state_space(plant: Plant) -> Lti:
@@ -48,8 +49,8 @@ def delay(seconds: float) -> Lti:
     return state_space(TransferFunction(*(tuple(part) for part in control.pade(seconds, _PADE))))
 
 
-_FREQUENCIES = 600  # of a Bode plot, from which margins are read
-_SAMPLES = 4000  # of a step response
+_FREQUENCIES = 600  # points of the Bode plot from which margins are read
+_SAMPLES = 4000  # samples of a step response
 _TRIES = 60  # trial crossovers of `fastest`
 
 
@@ -72,7 +73,7 @@ class Loop:
         gain_frequency: frequency at which the phase is -π [rad/s]; NaN if there is none.
         phase_margin: phase margin [rad].
         phase_frequency: crossover [rad/s].
-        stable: whether the closed loop is stable; if not, the figures of the step are NaN.
+        stable: whether the closed loop is stable; if not, the step measures are NaN.
     """
 
     rise: float
@@ -125,7 +126,7 @@ def _step(closed: Lti, poles: Complex) -> tuple[float, float, float]:
     """Compute rise time [s], settling time [s] and relative overshoot of a stable system."""
     final = float(np.real(closed.dcgain()))
     span = 10.0 / np.abs(poles.real).min()
-    for _ in range(2):  # a slow pole with a negligible residue makes the first span far too long
+    for _ in range(2):  # a slow pole with a negligible residue makes the first time span far too long
         time, y = control.step_response(closed, np.linspace(0.0, span, _SAMPLES))
         measured = control.step_info(y, T=time, yfinal=final)
         span = min(span, 4.0 * measured["SettlingTime"])
@@ -149,8 +150,8 @@ def tune(
         plant: plant of the loop.
         crossover: ωc [rad/s].
         phase_margin: phase margin [rad].
-        integral_ratio: gain of the PID at the crossover over that of its integral there.
-        filter_ratio: N over the crossover.
+        integral_ratio: ratio of the gain of the PID to that of its integral part, at the crossover.
+        filter_ratio: ratio of N to the crossover.
         wait: pure delay in the loop [s].
 
     Raises:
@@ -181,13 +182,13 @@ def tune(
 def fastest(
     plant: Plant, *, band: tuple[float, float], phase_margin: float, gain_margin: float, wait: float = 0.0
 ) -> PidGains:
-    """Compute the gains of the highest crossover in a band with both margins met and a stable loop.
+    """Compute the gains for the highest crossover in a band that meets both margins with a stable loop.
 
     Args:
         plant: plant of the loop.
         band: lowest and highest crossover [rad/s].
-        phase_margin: least phase margin [rad].
-        gain_margin: least gain margin, as a factor.
+        phase_margin: required phase margin [rad].
+        gain_margin: required gain margin, as a factor.
         wait: pure delay in the loop [s].
 
     Raises:

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reduced-order model of a channel from its step or frequency response, and its realisable inverse.
 
-Both stages of paper 004 (Figs 6-9):
+The module covers both stages of paper 004 (Figs 6-9):
 
     model      (b_m·p^m + … + b0)/((a_n·p^n + … + 1)·p^k), k = 0 or 1, by least squares of the step response
     inverse    (c_r·p^r + … )/Π(1 + p·τ_i), by nonlinear programming: the step response of model and inverse in series
                approximates a step in the mean square
 
 A model is linear in its numerator, so only the denominator is searched, and with it a delay e^{-pτ} if asked for. The
-poles of the model are kept stable by factors of second and first order with positive coefficients. The relative error
-of a frequency response is minimised, weighted by its uncertainty. The lags τ_i of the inverse have a lower bound:
-without it the optimum is the exact inverse, which is not realisable.
+denominator consists of factors of second and first order with positive coefficients, which keeps the poles stable. The
+relative error of a frequency response is minimised, weighted by its uncertainty. The lags τ_i of the inverse have a
+lower bound; without it, the optimum would be the exact inverse, which is not realisable.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,11 @@ from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-_SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, over the length of the record
+_SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, relative to the length of the record
 _DAMPINGS = (0.2, 1.2)
 _POINTS = 2000  # of the step response of a model from a frequency response
-_MOST = 60  # steps of a search; the best of several counts
-_LARGEST_LAG = 100.0  # of the inverse, over the least one
+_MOST = 60  # largest number of evaluations in one of several searches, of which the best counts
+_LARGEST_LAG = 100.0  # largest lag of the inverse, relative to the least one
 
 
 def refuse_unusable(what: str, time: Array, response: Array, least: int) -> None:
@@ -61,11 +61,11 @@ class ChannelStep:
     """Measured response of a channel to a unit step at time 0.
 
     Args:
-        time: time in equal steps from 0 [s], shape (n,), n at least 16.
+        time: uniformly spaced times starting at 0 [s], shape (n,), n at least 16.
         response: response in the unit of the channel, shape (n,).
 
     Raises:
-        InputError: the arrays are not such a response.
+        InputError: the arrays do not meet these conditions.
     """
 
     time: Array
@@ -119,7 +119,7 @@ def _through(transfer: TransferFunction, step: float, signal: Array, hold: Hold)
 
 
 def step_of(transfer: TransferFunction, time: Array) -> Array:
-    """Compute the step response at ``time`` [s], in equal steps from 0, shape (n,)."""
+    """Compute the step response at ``time`` [s], uniformly spaced from 0, shape (n,)."""
     return _through(transfer, float(time[1] - time[0]), np.ones(time.size), "zoh")
 
 
@@ -148,7 +148,7 @@ class Fit:
 
 
 def _denominator(logarithms: Array, pairs: int) -> Array:
-    """Compute the denominator, falling powers: ``pairs`` factors a·p² + b·p + 1, then b·p + 1 for the other numbers."""
+    """Compute the denominator in descending powers: ``pairs`` factors a·p² + b·p + 1, then factors b·p + 1."""
     values = np.exp(logarithms)
     whole = np.ones(1)
     for a, b in values[: 2 * pairs].reshape(-1, 2):
@@ -162,7 +162,7 @@ def _starts(poles: int, pairs: int, span: float) -> list[Array]:
     """Return the logarithms of the denominator's coefficients at which the searches start."""
     starts = []
     for part in _SPREADS:
-        # Factors differ, or they would stay equal.
+        # The factors start with different values; equal factors would stay equal.
         times = part * span / 2.0 ** np.arange(pairs)
         single = part * span / 3.0 ** np.arange(1, poles - 2 * pairs + 1)
         for damping in _DAMPINGS if pairs else (1.0,):
@@ -259,7 +259,7 @@ def fit(
         delayed: whether the model has a delay.
 
     Raises:
-        InputError: the orders do not give a strictly proper model.
+        InputError: a model of these orders would not be strictly proper.
     """
     _check_orders(zeros, poles, integrator=integrator)
     time, response = measured.time, measured.response

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compliance of a shaft in the lathe along its length: deflection per force at the height z.
+"""Compliance of a shaft in the lathe along its length: deflection per unit force at the height z.
 
 Between centres, head stock and tail stock share the force by the lever arm, and the shaft is a simply supported beam:
 
     1/k(z) = (1 - z/L)²/k_head + (z/L)²/k_tail + z²·(L - z)²/(3·E·I·L) + 1/k_carriage
 
-A chuck also holds the shaft's end against tilting, so that the share of the tail stock depends on all stiffnesses. With
-R of a unit force in the tail stock, A of it in the head stock and the moment M at the chuck, least energy gives
+A chuck also holds the shaft's end against tilting, so that the share of the tail stock depends on all stiffnesses. If
+the tail stock carries the fraction R of a unit force and the head stock the fraction A, with the moment M at the chuck,
+the principle of least energy gives
 
     R·(L³/(3·E·I) + 1/k_tail + 1/k_head + c·L²) = z²·(3L - z)/(6·E·I) + 1/k_head + c·z·L
     1/k(z) = z³/(3·E·I) - R·z²·(3L - z)/(6·E·I) + A/k_head + c·z·M + 1/k_carriage,  A = 1 - R,  M = z - R·L
 
-where c is the rotation of the chuck under a moment; c → ∞ is the centre. Without a tail stock R = 0.
+where c is the rotation of the chuck per unit moment; c → ∞ corresponds to a centre. Without a tail stock, R = 0.
 
 Source: paper 004, which predistorts the path of the tool for head stock, tail stock and bending of the shaft, with
 models from other sources; the equations are those of elementary beam theory.
@@ -38,7 +39,7 @@ class Shaft:
     Attributes:
         length: L, from the head stock to the tail stock, or to the free end [m].
         diameter: diameter of the shaft [m].
-        support: between centres; in a chuck with the centre of the tail stock; in a chuck alone.
+        support: between centres; in a chuck and the centre of the tail stock; or in a chuck alone.
         head, tail, carriage: stiffnesses of head stock, tail stock and carriage [N/m]; inf for rigid.
         chuck_rotation: c [rad/(N·m)]; 0 for a clamped end; unused between centres.
         modulus: E [Pa].
@@ -79,7 +80,7 @@ class Shaft:
         """Compute the compliance 1/k(z) [m/N] at ``height`` z from the head stock [m], any shape.
 
         Raises:
-            InputError: a height is beyond the shaft.
+            InputError: a height lies beyond the shaft.
         """
         z = np.asarray(height, dtype=np.float64)
         if np.any((z < 0.0) | (z > self.length)):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdict on a run by its form error: whether the part is in tolerance, and whether the form error grows.
 
-The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t to each side of the desired form. A
+The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t on either side of the desired form. A
 revolution is in tolerance if its form error nowhere exceeds t; a run is in tolerance from the first revolution of the
 final sequence of revolutions in tolerance. The margin is computed from the last revolutions, since the first one in
 tolerance has hardly any margin.
@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-LAST = 10  #: revolutions at the end of a run that its spare and its budget speak of, at most
-_FEWEST = 4  # revolutions of a rise
-_FACTOR = 2.0  # of the settled error and of growth, see the module
-_BENT = 1.2  # rise of the last third over that of the middle third, above which the rise accelerates
+LAST = 10  #: largest number of revolutions at the end of a run that margin and budget cover
+_FEWEST = 4  # smallest number of revolutions in a rise
+_FACTOR = 2.0  # factor in the definitions of settled error and growth, see the module docstring
+_BENT = 1.2  # ratio of the rise in the last third to that in the middle third above which the rise accelerates
 _NOTHING = 1e-12  # [m] form error below which a rise is rounding error
 
 
@@ -36,7 +36,7 @@ class Verdict:
         since: first revolution, counted from 1, of the final sequence in tolerance; 0 if the last one is not.
         over: first and last revolution used for `largest`: at most the last `LAST` in tolerance, or only the last
             revolution if it is out of tolerance; (0, 0) without a revolution.
-        largest: largest magnitude of the form error in these revolutions; NaN without a revolution [m].
+        largest: largest magnitude of the form error in these revolutions [m]; NaN without a revolution.
     """
 
     tolerance: float
@@ -83,7 +83,7 @@ class Growth:
     """Growth of the form error beyond its settled range.
 
     Attributes:
-        diverges: True for an accelerating rise; False for a rise proportional to time, as by wear or drift.
+        diverges: True for an accelerating rise; False for a rise proportional to time, as caused by wear or drift.
         since: revolution, counted from 1, in which the growth begins.
         before: largest magnitude in the settled revolutions before the growth [m].
         last: largest magnitude in the last revolution [m].
@@ -117,7 +117,7 @@ def judge(largest: Array, tolerance: float, before: int = 0) -> Verdict:
     count = largest.size
     if not count:
         return Verdict(tolerance, 0, 0, (0, 0), np.nan)
-    outside = np.flatnonzero(~(largest <= tolerance))  # NaN is not in tolerance
+    outside = np.flatnonzero(~(largest <= tolerance))  # NaN counts as out of tolerance
     inside = int(outside[-1]) + 1 if outside.size else 0  # first of the final sequence in tolerance
     start = max(inside, count - LAST) if inside < count else count - 1
     since = inside + 1 + before if inside < count else 0
@@ -143,7 +143,7 @@ def growth(largest: Array, before: int = 0) -> Growth | None:
     rise = sizes[start + 1 :]
     if not rise.size or rise[-1] <= _FACTOR * settled.max():
         return None
-    # Up to half of the largest: at the limits of a drive the error stops growing.
+    # Only up to half of the largest rise, because the error stops growing at the limits of a drive.
     climb = sizes[start : start + 2 + int(np.argmax(rise >= rise.max() / _FACTOR))]
     steps = np.diff(np.log(climb))
     if climb.size <= _FEWEST or steps.max() > steps.sum() / 2.0:

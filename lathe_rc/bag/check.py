@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check of a bag: every sample present once, all values finite, bit-identical to the recorded run."""
+"""Check that a bag has every sample once and only finite values, and is bit-identical to the recorded run."""
 
 import json
 from collections.abc import Mapping
@@ -21,21 +21,21 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.files import contents, replacing
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness
-_MOST_FINDINGS = 20  # listed for one topic
-_MOST_DIGESTS = 2**20  # size of that file [B]
+_MOST_FINDINGS = 20  # maximum number listed per topic
+_MOST_DIGESTS = 2**20  # maximum size of the digest file [B]
 
 
 @dataclass
 class Findings:
-    """Findings of the check of a bag.
+    """Findings of a bag check.
 
     Attributes:
-        wrong: errors in the content: numbers that are not finite, digests other than recorded.
-        lost: missing content: gaps, topics that end early.
-        digests: digest of each signal topic, computed as in `lathe_rc.cell.recording`; empty if samples are lost.
-        compared: topics whose recorded digest is identical.
+        wrong: errors in the content, such as non-finite numbers, or digests that differ from the recorded ones.
+        lost: missing content, such as gaps, or topics that end early.
+        digests: digest of each signal topic, as in `lathe_rc.cell.recording`; empty if anything is wrong or lost.
+        compared: number of topics whose recorded digest is identical.
         foreign: third-party code and files that the bag refers to but does not contain.
-        messages: number of all messages.
+        messages: total number of messages.
         samples: number of samples of the dense topics, which all have the same length.
         first: first sample of a snapshot; 0 for a whole run.
         unread: topics that were not checked, because they are not ROS 2 topics.
@@ -53,7 +53,7 @@ class Findings:
 
     @property
     def exit_code(self) -> int:
-        """Return 0 for a clean bag, 3 if samples are lost, 1 if the content has errors."""
+        """Return 0 for a clean bag, 3 if samples are lost, or 1 if the content has errors."""
         return 1 if self.wrong else 3 if self.lost else 0
 
 
@@ -67,7 +67,7 @@ class _Sparse:
 
     def add(self, log_ns: int, data: bytes) -> None:
         if self._told >= _MOST_FINDINGS:
-            return  # no more digests are requested
+            return  # no digest is computed once there are findings
         try:
             self.part.append(log_ns, messages.values_of(self._type, data))
         except ValueError as error:
@@ -172,7 +172,7 @@ def check(path: Path) -> Findings:
 
 
 def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> None:
-    """Check that all dense topics end with the same sample, and in a whole run with a block marked as the last."""
+    """Check that all dense topics end at the same sample and, in a whole run, with a block marked as the last one."""
     end = max((looked.end for looked in dense.values()), default=findings.first)
     for topic, looked in dense.items():
         if looked.end < end:
@@ -183,7 +183,7 @@ def _ends(dense: Mapping[str, _Dense], findings: Findings, *, part: bool) -> Non
 
 
 def recorded(path: Path) -> dict[str, str]:
-    """Return the digests stored in a bag's folder by its recorder; empty if there are none.
+    """Return the digests stored in a bag's folder by the harness; empty if there are none.
 
     Raises:
         InputError: the file has an unexpected format.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a bag's run: scenario, files and versions, stored in the bag to reproduce the run later."""
+"""Provenance of a run: scenario, files and versions, stored in the bag so that the run can be reproduced later."""
 
 import base64
 import contextlib
@@ -27,13 +27,14 @@ from lathe_rc.files import contents
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
-FILE = "lathe_rc.file."  #: prefix of NODE.PARAM: content of the file that the parameter refers to
+FILE = "lathe_rc.file."  #: key prefix before NODE.PARAM; the value is the content of the file that the parameter names
 ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are any
-HELD = "lathe_rc.held"  #: by topic of a lost node, the sample from which its last value was repeated
-RECOVERED = "lathe_rc.recovered"  #: report of a recovery, with the losses
-_MOST_FILE = 2**19  # longest such file that is stored [B]
+HELD = "lathe_rc.held"  #: for each topic of a lost node, the sample from which its last value was held
+RECOVERED = "lathe_rc.recovered"  #: recovery report, including the losses
+COPIED = "lathe_rc.copied"  #: number of messages copied from each source bag
+_MOST_FILE = 2**19  # longest file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
-_HASH = 12  # displayed characters of a hash
+_HASH = 12  # number of characters displayed of a hash
 _MOST_ORIGINS = 256
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
@@ -43,7 +44,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
 
     Args:
         scenario: scenario with the actual parameters of the nodes.
-        host_topics: topics recorded beside the signals.
+        host_topics: topics recorded in addition to the signals.
     """
     nodes: dict[str, NodeParameters] = {}
     files: dict[str, str] = {}
@@ -52,7 +53,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
             continue
         nodes[name] = table
         for row in type(table).rows().values():
-            # A file that does not exist yet, or that is longer, is left out.
+            # A file that does not exist yet or is too long is left out.
             with contextlib.suppress(OSError):
                 if row.is_path:
                     kept = contents(Path(str(getattr(table, row.name))), _MOST_FILE)
@@ -69,7 +70,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
 
 
 def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
-    """Return the origin of each third-party class, see `Registry.origin`, and the parameters that name it."""
+    """Return the origin of each third-party class (see `Registry.origin`), and the parameters that name the class."""
     named: list[tuple[str, Mapping[str, str] | None]] = []
     for node, table in nodes.items():
         kind = kind_of(node, table.stage)
@@ -91,11 +92,11 @@ def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]
 
 @dataclass(frozen=True)
 class Origin:
-    """Provenance of a third-party class when a bag was made.
+    """Provenance of a third-party class at the time when a bag was made.
 
     Attributes:
         name: name of the class, as ``package.module:Class``.
-        distribution, version: distribution package and its version; empty if not installed as one.
+        distribution, version: distribution package and its version; empty if the class did not come from one.
         source: hash of the source code.
         used: parameters that refer to the class, as NODE.PARAM.
     """
@@ -108,7 +109,7 @@ class Origin:
 
     @property
     def package(self) -> str:
-        """Return distribution and version; empty if the class was not installed with a distribution package."""
+        """Distribution and version; empty if the class was not installed with a distribution package."""
         return f"{self.distribution} {self.version}".strip()
 
 
@@ -161,10 +162,10 @@ def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
 
 
 def named_files(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the files, by NODE.PARAM, that a bag's scenario refers to and the bag does not contain.
+    """Return the files, by NODE.PARAM, that a bag's scenario refers to but the bag does not contain.
 
     Raises:
-        InputError: the bag's scenario is no parameter file.
+        InputError: the bag's scenario is not a parameter file.
     """
     return {
         f"{node}.{key}": str(value)
@@ -192,7 +193,7 @@ def foreign(about: Mapping[str, str]) -> list[str]:
 
 
 def held(about: Mapping[str, str]) -> dict[str, int]:
-    """Return, by topic of a lost node, the sample from which its last value was repeated; empty without lost nodes."""
+    """Return, for each topic of a lost node, the sample from which its last value was held."""
     try:
         told = json.loads(about.get(HELD, "{}"))
         return {str(topic)[:256]: int(first) for topic, first in list(told.items())[:256]}
@@ -201,7 +202,7 @@ def held(about: Mapping[str, str]) -> dict[str, int]:
 
 
 def namespace(about: Mapping[str, str]) -> str:
-    """Return the namespace of the cell as a topic prefix; empty if it has none or the bag does not state it."""
+    """Return the namespace of the cell as a topic prefix; empty if there is none or the bag does not state it."""
     try:
         topics = [str(topic)[:256] for topic in json.loads(about.get(HOST_TOPICS, "[]"))[:256]]
     except (ValueError, TypeError, RecursionError, KeyError):
@@ -213,7 +214,7 @@ def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
     """Return the unvalidated values of a bag's scenario by node and parameter; empty without a scenario.
 
     Raises:
-        InputError: the bag's scenario is no parameter file.
+        InputError: the bag's scenario is not a parameter file.
     """
     return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
 
@@ -242,8 +243,8 @@ def _versions() -> dict[str, str]:
 def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str] = ()) -> Scenario:
     """Return the scenario that a bag was made with.
 
-    Its files are written to ``folder``, which must exist as long as the scenario is in use. The scenario of a bag is
-    data: it may not refer to other files, nor to code that is not allowed (`lathe_rc.allowed_code`).
+    The scenario's files are written to ``folder``, which must exist as long as the scenario is in use. A bag's scenario
+    is untrusted data: it may not refer to other files, nor to code that is not allowed (`lathe_rc.allowed_code`).
 
     Raises:
         InputError: the bag has no scenario, or one that is not allowed or not accepted by this version.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of the cell as in-memory recordings."""
+"""Reading of a cell's bags into memory, as recordings."""
 
 import os
 from collections.abc import Mapping

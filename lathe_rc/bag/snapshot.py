@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lathe_rc.errors import InputError
 
-SNAPSHOT = "lathe_rc.snapshot"  #: metadata entry with the section of the run in the bag, and its triggers
+SNAPSHOT = "lathe_rc.snapshot"  #: metadata entry with the section of the run that the bag covers, and the triggers
 
 _MOST_TRIGGERS = 1000  # triggers of a snapshot that are listed individually
 
@@ -19,8 +19,8 @@ class Snapshot:
 
     Attributes:
         path: path of the bag.
-        first: its first sample.
-        last: its last sample, if the run continues until then.
+        first: first sample of the section.
+        last: last sample of the section, if the run continues until then.
         wanted: last sample requested by any trigger.
         triggers: sample and cause of each trigger, at most `_MOST_TRIGGERS`.
         further: number of triggers beyond those listed.
@@ -52,13 +52,13 @@ class Snapshot:
 
 
 def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return first sample and number of samples of a snapshot (0 if it was never closed); None for a whole run.
+    """Return the first sample and the number of samples of a snapshot (0 if it was never closed); None for a whole run.
 
     Args:
-        about: strings from the metadata of the bag.
+        about: strings from the bag's metadata.
 
     Raises:
-        InputError: the snapshot entry is not in the format of the recorder.
+        InputError: the snapshot entry is not in the recorder's format.
     """
     text = about.get(SNAPSHOT)
     if text is None:
@@ -79,10 +79,10 @@ def first_sample(about: Mapping[str, str]) -> int:
     """Return the first sample of a bag: 0, or the beginning of a snapshot.
 
     Args:
-        about: strings from the metadata of the bag.
+        about: strings from the bag's metadata.
 
     Raises:
-        InputError: the snapshot entry is not in the format of the recorder.
+        InputError: the snapshot entry is not in the recorder's format.
     """
     span = span_of(about)
     return span[0] if span else 0

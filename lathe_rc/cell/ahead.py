@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compilation of the steps of stages ahead of a run, once per machine, on all cores.
+"""Compilation of the steps of stages before a run, once per computer, on all cores.
 
-Numba compiles one function at a time, so several processes are used: each gets some stages and reports each one.
-The compiled code is cached on disk, where later runs find it.
+Numba compiles one function at a time, so several processes are used: each is sent some of the stages, and reports each
+one that it has compiled. The compiled code is cached on disk, where later runs find it.
 """
 
 import contextlib
@@ -29,14 +29,14 @@ _REFUSED = "refused: "  # prefix of the answer for a stage whose step cannot be 
 
 
 def uncompiled(stages: Iterable[Stage]) -> list[Stage]:
-    """Return the stages whose steps are not compiled on this machine; the first of those with an equal step."""
-    # Reversed, so that of stages with equal steps the first stays in the dictionary.
+    """Return the stages whose steps are not compiled on this computer; of stages with equal steps, only the first."""
+    # Reversed, so that the first of the stages with equal steps stays in the dictionary.
     steps = {stage.native().name: stage for stage in reversed(list(stages)) if stage.is_compiled}
     return [stage for name, stage in reversed(steps.items()) if not is_kept(name)]
 
 
 def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
-    """Compile the steps of stages that are not compiled on this machine.
+    """Compile those steps of stages that are not yet compiled on this computer.
 
     Yields:
         The names of the remaining stages, before the first compilation and after each but the last.
@@ -45,7 +45,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         InputError: a step cannot be compiled.
         LatheError: a compiling process has exited.
     """
-    # The longest first, so that all processes end at about the same time: the larger its memory, the more a step does.
+    # The longest steps come first, so that all processes end at about the same time; larger memory means a longer step.
     missing = sorted(uncompiled(stages), key=lambda stage: -stage.native().words.size)
     numbered = enumerate(missing if missing and can_keep() else [])
     waiting = deque(numbered)
@@ -56,7 +56,7 @@ def compile_ahead(stages: Iterable[Stage]) -> Iterator[list[str]]:
         threading.Thread(target=_have_compiled, args=(process, waiting, done), daemon=True).start()
     try:
         if left:
-            compile_loop()  # meanwhile
+            compile_loop()  # while the processes compile the steps
         while left:
             yield list(left.values())
             number, told = done.get()
@@ -81,7 +81,7 @@ def _start() -> "subprocess.Popen[str]":
 def _have_compiled(
     process: "subprocess.Popen[str]", waiting: deque[tuple[int, Stage]], done: "queue.SimpleQueue[tuple[int, str]]"
 ) -> None:
-    """Send stages to a process one by one; ``done`` receives its answers, and an empty one if it has exited."""
+    """Send stages to a process one by one; ``done`` receives the answers, or an empty one if the process has exited."""
     assert process.stdin is not None, "it is a pipe"
     assert process.stdout is not None, "the same"
     with contextlib.suppress(IndexError):  # no more stages are waiting

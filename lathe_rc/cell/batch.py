@@ -7,8 +7,8 @@
         print(outcome.kept.rms[-1])
 
 Results are bit-identical to those of single runs, although consecutive cells share unchanged parts (`CellRunner`).
-Only the requested signals are kept, and each cell is created just before its run, so that the memory that
-a batch takes does not depend on the number of cells.
+Only the requested signals are kept, and each cell is created just before its run, so that the memory required by a
+batch does not depend on the number of cells.
 """
 
 import os
@@ -37,22 +37,22 @@ _AHEAD = 2  # cells created ahead for each thread
 
 
 class Keeper(Sink, Protocol[K_co]):
-    """Sink that keeps the requested part of a run; the cell's stages run again in the next one."""
+    """Sink that keeps the requested part of a run; the cell's stages may be reused in the next run."""
 
     @property
     def heard(self) -> Collection[str]:
         """Relative topics, or single fields ``TOPIC.FIELD``, that the sink receives; no others are kept."""
 
     def kept(self) -> K_co:
-        """Return the kept result at the end of the run."""
+        """Return the result to keep, at the end of the run."""
 
 
-Make = Callable[[Cell, int], Keeper[K_co]]  #: makes a keeper for a cell and so many samples
+Make = Callable[[Cell, int], Keeper[K_co]]  #: factory of the keeper for a cell and a number of samples
 
 
 @dataclass(frozen=True)
 class Outcome(Generic[K_co]):
-    """Outcome of the run of a cell.
+    """Outcome of a cell's run.
 
     Attributes:
         scenario: scenario of the cell.
@@ -87,10 +87,10 @@ def run_many(
     """Run cells to completion, in parallel.
 
     Args:
-        scenarios: scenarios of the cells, read lazily; each needs a number of revolutions. Variations
-            of a `Scenario.named` are created in half the time.
-        keep: the part of a run that is kept: None: form error by revolution; relative topics: all their samples; or a
-            factory of the `Keeper` for a cell and a number of samples.
+        scenarios: scenarios of the cells, read lazily; each needs a number of revolutions. Variations of a
+            `Scenario.named` are created in half the time.
+        keep: the part of each run that is kept. None: the form error by revolution; relative topics: all samples of
+            these; or a factory of the `Keeper` for a cell and a number of samples.
         threads: number of computing threads; None: one per core.
 
     Yields:
@@ -114,7 +114,7 @@ def run_many(
     make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
-    # One runner per thread; a deque lends and takes them back without a lock.
+    # There is one runner per thread; a deque hands out runners and takes them back without a lock.
     pool, idle = ThreadPoolExecutor(count), deque(CellRunner() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
@@ -129,7 +129,7 @@ def run_many(
 
 
 class CellRunner:
-    """Sequential runner of cells; cells that are alike share the engine and the unchanged stages."""
+    """Sequential runner of cells; similar cells share the engine and the unchanged stages."""
 
     def __init__(self) -> None:
         self._stages = StageCache()

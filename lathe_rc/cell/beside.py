@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes outside the cell: they compute no samples, and no member waits for them."""
+"""Parameters of nodes outside the cell, which compute no samples and for which no member waits."""
 
 from typing import Annotated, Literal
 
@@ -8,9 +8,9 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell.parameters import NonNegative, Table, parameter
 
 REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER = "replayer", "rerun_bridge", "topic_recorder"  #: kinds of node
-REPLAYED_FILES = "lathe-replay-"  #: begins the name of the temporary folder with the files of a replayed bag
-RERUN_RATE = 2000.0  #: points of a curve in a second
-RERUN_PORT = 9090  #: of the web page
+REPLAYED_FILES = "lathe-replay-"  #: prefix of the temporary folder that contains the files of a replayed bag
+RERUN_RATE = 2000.0  #: points of a curve per second
+RERUN_PORT = 9090  #: port of the web page
 
 RerunOutput = Literal["spawn", "serve", "connect", "save"]
 

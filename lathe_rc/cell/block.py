@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a cell's members: blocks of samples, and messages at chosen samples."""
+"""Messages of a cell's members: blocks of samples, and messages at individual samples."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from lathe_rc.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _MOST_FIELDS = 16
 _ZEROS = np.zeros(_MOST_FIELDS * (MAX_BLOCK + 1))
-_AT_ONCE = 8192  # numbers allocated at once, if these are several blocks
+_AT_ONCE = 8192  # numbers allocated at once, unless a single block is larger
 
 
 @dataclass(slots=True)
@@ -50,7 +50,7 @@ class Block:
         """Copy the samples into arrays of shape (samples,), by field.
 
         Raises:
-            ValueError: a sample is NaN or infinite, if ``check`` is set.
+            ValueError: ``check`` is set, and a sample is NaN or infinite.
         """
         for name, array in signals.items():
             array[:] = self.signals[name]
@@ -93,9 +93,9 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
         first: index of the first sample.
 
     Raises:
-        NotFiniteError: a sample is NaN or infinite; the error holds the first.
+        NotFiniteError: a sample is NaN or infinite; the error describes the first one.
     """
-    # 0 times anything finite is 0, and NaN otherwise: one product checks the whole block.
+    # 0 times a finite number is 0, and NaN otherwise, so one product checks the whole block.
     if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
         bad = int(np.flatnonzero(~np.isfinite(array))[0])
         index = first + bad
@@ -103,10 +103,10 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
 
 
 class Pool:
-    """Memory pool for the samples of blocks of one type.
+    """Memory pool for the samples of blocks of one message type.
 
-    Readers in the same process may keep the arrays as long as needed, so each block needs memory of its
-    own; allocating it for several blocks at once takes 25 % of the time.
+    Readers in the same process may keep the arrays as long as needed, so each block needs its own memory; allocating
+    memory for several blocks at once takes 25 % of the time.
 
     Args:
         msgtype: message type.
@@ -119,7 +119,7 @@ class Pool:
         self._free: list[Samples] = []
 
     def take(self, samples: int) -> tuple[Signals, Samples | None]:
-        """Return uninitialised arrays of shape (samples,) by field, and one array of all if they share a type."""
+        """Return uninitialised arrays of shape (samples,) by field, and one array of all if they have the same type."""
         if not self._uniform:
             return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
         if not self._free or samples != self._samples:
@@ -134,7 +134,7 @@ class Framer:
     """Factory of the sparse messages of one node.
 
     Args:
-        run_id: identity of the run.
+        run_id: ID of the run.
         source: fully qualified name of the node.
         step_ns: sampling step [ns].
 
@@ -147,7 +147,7 @@ class Framer:
         self.companions = 0
 
     def sparse(self, message: Sparse) -> Any:
-        """Return a message at a chosen sample, and count it, since blocks report the number of preceding messages."""
+        """Return a message at an individual sample and count it, since a block reports how many messages precede it."""
         self.companions += 1
         head = messages.header(message.index, self._step_ns)
         kind = messages.store().types[message.type]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Error budget of a scenario: contributions to its form error, from runs with causes switched off."""
+"""Error budget of a scenario: contributions to the form error, determined by runs with causes switched off."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -27,12 +27,12 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
-_PREFIXES = ("", "coarse_", "fine_", "cut_")  # of parameters; stages composed of several devices use prefixes
-_FACTOR = 0.9  # largest factor of a cycle for a flat Q, unless the scenario's own Q has a larger one
-_CONVERGES = 0.98  # upper limit: the scenario may run with allow_unstable
+_PREFIXES = ("", "coarse_", "fine_", "cut_")  # parameter prefixes of stages composed of several devices
+_FACTOR = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
+_CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
 
 _Off = Mapping[str, Value]
-#: Parameters of nodes with a table of some kind that are a cause, with the values that switch it off.
+#: Parameters by cause, in nodes with a table of a given kind, with the values that switch the cause off.
 _CAUSES: Mapping[str, tuple[type[NodeParameters], _Off]] = {
     "force": (NodeParameters, {"deflects": False, "cross_slide": False, "radial_ratio": 0.0}),
     "load": (LoadedSpindleParameters, {"part_radius": 0.0}),
@@ -55,7 +55,7 @@ _CAUSES: Mapping[str, tuple[type[NodeParameters], _Off]] = {
     ),
     "faults": (NodeParameters, {"faults": []}),
 }
-#: Of these causes, those that make one revolution differ from the next.
+#: The causes that make one revolution differ from the next.
 _CHANGING = {name: _CAUSES[name][1] for name in ("noise", "quantisation", "vibration")}
 _CONSTANT = ("harmonics", "polygon")  # profiles that are constant along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
@@ -66,8 +66,8 @@ class Cause:
     """Cause of form error that can be switched off.
 
     Attributes:
-        off: parameter values that switch it off, by NODE.PARAM.
-        needs: cause without which it has no effect; empty: none.
+        off: parameter values that switch the cause off, by NODE.PARAM.
+        needs: another cause without which this one has no effect; empty if there is none.
     """
 
     off: Mapping[str, Value]
@@ -79,8 +79,8 @@ class _Tail:
     """Last revolutions of a run.
 
     Attributes:
-        whole: number of complete revolutions of the run.
-        error: form error over even angles [m], shape (revolutions, points).
+        whole: number of complete revolutions in the run.
+        error: form error at equally spaced angles [m], shape (revolutions, points).
         height: height of the tool along the part [m], shape (samples,).
     """
 
@@ -111,7 +111,7 @@ class _Keep:
         angle = self._kept["angle"]
         if angle.size < 2:
             return _Tail(0, np.empty((0, 0)), angle)
-        # One revolution more than reported, for the spline; the last may lack two samples.
+        # Keep one revolution more than reported, for the spline; the last one may lack two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
         error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
@@ -125,7 +125,7 @@ def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value
 
 
 def _simple(scenario: Scenario) -> dict[str, Cause]:
-    """Return the causes that parameter values switch off."""
+    """Return the causes that fixed parameter values switch off."""
     return {
         name: Cause(
             {
@@ -146,7 +146,7 @@ def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
 
 
 def _speed(scenario: Scenario) -> dict[str, Cause]:
-    """Return the cause of a varying speed and the lead that follows it; off is the exact preview of the speed law."""
+    """Return the causes ``speed`` (it varies) and ``lead`` (it follows the speed; off: exact preview of the speed)."""
     (master,) = scenario.masters
     law, learners = scenario.nodes[master], _learners(scenario)
     if not isinstance(law, SpeedLawParameters):
@@ -163,7 +163,7 @@ def _speed(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
-    """Return the cause of a form that changes along the part; off, the tool stays at the middle reported height."""
+    """Return the cause ``feed``: the form changes along the part. Off: the tool stays at the middle reported height."""
     forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
     off: dict[str, Value] = {}
     for node, table in forms.items():
@@ -175,7 +175,7 @@ def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
 
 
 def _model(scenario: Scenario) -> dict[str, Cause]:
-    """Return the cause of a correction whose model differs from the drive."""
+    """Return the cause ``model``: the model of a correction differs from the drive."""
     off: dict[str, Value] = {}
     for node, table in _learners(scenario).items():
         if table.correction not in ("none", "lead_lag"):
@@ -184,7 +184,7 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
 
 
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
-    """Return the cause of a Q below 1; off, each Q is 1 as far as its channel converges with it."""
+    """Return the cause ``Q floor``: Q is below 1. Off: each Q is 1 as far as its channel then converges."""
     off: dict[str, Value] = {}
     low, high = cell.speed_range
     for stage in cell.stages.values():
@@ -231,7 +231,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
         height: height of the tool along the part in the reported revolutions [m].
 
     Returns:
-        The causes, each after its prerequisite; and the causes that cannot be switched off, with the reason.
+        The causes, each after its prerequisite; and the causes that cannot be switched off, with the reasons.
     """
     left_out: dict[str, str] = {}
     found = {
@@ -256,7 +256,7 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
 
 
 def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Scenario:
-    """Return the scenario with only some causes active; causes that need an inactive one stay unchanged."""
+    """Return the scenario with only some causes active; causes that need an inactive one are left unchanged."""
     off: dict[str, Value] = {}
     for name, cause in found.items():
         if name not in acting and (not cause.needs or cause.needs in acting):
@@ -280,16 +280,16 @@ def budget(
 ) -> Budget:
     """Return the error budget of a scenario in its last ten revolutions (see `lathe_rc.analysis.budget`).
 
-    The scenario runs offline, as a batch, with one cause after the other switched off: about 10 runs, or 30 if causes
-    act together.
+    The scenario runs offline, as a batch, with one cause after another switched off: about 10 runs, or 30 if causes
+    interact.
 
     Args:
-        scenario: scenario with all causes; its spindle must have a number of revolutions.
+        scenario: scenario with all causes active; its spindle must have a number of revolutions.
         threads: number of computing threads; None: one per core.
         watch: called after each run with the number of completed runs and the known total.
 
     Raises:
-        InputError: the scenario is invalid, has no tool, or no complete revolution.
+        InputError: the scenario is invalid, or it has no tool or no complete revolution.
         LatheError: a run failed.
 
     Example:

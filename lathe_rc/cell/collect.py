@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Storage of the signals of an offline run in memory."""
+"""In-memory storage of the signals of an offline run."""
 
 import contextlib
 import math
@@ -20,7 +20,7 @@ from lathe_rc.names import instead
 
 
 def _free_memory() -> int:
-    """Return the memory available without swapping [B]; all memory where the system does not report it."""
+    """Return the memory available without swapping [B], or the total memory if the system does not report it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             name, _, size = line.partition(":")
@@ -30,10 +30,11 @@ def _free_memory() -> int:
 
 
 def check_room(cell: Cell) -> None:
-    """Check that the memory of this machine suffices for all signals, needed for form errors and digests.
+    """Check that this computer has enough memory for all signals, which form errors and digests need.
 
     Raises:
-        InputError: memory is insufficient; the message gives need, available memory, and the longest run.
+        InputError: there is not enough memory; the message states the memory required and available, and the longest
+            possible run.
     """
     fields = [messages.sample_fields(source.type).values() for source in cell.dense.values()]
     needed = cell.expected_samples * sum(np.dtype(kind).itemsize for kinds in fields for kind in kinds)
@@ -75,7 +76,7 @@ class Collector:
         }
         for signals in self._dense.values():
             for array in signals.values():
-                array.fill(0)  # touches the memory now: page faults would cost 25 % of the run
+                array.fill(0)  # touches the memory now: page faults would take 25 % of the run
         self._sparse: dict[str, list[Sparse]] = {topic: [] for topic in self._sources if topic in cell.sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -87,7 +88,7 @@ class Collector:
             kept.extend(sparse.get(topic, ()))
 
     def recording(self) -> Recording:
-        """Recording of the collected signals, by fully qualified topic."""
+        """Return a recording of the collected signals, by fully qualified topic."""
         sparse = {}
         for topic, found in self._sparse.items():
             part = sparse[f"/{topic}"] = SparseTopic()

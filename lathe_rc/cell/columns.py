@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signal topics as tables: columns with units, one row per sample or message."""
+"""Signal topics as tables: columns with units, and one row per sample or message."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
 
-TEXT = np.dtype(object)  #: element type of texts
+TEXT = np.dtype(object)  #: element type of strings
 _FIELD = re.compile(r"\S+\s+(\w+)\s*#(.*)")
 _UNIT = re.compile(r"\[([^\[\]]+)\]")
 
@@ -45,9 +45,9 @@ _FIRST = (Column("sample", np.dtype(np.int64)), Column("time", np.dtype(np.float
 
 @cache
 def units(msgtype: str) -> Mapping[str, str]:
-    """Return the unit by field, from the comments of the type's .msg file; ``m or N`` if it depends on the sender.
+    """Return the units by field, from the comments in the type's .msg file; ``m or N`` if it depends on the sender.
 
-    Types of other packages have no readable units.
+    For types of other packages, units are not available.
     """
     package, _, name = msgtype.partition("/msg/")
     if package != messages.PACKAGE:
@@ -59,7 +59,7 @@ def units(msgtype: str) -> Mapping[str, str]:
 
 @cache
 def columns(msgtype: str) -> tuple[Column, ...]:
-    """Return the columns of the table of a signal topic of this type."""
+    """Return the table columns of signal topics of a message type."""
     known = units(msgtype)
     if msgtype in messages.block_types():
         fields = messages.sample_fields(msgtype)
@@ -84,7 +84,7 @@ def dense_rows(first: int, signals: Signals, step_ns: int) -> dict[str, Samples]
 
 
 def sparse_rows(table: Sequence[Column], found: Sequence[Sparse], step_ns: int) -> dict[str, Samples]:
-    """Return the columns of messages at chosen samples; a message with lists has one row per element."""
+    """Return the columns of messages at individual samples; a message with lists has one row per element."""
     cells: dict[str, list[Any]] = {column.name: [] for column in table}
     for message in found:
         parts = {column.name: message.values[column.name] for column in table[len(_FIRST) :]}

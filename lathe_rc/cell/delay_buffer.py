@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Delay buffer: recent past of a topic in contiguous memory, for views of several or delayed blocks without a copy."""
+"""Delay buffer: recent past of a topic in contiguous memory, for views of several or delayed blocks without copying."""
 
 from collections.abc import Iterable, Mapping
 from math import ceil
@@ -16,7 +16,7 @@ _VIEWS = 256  # largest number of cached views
 
 
 def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
-    """Return the longest delay [sample] at which each field is read by the given ports."""
+    """Return the longest delay [sample] with which the given ports read each field."""
     delays: dict[str, int] = {}
     for port in ports:
         for name in port.fields:
@@ -31,7 +31,7 @@ class DelayBuffer:
 
     Args:
         msgtype: message type of the topic.
-        delays: longest delay at which each field is read [sample]; other fields are not kept.
+        delays: longest delay with which each field is read [sample]; other fields are not kept.
         longest: largest number of samples added or viewed at once.
 
     Attributes:
@@ -50,7 +50,7 @@ class DelayBuffer:
         self.end = 0  #: index after the newest sample
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the pickled state, without array views, which would be pickled as copies."""
+        """Return the state to be pickled, without array views, which would be pickled as copies."""
         return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
 
     def _at(self, start: int, samples: int) -> Signals:
@@ -66,7 +66,7 @@ class DelayBuffer:
     def extend(self, samples: int) -> Signals:
         """Return views of ``samples`` new samples, for the caller to fill."""
         if self.end + samples - self._base > self._capacity:
-            # The kept samples move to the start, once per several times their number.
+            # The kept samples are moved to the start, but only after several times as many new samples.
             shift = self.end - self._kept - self._base
             for array in self._arrays.values():
                 array[: self._kept] = array[shift : shift + self._kept]

@@ -21,21 +21,22 @@ K = TypeVar("K")
 
 
 class Sink(Protocol):
-    """Sink for the results of a run, chunk by chunk, in order."""
+    """Sink that receives the results of a run in order, chunk by chunk."""
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Process the samples of each requested topic starting at ``first``, and their sparse messages."""
+        """Process the samples of each requested topic from ``first`` on, and the sparse messages at these samples."""
 
 
 class Engine:
     """Engine that runs a cell offline, as fast as possible.
 
-    A stage computes as many samples per call as the shortest feedback allows, independent of ``block_size``; sinks get
-    whole blocks, which can be cut into the messages of any other host. The results depend on neither.
+    A stage computes as many samples per call as the shortest feedback allows, independent of ``block_size``; sinks
+    receive whole blocks, which can be divided into the messages of any other host. The results depend neither on the
+    number of samples per call nor on ``block_size``.
 
     Args:
         cell: the wired cell; must have passed its check.
-        heard: relative topics requested by the sinks, or ``TOPIC.FIELD`` for one field of signals; None: all.
+        heard: relative topics requested by the sinks, or ``TOPIC.FIELD`` for a single field of a topic; None: all.
             Other signals are not kept, and other sparse messages are not created.
 
     Raises:
@@ -44,7 +45,7 @@ class Engine:
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
-        # Whole chunks, and so whole blocks: no sink gets a partial block.
+        # Whole chunks, and thus whole blocks: no sink receives a partial block.
         self._piece = MAX_BLOCK // self._chunk * self._chunk
         self._heard = _heard(cell, heard)
         self._take(cell)
@@ -74,10 +75,11 @@ class Engine:
             stage.unheard = {topic for name, topic in names.items() if name not in self._heard}
 
     def begin(self, cell: Cell, heard: Collection[str] | None = None) -> bool:
-        """Restart with another cell, which has passed its check.
+        """Restart with another cell, which must have passed its check.
 
         Returns:
-            Whether the restart is possible: wiring and requested topics must equal those of the previous cell.
+            Whether the restart is possible: wiring, block size and requested topics must equal those of the previous
+            cell.
         """
         block = cell.master.shared.block_size
         # Cells with equal ports share one `Wiring`, so that comparing identities suffices.
@@ -106,14 +108,14 @@ class Engine:
             gc.unfreeze()
 
     def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
-        """Run chunk by chunk, yielding the sample index after each chunk; raise as `run`."""
+        """Run chunk by chunk, yielding the sample index after each chunk; raise the same errors as `run`."""
         for first in range(0, self.samples, self._piece):
             self._tapes.advance(first)
             broken = False
             try:
                 broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
             finally:
-                # After a NaN or infinite sample the chunk is useless to sinks; after an error it is not.
+                # A chunk with a NaN or infinite sample is useless to sinks, unlike the samples before another error.
                 if not broken:
                     self._hand_over(first, self._program.reached, sinks)
             if broken:
@@ -121,7 +123,7 @@ class Engine:
             yield self._program.reached
 
     def _break_off(self) -> NoReturn:
-        """Raise an error that names the first NaN or infinite sample, which is in the newest chunk, as nodes do."""
+        """Raise the error that a node would raise: it names the first NaN or infinite sample, in the newest chunk."""
         found: list[tuple[int, int, str]] = []
         end = self._program.reached
         first = (end - 1) // self._chunk * self._chunk
@@ -145,7 +147,7 @@ class Engine:
                 for topic, names in kept.items()
             ]
             dense.update(zip(kept, outputs, strict=True))
-            # After a failure of a stage, the stages before it are further ahead.
+            # If a stage has failed, the stages before it have advanced further.
             said, last = self._program.said(number, end), end == self.samples
             if said or last or stage.tells_joints:
                 for message in stage.conclude(first, end, said, outputs, last=last):

@@ -35,7 +35,7 @@ def with_spindle(
 
     Args:
         table: columns of the table.
-        rows: values of the columns, shape (rows,), in this order.
+        rows: values of the columns, shape (rows,), in the order of ``table``.
         angle: true angle of the spindle in each row [rad], shape (rows,).
     """
     turns = np.floor(angle / (2.0 * np.pi))

@@ -12,7 +12,7 @@ _SPARE, _FREE_RUNNING = 32, 2080  # messages
 
 
 def signal_depth(shared: SharedParameters) -> int:
-    """Return the queue length of signal topics: all blocks in flight with a reserve; large without flow control.
+    """Return the queue length of signal topics: all blocks in flight plus a reserve; large without flow control.
 
     A publisher may be one window ahead, and a reader that replaces a dead one starts two windows back.
     """
@@ -23,10 +23,10 @@ class HostTopic(NamedTuple):
     """Topic other than a signal: it carries wall time, or the progress of the run, and is not part of a digest.
 
     Attributes:
-        name: relative, or absolute where the whole ROS domain shares it.
+        name: name of the topic: relative, or absolute if the whole ROS domain shares the topic.
         type: message type.
         depth: queue length that publishers offer.
-        durability: ``transient local`` (late readers get the newest messages), or ``volatile``.
+        durability: ``transient local`` (late readers receive the newest messages), or ``volatile``.
         publishers: kinds of node that publish it.
         subscribers: kinds of node that read it.
         doc: purpose of the topic.

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 BINS = 32
-LATENESS = (
-    "lateness of blocks"  #: key in a report: from the moment at which a block was due to that at which it was let go
-)
-PERCENT = (50, 95, 99)  #: of the blocks of a run, whose lateness is told
-LATENCY = "latency of blocks"  #: from there until every member has completed it
-_EXACT_BITS = 6  # of a duration in µs
+LATENESS = "lateness of blocks"  #: key in a report: time from when a block was due until its release
+PERCENT = (50, 95, 99)  #: percentages of the blocks of a run for which the lateness is reported
+LATENCY = "latency of blocks"  #: key in a report: time from a block's release until every member has completed it
+_EXACT_BITS = 6  # leading bits that are kept of a duration in µs
 _TEXT = re.compile(r"(?:[0-9]{1,2}:[0-9]{1,15})(?: [0-9]{1,2}:[0-9]{1,15})*")
 
 
@@ -20,15 +18,15 @@ class Durations:
     """Histogram of durations with bins of powers of 2 µs.
 
     Attributes:
-        counts: number of durations in each bin, shape (`BINS`,): bin 0 below 1 µs, bin b from 2^(b-1) to 2^b µs; the
-            last bin has all longer ones.
+        counts: number of durations in each bin, shape (`BINS`,): bin 0 is below 1 µs, bin b from 2^(b-1) to 2^b µs; the
+            last bin also contains all longer durations.
     """
 
     def __init__(self) -> None:
         self.counts = [0] * BINS
 
     def add(self, seconds: float, count: int = 1) -> None:
-        """Count ``count`` equal durations [s], not negative."""
+        """Count ``count`` equal durations [s], which must not be negative."""
         self.counts[min(int(seconds * 1e6).bit_length(), BINS - 1)] += count
 
     def __str__(self) -> str:
@@ -62,7 +60,7 @@ class Lateness:
         late: number of blocks released after the due time of the next one.
         worst: largest lateness [s].
         within: percentiles of the lateness [s], by per cent of the blocks.
-        slipped: delay that the schedule did not catch up [s].
+        slipped: delay of the schedule that was not made up for [s].
     """
 
     blocks: int
@@ -73,7 +71,7 @@ class Lateness:
 
 
 class Percentiles:
-    """Percentiles of durations in constant memory, by counts per size; values are up to 3 % too large.
+    """Percentiles of durations in constant memory, from counts of rounded durations; values are up to 3 % too large.
 
     Attributes:
         count: number of durations.
@@ -85,7 +83,7 @@ class Percentiles:
         self._counts: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """Count a duration [s], not negative."""
+        """Count a duration [s], which must not be negative."""
         self.count += 1
         self.worst = max(self.worst, seconds)
         microseconds = int(seconds * 1e6)

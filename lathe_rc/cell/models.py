@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller models of drive, form and encoder, taken from the nodes unless the scenario gives others.
+"""Controllers' models of drive, form and encoder, taken from the nodes unless the scenario gives others.
 
-A parameter that `lathe_rc.cell.parameters.parameter` marks with a quantity of the drive, and that is not set,
-gets the value of the drive that reads the controller's command. Quantities with the same word before a dot belong
-together: a scenario gives all of them or none. The parameters that a table ``asks`` for are provided likewise by the
-node that has them.
+If a parameter that `lathe_rc.cell.parameters.parameter` marks with a drive quantity is not set, its value is that of
+the drive that reads the controller's command. Quantities with the same word before a dot belong together: a scenario
+gives all of them or none. The parameters that a table ``asks`` for are provided in the same way by the node that has
+them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ def _marked(table: type[NodeParameters]) -> Mapping[str, str]:
 
 
 def _together(quantity: str) -> str:
-    """Return the group of a quantity; the quantity itself without a group."""
+    """Return the group of a quantity, or the quantity itself if it has no group."""
     return quantity.partition(".")[0]
 
 
@@ -36,7 +36,7 @@ def _not_given(table: NodeParameters) -> Mapping[str, str]:
 
 
 def _drives(tables: Mapping[str, NodeParameters], topic: str) -> Iterator[tuple[str, Mapping[str, Quantity]]]:
-    """Return names and quantities of the drives that read a topic."""
+    """Yield the names and quantities of the drives that read a topic."""
     for node, table in tables.items():
         for command, known in table.drive_models().items():
             if remapped(table, command) == topic:
@@ -78,14 +78,14 @@ def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
 
 
 def given(table: NodeParameters) -> NodeParameters:
-    """Return a copy of the table whose models count as given."""
+    """Return a copy of a table, in which the models count as given."""
     made = table.model_copy()
     made.model_fields_set.update(_marked(type(table)))
     return made
 
 
 def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
-    """Return the tables of a cell by node, with the missing models filled in; these count as not given.
+    """Return the tables of a cell by node, with the missing models filled in; these models count as not given.
 
     Raises:
         InputError: several drives are commanded, and a missing model cannot match all of them.
@@ -95,13 +95,13 @@ def resolved(tables: Mapping[str, NodeParameters]) -> dict[str, NodeParameters]:
         values: dict[str, Value] = {**_model(node, table, tables), **_known(node, table, tables)}
         if any(getattr(table, name) != value for name, value in values.items()):
             made[node] = table.model_copy(update=values)
-            # These still count as not given: another drive in a variation changes them again.
+            # These values still count as not given: another drive in a variation changes them again.
             made[node].model_fields_set.difference_update(values)
     return made
 
 
 def of_drives(node: str, tables: Mapping[str, NodeParameters]) -> dict[str, Quantity]:
-    """Return the default model of a node, ignoring values given in the scenario, by parameter.
+    """Return the default model of a node by parameter, ignoring the values given in the scenario.
 
     Raises:
         InputError: see `resolved`.

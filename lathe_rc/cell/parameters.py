@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter tables: definition of each parameter with type, default, range, unit and description.
+"""Parameter tables, which define the type, default, range, unit and description of each parameter.
 
 ROS descriptors, validation, help and the documentation are generated from these tables.
 """
@@ -22,15 +22,15 @@ from lathe_rc.extensions import Named
 from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
 
-NonNegative = Annotated[float, Ge(0)]  #: most quantities, and those that 0 switches off
-Positive = Annotated[float, Gt(0)]  #: what something is divided by
+NonNegative = Annotated[float, Ge(0)]  #: most quantities, including those that 0 switches off
+Positive = Annotated[float, Gt(0)]  #: quantities that are used as divisors
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
 T = TypeVar("T", bound="Table")
 
-_LONGEST = 60  # characters of a value in a summary
-_FAR = 1e9  # ratio to the default, or its inverse, from which floating point may fail
+_LONGEST = 60  # maximum length of a value in a summary [characters]
+_FAR = 1e9  # ratio of a value to its default, or the inverse, from which floating point may fail
 _HUGE = 1e12  # magnitude from which floating point may fail, if the default is 0
 _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
 
@@ -38,8 +38,8 @@ _NAMES = {bool: "true or false", int: "an integer", float: "a finite number", st
 def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, drive: str = "") -> Any:
     """Define a field of a parameter table; ``path`` marks a file name relative to the scenario's folder.
 
-    ``drive`` marks a controller's model of a quantity of the commanded drive, by the name of the quantity in
-    `NodeParameters.drive_models`; its default is the drive's value (`lathe_rc.cell.models`).
+    ``drive`` marks a parameter as a controller's model of a quantity of the commanded drive, named as in
+    `NodeParameters.drive_models`; the default of such a parameter is the drive's value (`lathe_rc.cell.models`).
 
     Ranges are part of the annotation.
 
@@ -61,13 +61,13 @@ class Row:
     Attributes:
         name: parameter name.
         type: type of the value, or of its elements.
-        is_list: whether it is an array.
+        is_list: whether the value is an array.
         choices: allowed strings; empty if unrestricted.
         is_file: whether the value is a path, relative to the scenario or not.
-        named: kind of third-party classes that may be named as well; None: none.
-        low, high: range of a number, infinite if unlimited; ``limits`` tells whether the ends are included.
-        limits: the range in words, empty where there is none.
-        drive: quantity of the commanded drive that the parameter models, see `parameter`; empty: none.
+        named: kind of third-party classes that may be named as well; None if there is none.
+        low, high: range of a number, infinite if unlimited; ``limits`` states whether the ends are included.
+        limits: the range in words; empty if there is none.
+        drive: quantity of the commanded drive that the parameter models (see `parameter`); empty if there is none.
     """
 
     def __init__(self, name: str, info: FieldInfo) -> None:
@@ -108,7 +108,7 @@ class Row:
         self.limits = " ".join(words)
 
     def element(self) -> "Row":
-        """Return the row of one element of a list parameter."""
+        """Return the row for a single element of a list parameter."""
         found = copy.copy(self)
         found.is_list = False
         return found
@@ -152,14 +152,14 @@ class Table(BaseModel):
 
     @classmethod
     def read(cls: type[T], node: str, values: Mapping[str, object]) -> T:
-        """Build the table from values by parameter name; missing ones get their defaults.
+        """Build the table from values by parameter name; missing parameters take their defaults.
 
         Raises:
-            InputError: a value is invalid; one line for the first, with the name ``node``.
+            InputError: a value is invalid; the one-line message describes the first such value and names ``node``.
         """
         try:
             return cls(**values)
-        except InputError as error:  # of a `model_post_init`, whose messages begin with a parameter, or of a class
+        except InputError as error:  # from a `model_post_init`, whose messages begin with a parameter, or from a class
             dot = "." if str(error).partition(" ")[0] in cls.model_fields else ": "
             raise InputError(f"{node}{dot}{error}") from None
         except ValidationError as error:
@@ -175,12 +175,12 @@ class Table(BaseModel):
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
     def changed(self: T, node: str, values: Mapping[str, object]) -> T:
-        """Return a copy of the table with other values; raises as `read`."""
+        """Return a copy of the table with other values; raise the same errors as `read`."""
         kind = type(self)
         checks = kind.__pydantic_decorators__  # validators of third-party tables may use all values
         if not (checks.field_validators or checks.model_validators):
             try:
-                # Checks only the changed values: in a batch, cells differ in a few.
+                # Only the changed values are checked: the cells of a batch differ in a few values.
                 found = self.model_copy(update={name: _check(kind, name)(value) for name, value in values.items()})
                 found.model_post_init(None)
             except (KeyError, InputError, ValidationError):
@@ -206,7 +206,7 @@ def _check(table: type[Table], name: str) -> Callable[[object], Any]:
 def about(node: str, *names: str) -> Iterator[None]:
     """Prefix errors with the names of the parameters at fault, as ``node.a, b: ...``, unless already prefixed.
 
-    Physics and control code is independent of parameters; the stage that builds it from a table knows them.
+    Physics and control code is independent of parameter names; the stage that passes values from a table knows them.
     """
     try:
         yield
@@ -228,7 +228,7 @@ def _rows(table: type[Table]) -> Mapping[str, Row]:
 
 
 class SharedParameters(Table):
-    """Parameters shared by all nodes of a cell, which may stand under ``/**`` in a parameter file."""
+    """Parameters shared by all nodes of a cell, which may be set under ``/**`` in a parameter file."""
 
     sample_rate: Annotated[int, Ge(1000), Le(1_000_000)] = parameter(
         64_000, "sampling rate of the cell; the step must be a whole number of nanoseconds", "Hz"
@@ -279,7 +279,7 @@ class NodeParameters(SharedParameters):
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
-    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters of the node that knows them, unless given
+    asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters taken from the node that knows them, unless given
     judging: ClassVar[frozenset[str]] = frozenset()
 
     stage: str = parameter("", "what the node is; empty: its name says it")
@@ -309,11 +309,11 @@ class NodeParameters(SharedParameters):
         return ""
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Drive quantities available to controllers, by command topic before remapping and by quantity."""
+        """Return the drive quantities available to controllers, by command topic before remapping and by quantity."""
         return {}
 
     def known(self) -> Mapping[str, Value]:
-        """Values of the node that other nodes may use, by their parameter name."""
+        """Return the values of the node that other nodes may use, by parameter name."""
         return {}
 
 
@@ -326,7 +326,7 @@ class ObedientParameters(NodeParameters):
 
 
 class RestartParameters(NodeParameters):
-    """Parameters of a node that another process may replace in mid-run."""
+    """Parameters of a node that another process may replace during a run."""
 
     restart_file: str = parameter(
         "", "the node's state is kept in this file, and another process of it goes on from there; empty: it is not"

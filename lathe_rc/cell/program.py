@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Program of a cell: the steps of its stages, in order, block after block, as one compiled loop.
 
-The loop returns where Python is needed (request of a stage, event due, no compiled step), and later continues
-at that stage and sample.
+The loop returns when Python is needed (a stage requests it, an event is due, or a step is not compiled), and later
+continues at that stage and sample.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -24,15 +24,15 @@ _CHUNK = 1024  # largest number of samples per call of a stage, so that signals 
 class Tapes:
     """Tapes: sample buffers of topics, filled chunk by chunk, with the past samples needed by delayed readers.
 
-    Before sample 0 everything is zero. Fields used only within a chunk are buffered for one chunk, which stays in the
-    cache.
+    Before sample 0 everything is zero. For fields used only within a chunk, a single chunk is buffered, which stays in
+    the cache.
 
     Args:
-        topics: message type and, by field, the longest delay [sample] at which it is read, by relative topic.
-        samples: largest length of the buffered interval.
-        passing: fields, with their topics, whose samples are not needed after the chunk in which they were computed,
+        topics: by relative topic, the message type and, by field, the longest delay [sample] with which it is read.
+        samples: maximum length of the buffered interval.
+        passing: fields, with their topics, whose samples are not needed after the chunk in which they are computed,
             unless a reader has a delay.
-        chunk: largest length of a chunk.
+        chunk: maximum length of a chunk.
     """
 
     def __init__(
@@ -55,12 +55,12 @@ class Tapes:
             for name, dtype in messages.sample_fields(kind).items()
         }
         self._fields = {topic: list(messages.sample_fields(kind)) for topic, (kind, _) in topics.items()}
-        self.begin = 0  #: sample index with which the piece begins
+        self.begin = 0  #: sample index at which the buffered interval begins
 
     def view(
         self, topic: str, first: int, samples: int, delay: int = 0, names: Collection[str] | None = None
     ) -> Signals:
-        """Return views of samples starting at ``first`` for a delayed reader; ``passing`` fields for one chunk only.
+        """Return views of samples from ``first`` on for a delayed reader; of ``passing`` fields, one chunk at most.
 
         Args:
             topic: relative name.
@@ -88,7 +88,7 @@ class Tapes:
         for key, delay in self._delays.items():
             if delay:
                 array, kept = self._arrays[key], slice(self.history - delay, self.history)
-                # The copy: both slices may overlap.
+                # Copied, because the slices may overlap.
                 array[kept] = array[kept.start + shift : kept.stop + shift].copy()
         self.begin = first
 
@@ -99,11 +99,11 @@ class Tapes:
         self.begin = 0
 
 
-NOT_FINITE = -3  #: why a program has stopped: a number is not finite
+NOT_FINITE = -3  #: reason why a program has stopped: a number is not finite
 _NOBODY = np.empty(0, np.int64)
 
-# Columns of the plan of the stages: address of the step or 0, address of its memory, its first field, the field with
-# the spindle angle or -1, the sample from which it needs Python.
+# Columns of the plan, which has a row for each stage: address of the step or 0, address of its memory, first field,
+# field with the spindle angle or -1, and the sample from which the stage needs Python.
 _STEP, _WORDS, _FIELD, _ANGLE, _DUE = range(5)
 
 
@@ -116,13 +116,13 @@ def _run(
     Args:
         plan: plan of the loop, terminated by an additional row.
         turn: spindle angle from which each stage needs Python [rad].
-        fields: per field the address of its first sample on the tape less the delay, the increment per sample,
+        fields: for each field, the address of its first sample on the tape minus the delay, the increment per sample,
             and the address of the current block, shape (3, fields); the addresses of a stage form its `AddressTable`.
         where: current position; updated.
         base: position of sample 0 on the tape.
         end: index after the last sample.
         chunk: number of samples that a stage computes per call.
-        told: numbers of the fields that must be finite.
+        told: indices of the fields that must be finite.
 
     Returns:
         Reason for stopping: `DONE` at the end, `NOT_FINITE` after a chunk with a NaN or infinite sample.
@@ -136,14 +136,14 @@ def _run(
         while stage < plan.shape[0] - 1:
             row = plan[stage]
             block = at.ctypes.data + 8 * row[_FIELD]
-            # Events are searched at the start of a chunk; a step that resumes inside a chunk has none in it.
+            # Events are searched for at the start of a chunk; there are none where a step resumes within a chunk.
             waits = row[_STEP] == 0 or (start == 0 and row[_DUE] < first + n)
             if start == 0 and turn[stage] < np.inf and row[_ANGLE] >= 0:
                 waits = waits or _passes(floats(block, row[_ANGLE] - row[_FIELD], n), turn[stage])
             where[0], where[1], where[2] = first, stage, start
             if waits:
                 return PYTHON
-            # An exception in a step is printed and swallowed by Numba: then the step does not write this word.
+            # Numba prints and swallows an exception in a step; in that case the step does not write this word.
             where[2] = BROKEN
             reason: int = call(row[_STEP], row[_WORDS], first, start, n, block, where.ctypes.data + 16)
             if where[2] == BROKEN:
@@ -166,14 +166,14 @@ def _finite(samples: Samples) -> bool:
     """Return whether no sample is NaN or infinite."""
     count = 0
     for k in range(samples.size):
-        # Counted to the end: the compiler vectorises a loop only if it has no early exit.
+        # All samples are counted, because the compiler vectorises a loop only if it has no early exit.
         count += not abs(samples[k]) < np.inf
     return count == 0
 
 
 @kernel
 def _passes(angle: Samples, turn: float) -> bool:
-    """Return whether an angle of rising samples, shape (n,), reaches ``turn`` [rad]; same search as NumPy's."""
+    """Return whether an increasing angle, shape (n,), reaches ``turn`` [rad]; the search is the same as in NumPy."""
     low, high = 0, angle.size
     while low < high:
         middle = low + ((high - low) >> 1)
@@ -191,7 +191,7 @@ def compile_loop() -> None:
 
 
 def chunk_of(block: int, delays: Iterable[int]) -> int:
-    """Return the chunk size [sample]: whole blocks, not above the shortest feedback delay; 0 means no feedback."""
+    """Return the chunk size [sample]: whole blocks, up to the shortest feedback delay, where 0 means no feedback."""
     most = min([_CHUNK, *(delay for delay in delays if delay)])
     return most // block * block or block
 
@@ -201,7 +201,7 @@ class Wired(NamedTuple):
 
     Attributes:
         stage: the stage.
-        inputs: tape of each input, and its delay [sample].
+        inputs: tape and delay [sample] of each input.
         outputs: tape of each output.
     """
 
@@ -225,7 +225,7 @@ class Program:
         chunk: samples that a stage computes per call: at most the shortest feedback delay between the stages.
 
     Attributes:
-        number: index of the failed stage, when `run` raises.
+        number: index of the failed stage if `run` has raised an error.
         ends: sample up to which each stage has computed; after an error, the stages before the failed one may be
             a chunk ahead.
     """
@@ -264,7 +264,7 @@ class Program:
         self.begin([each.stage for each in stages])
 
     def begin(self, stages: Sequence[Stage]) -> None:
-        """Restart at sample 0 with other stages that have equal ports."""
+        """Restart at sample 0 with other stages that have the same ports."""
         self._stages = stages
         self.number, self.ends = 0, [0] * len(stages)
         self._where[:] = 0
@@ -293,10 +293,11 @@ class Program:
             finite: whether to stop after a chunk with a NaN or infinite sample.
 
         Returns:
-            Whether the run was stopped for a NaN or infinite sample.
+            Whether the run was stopped because of a NaN or infinite sample.
 
         Raises:
-            LatheError: a stage cannot continue; the message names it. Earlier results are on the tapes (`reached`).
+            LatheError: a stage cannot continue; the message names the stage. Earlier results are on the tapes (see
+                `reached`).
         """
         self.number = 0
         try:
@@ -333,7 +334,7 @@ class Program:
         return int(self._where[0])
 
     def _serve(self, reason: int, first: int, number: int, reached: int, samples: int) -> None:
-        """Handle in Python the reason for which a stage has stopped the loop."""
+        """Handle in Python the reason why a stage has stopped the loop."""
         stage, tapes = self._stages[number], self._tapes
         inputs = [tapes.view(tape, first, samples, delay) for tape, delay in self._inputs[number]]
         outputs = [tapes.view(tape, first, samples) for tape in self._outputs[number]]
@@ -356,7 +357,7 @@ class Program:
             self._told[number] = end
 
     def said(self, number: int, end: int) -> list[Sparse]:
-        """Return the stage's events since the last call, for the samples before ``end``."""
+        """Return a stage's sparse messages since the last call, for samples before ``end``."""
         said = self._sparse[number]
         if not said:
             return []

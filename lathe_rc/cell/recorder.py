@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the recorder, which is not a stage: it computes no samples and delays none."""
+"""Parameters of the recorder, which is not a stage: it does not compute or delay any samples."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -48,5 +48,5 @@ class RecorderParameters(NodeParameters):
                 raise InputError(f"triggers = {pattern!r}; allowed: a pattern of NODE: ACTION, like '*: {pattern}'")
 
     def snapshots_of(self, bag: Path) -> Path:
-        """Return the folder of the snapshots, for a bag at ``bag``."""
+        """Return the folder of the snapshots that belong to a bag at ``bag``."""
         return Path(self.snapshots) if self.snapshots else bag.with_name(f"{bag.name}_snapshots")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording of all signals of a run, independent of the host, and its digests."""
+"""Recording of all signals of a run, independent of the host, and the digests of a recording."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ _PIECE = 2**15  # samples per hash update
 
 @dataclass(frozen=True)
 class SparseTopic:
-    """Messages at chosen samples: time stamps [ns] and, by field, one value per message."""
+    """Messages at individual samples: time stamps [ns] and, by field, one value per message."""
 
     stamps: list[int] = field(default_factory=list)
     values: dict[str, list[Any]] = field(default_factory=dict)
@@ -50,10 +50,10 @@ class Recording:
 
     Attributes:
         types: message type by fully qualified topic.
-        dense: by fully qualified topic, the arrays of each field, shape (samples,).
-        sparse: by fully qualified topic.
+        dense: array of each field, shape (samples,), by fully qualified topic.
+        sparse: sparse messages by fully qualified topic.
         step_ns: sampling step [ns]; 0 without a dense topic.
-        first: sample that the arrays begin with; 0 but in a snapshot.
+        first: index of the first sample of the arrays; 0 except in a snapshot.
 
     Example:
         >>> import lathe_rc
@@ -104,26 +104,26 @@ class Recording:
 
     @cached_property
     def errors(self) -> FormErrors:
-        """Return the form error of each complete revolution; empty if there is no tool."""
+        """Form error of each complete revolution; empty if there is no tool."""
         if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
             return form_errors(np.empty(0), np.empty(0))
         angle = self.of_type(messages.ENCODER)["angle_true"]
         return form_errors(angle, self.of_type(messages.TOOL)["error"], turns_before(angle))
 
     def frame(self, topic: str) -> Any:
-        """Return a topic as a table with one row per sample or message; one row per element of messages with lists.
+        """Return a topic as a table with one row per sample or message, or per element of a message with lists.
 
         The columns are those of `lathe_rc.bag.exporting.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
-        fields of the message. With an encoder in the recording two come before the fields: ``revolution``, counted
-        from 1, and ``spindle_angle``, the true angle in it [rad].
+        fields of the message. If the recording has an encoder, two more columns come before the fields: ``revolution``,
+        counted from 1, and ``spindle_angle``, the true angle within the revolution [rad].
 
         Args:
             topic: topic name, with or without the leading slash.
 
         Returns:
-            Where pandas is installed, a ``pandas.DataFrame`` with a copy of the samples, ``time`` as its index, and
-            the topic and the unit of each column that has one in ``attrs``. Otherwise a ``pyarrow.Table``, whose
-            fields have the unit in their metadata, as in a Parquet file of an export.
+            If pandas is installed, a ``pandas.DataFrame`` with a copy of the samples, indexed by ``time``, and with the
+            topic and the units of the columns in ``attrs``. Otherwise a ``pyarrow.Table`` with the units in the
+            metadata of the fields, as in an exported Parquet file.
 
         Raises:
             InputError: there is no such topic.
@@ -154,14 +154,14 @@ class Recording:
         return frames.frame(name, table, rows)
 
     def plot(self, title: str = "", beside: "tuple[str, Recording] | None" = None) -> "Figure":
-        """Plot desired form, form error over angle, form error by revolution (see `lathe_rc.drawing.form.draw`).
+        """Plot the desired form, and the form error over angle and by revolution (see `lathe_rc.drawing.form.draw`).
 
         Args:
             title: title of the figure.
             beside: name and recording of another run of the same part, whose errors are drawn as well.
 
         Raises:
-            InputError: there is no tool, or not one complete revolution.
+            InputError: there is no tool, or no complete revolution.
         """
         from lathe_rc.drawing import form  # Matplotlib is slow to import
 
@@ -172,7 +172,7 @@ class Recording:
         """Return the turned form of the part, for a figure.
 
         Raises:
-            InputError: there is no tool, or not one complete revolution.
+            InputError: there is no tool, or no complete revolution.
         """
         from lathe_rc.drawing.form import TurnedForm
 
@@ -201,10 +201,10 @@ class Recording:
         return next(signals for topic, signals in self.dense.items() if self.types[topic] == msgtype)
 
     def digests(self) -> dict[str, str]:
-        """Return one digest for each signal topic, by topic.
+        """Return the digest of each signal topic, by topic.
 
-        It is the SHA-256 of the SHA-256 of each field's samples in the order of the fields, little-endian; of sparse
-        topics the time stamps come first. The digest does not depend on the block size.
+        A digest is the SHA-256 of the concatenated SHA-256 hashes of each field's samples (little-endian), in the order
+        of the fields; for sparse topics, the time stamps come first. The digest does not depend on the block size.
         """
         digester = Digester()
         for topic, signals in self.dense.items():
@@ -215,7 +215,7 @@ class Recording:
 class Digester:
     """Digests of a run whose signals arrive in chunks (see `Recording.digests`).
 
-    A thread computes them without holding the interpreter lock, in parallel with the caller.
+    A thread computes the digests in parallel with the caller, without holding the interpreter lock.
     """
 
     def __init__(self) -> None:
@@ -223,14 +223,14 @@ class Digester:
         self._thread = ThreadPoolExecutor(1)
 
     def dense(self, topic: str, signals: Signals) -> None:
-        """Append the next samples of a dense topic, arrays of shape (n,) by field; they are copied."""
+        """Append the next samples of a dense topic, as arrays of shape (n,) by field, which are copied."""
         found = self._topics.get(topic)
         if found is None:
             found = self._topics[topic] = _Topic(signals, self._thread)
         found.add(signals)
 
     def result(self, sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
-        """Return one digest for each topic; sparse topics are passed complete."""
+        """Return the digest of each topic; ``sparse`` contains the sparse topics in full."""
         found = {topic: part.digests() for topic, part in self._topics.items()}
         for topic, part in sparse.items():
             arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
@@ -297,7 +297,7 @@ def _bytes(samples: Samples) -> memoryview:
 
 
 def _flat(values: Sequence[Any]) -> Samples:
-    """Concatenate the values of a field into one array; strings become their bytes with an end mark."""
+    """Concatenate the values of a field into one array; strings are converted to bytes with an end mark."""
     parts = []
     for value in values:
         for item in value if isinstance(value, list) else [value]:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parser of ROS 2 parameter files without ROS, with the scalar rules of rcl.
+"""Parser for ROS 2 parameter files that does not need ROS and follows rcl's rules for scalars.
 
-YAML leaves the meaning of a scalar to its reader, and rcl's differs from that of every Python library: ``1e-3``
-is a double, ``0x10`` and ``010`` are integers, ``yes`` is true. So the text is parsed by PyYAML and the scalars
-by the C library's own strtol and strtod, as rcl_yaml_param_parser does it. Patterns for PyYAML's resolvers would need
-more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and a number out of range is a string.
+YAML leaves the meaning of a scalar to the reader, and rcl's interpretation differs from that of every Python library:
+``1e-3`` is a double, ``0x10`` and ``010`` are integers, and ``yes`` is true. The text is therefore parsed by PyYAML,
+and the scalars by the C library's strtol and strtod, as in rcl_yaml_param_parser. Patterns for PyYAML's resolvers would
+take more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and treats a number out of range as
+a string.
 """
 
 import ctypes
@@ -41,7 +42,7 @@ def _converted(function: Callable[..., Any], text: str, *base: int) -> Any:
 
 
 def scalar(text: str) -> bool | int | float | str:
-    """Return the value that rcl assigns to a scalar without quotes."""
+    """Return the value that rcl assigns to an unquoted scalar."""
     if text in _TRUE | _FALSE:
         return text in _TRUE
     number: int | float | None = _converted(_libc.strtol, text, 0)
@@ -66,10 +67,10 @@ def _name(node: yaml.Node, where: str) -> str:
 
 def _value(node: yaml.Node, where: str) -> Value:
     if isinstance(node, yaml.ScalarNode):
-        # rcl would truncate it, or not read it at all
+        # rcl would truncate the text, or not read it at all
         if "\0" in node.value or any("\ud800" <= character <= "\udfff" for character in node.value):
             raise InputError(f"{where}: {node.value!r}; allowed: text without NUL and surrogates")
-        # Blocks (| and >) count as plain.
+        # Block scalars (| and >) count as plain.
         quoted = node.style in ("'", '"')
         if not node.value and not quoted:
             raise InputError(f"{where}: no value; write '' for an empty text")
@@ -151,7 +152,7 @@ def rows(text: str, source: str) -> list[dict[str, Value]]:
 def read(path: Path) -> dict[str, dict[str, Value]]:
     """Read parameters by node and name, in the order of the file.
 
-    Node names lose their leading ``/`` or ``/**/``; the wildcard for all nodes is ``/**``.
+    A leading ``/`` or ``/**/`` of a node name is removed; the wildcard for all nodes is ``/**``.
 
     Raises:
         InputError: the file is missing, larger than 1 MiB, or not a ROS 2 parameter file.
@@ -168,7 +169,7 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
 
 
 def parse(text: str, source: str) -> dict[str, dict[str, Value]]:
-    """Parse parameters from a string, as `read` does; ``source`` is its origin, for messages.
+    """Parse parameters from a string, as `read` does from a file; ``source`` is the string's origin, for messages.
 
     Raises:
         InputError: the string is larger than 1 MiB, or not a ROS 2 parameter file.

@@ -32,7 +32,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 
     @property
     def own(self) -> list[str]:
-        """Return the built-in kinds."""
+        """Built-in kinds."""
         return [*STAGES.own, RECORDER]
 
     def allowed(self) -> str:
@@ -58,7 +58,7 @@ TABLES = _Tables()
 
 _EVERYONE = "/**"
 _ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
-# Parameters that affect neither samples nor messages of a run, and so not its identity.
+# Parameters that affect neither the samples nor the messages of a run, and therefore not its identity.
 _HOST_PARAMETERS = {
     *("run_id", "speed_factor", "window", "members", "processes", "autostart"),
     *("stall_reaction", "stall_time", "safe_time", "restart_time", "restart_file"),
@@ -78,7 +78,7 @@ def kind_of(node: str, stage: object) -> str:
 
 
 class _Text(str):
-    """String written in quotes: without them rcl reads 1e-3 as a number and y as true, unlike PyYAML."""
+    """String that is written in quotes: without them, rcl reads 1e-3 as a number and y as true, unlike PyYAML."""
 
     __slots__ = ()
 
@@ -104,9 +104,9 @@ class Scenario:
     """Description of a cell; see `load` and `varied` for examples.
 
     Attributes:
-        name: the file's name without its ending.
-        nodes: the table of each node by its name, in the order of the file.
-        fingerprints: hashes of the tables by node, as far as computed; the run id is derived from them.
+        name: name of the file without its extension.
+        nodes: parameter table of each node by node name, in the order of the file.
+        fingerprints: hashes of the tables by node, as far as computed; the run ID is derived from them.
     """
 
     name: str
@@ -146,7 +146,7 @@ class Scenario:
 
     @property
     def recorder(self) -> tuple[str, RecorderParameters]:
-        """Return the name and table of the recorder; default values if the scenario has none."""
+        """Name and table of the recorder; default values if the scenario has none."""
         for name, table in self.nodes.items():
             if isinstance(table, RecorderParameters):
                 return name, table
@@ -180,17 +180,17 @@ class Scenario:
 
     @property
     def identity(self) -> str:
-        """Return a hash of everything that affects a run: nodes, parameters, and contents of referenced files."""
+        """Hash of everything that affects a run: nodes, parameters, and contents of referenced files."""
         missing = {node: table for node, table in self.nodes.items() if node not in self.fingerprints}
         return _hash({**self.fingerprints, **{node: _fingerprint(table) for node, table in missing.items()}})
 
     @cached_property
     def _has_own_run_id(self) -> bool:
-        """Return whether the run id is derived from the content instead of being set explicitly."""
+        """Whether the run ID is derived from the content instead of being set explicitly."""
         return self.shared.run_id == _identity(self.fingerprints)
 
     def parameter(self, target: str) -> Row:
-        """Return the row of a parameter in the table of its node.
+        """Return the row of a parameter in its node's table.
 
         Args:
             target: ``NODE.PARAM``, or ``PARAM`` for a shared parameter, with ``[K]`` for an element of a list.
@@ -218,11 +218,11 @@ class Scenario:
         return cast("Value", found if element is None else found[element])
 
     def named(self) -> "Scenario":
-        """Return the same cell with a fixed run id, which its variations keep."""
+        """Return the same cell with a fixed run ID, which its variations keep."""
         return self.varied({"run_id": f"{self.shared.run_id} varied"})
 
     def with_models_given(self) -> "Scenario":
-        """Return the same cell with fixed drive models in the controllers, kept when the drives are varied."""
+        """Return the same cell with fixed drive models in the controllers, which do not change with the drives."""
         tables = {node: models.given(table) for node, table in self.nodes.items()}
         return Scenario(self.name, tables, self.fingerprints)
 
@@ -230,10 +230,11 @@ class Scenario:
         """Return the same cell with other parameter values, without reading its file again.
 
         Args:
-            values: by ``NODE.PARAM``, or ``PARAM`` for a shared parameter; ``NODE.PARAM[K]`` is element K of a list.
+            values: new values by ``NODE.PARAM``, or ``PARAM`` for a shared parameter; ``NODE.PARAM[K]`` is element K of
+                a list.
 
         Raises:
-            InputError: the input is invalid; one line for the first error.
+            InputError: the input is invalid; the one-line message describes the first error.
 
         Example:
             >>> import lathe_rc
@@ -260,29 +261,36 @@ class Scenario:
                     found[name] = _with_element(target, before, element, given_value)
                 else:
                     found[name] = given_value
-        tables, fingerprints = dict(self.nodes), dict(self.fingerprints)
-        given = "run_id" in values or not self._has_own_run_id
+        tables = dict(self.nodes)
         for node, changed in changes.items():
             tables[node] = self.nodes[node].changed(node, changed)
+        return self._with(tables, given="run_id" in values or not self._has_own_run_id)
+
+    def with_node(self, node: str, table: NodeParameters) -> "Scenario":
+        """Return the same cell with another table of a node, whose kind may differ."""
+        return self._with({**self.nodes, node: table}, given=not self._has_own_run_id)
+
+    def _with(self, tables: Mapping[str, NodeParameters], *, given: bool) -> "Scenario":
+        """Return the cell with other tables; ``given``: whether its run id is set explicitly."""
         # A changed drive changes the models of its controllers, unless these are given.
         tables = models.resolved(tables)
         other = {node: table for node, table in tables.items() if table is not self.nodes[node]}
         if given and (run_id := next(iter(tables.values())).run_id):
-            # With a given run id, changed tables are hashed only when the identity is requested.
-            known = {node: told for node, told in fingerprints.items() if node not in other}
+            # With a given run ID, changed tables are hashed only when the identity is requested.
+            known = {node: told for node, told in self.fingerprints.items() if node not in other}
             return _agreed(self.name, tables, known, run_id)
-        fingerprints |= {node: _fingerprint(table) for node, table in other.items()}
+        fingerprints = {**self.fingerprints, **{node: _fingerprint(table) for node, table in other.items()}}
         return _agreed(self.name, tables, fingerprints, _identity(fingerprints))
 
     def to_yaml(self, *, given: bool = False) -> str:
         """Return the complete parameter file; empty lists are left out, since rcl cannot read them.
 
         Args:
-            given: write only values set explicitly; on reading, the others get their defaults and models follow
-                their drives.
+            given: whether to write only the values that are set explicitly; when the file is read, the others take
+                their defaults, and models follow their drives.
         """
         tree = {}
-        # A run id derived from the content would be wrong as soon as a reader changes a value.
+        # A run ID derived from the content would be wrong as soon as a reader changes a value.
         left_out = {"run_id"} if given and self._has_own_run_id else None
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
@@ -310,7 +318,7 @@ def _with_element(target: str, values: object, element: int, value: Value) -> Va
 
 
 def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
-    """Return node and parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
+    """Return the node and the parameter of ``NODE.PARAM`` or, for a shared parameter, ``PARAM``.
 
     Args:
         text: target to be split.
@@ -334,7 +342,7 @@ def _target(text: str, kinds: Mapping[str, str], what: str) -> tuple[str, str]:
 
 
 def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
-    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``; return node and parameter."""
+    """Apply ``NODE.PARAM=VALUE`` or, for a shared parameter, ``PARAM=VALUE``; return the node and the parameter."""
     target, equals, value = text.partition("=")
     if not equals:
         raise InputError(f"--set {text!r}; allowed: NODE.PARAM=VALUE, or PARAM=VALUE for a shared parameter")
@@ -352,7 +360,7 @@ def _override(text: str, nodes: dict[str, dict[str, Value]]) -> tuple[str, str]:
 
 
 def _of_user(kind: str, name: str, value: Value, folder: Path) -> Value:
-    """Convert a user-supplied value: make a path relative to ``folder`` absolute, allow the code that it names."""
+    """Convert a user's value: make a path relative to ``folder`` absolute, and allow the code that the value names."""
     row = TABLES[kind].rows().get(name)
     if name == "stage" or (row is not None and row.named is not None):
         for each in value if isinstance(value, list) else [value]:
@@ -368,20 +376,20 @@ def read(
     copies: Mapping[str, Path] | None = None,
     stages: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, dict[str, Value]]:
-    """Read the values of a parameter file by node and name, with absolute paths; a file in a bag counts as data.
+    """Read the values of a parameter file by node and name, with absolute paths; a file in a bag is untrusted data.
 
     Args:
         path: path of the file.
         overrides: see `load`.
         copies: see `load`.
-        stages: stages of nodes for which the file names none.
+        stages: stages of nodes whose stages the file does not name.
 
     Raises:
-        InputError: the file is invalid, or it is data and names code that is not allowed, or files elsewhere.
+        InputError: the file is invalid, or it is untrusted data and names code that is not allowed or files elsewhere.
     """
     folder = path.parent if copies is not None else allowed_code.bag_around(path.parent)
     nodes = ros_yaml.read(path)
-    # Collected instead of rejected at once: an override may name another file.
+    # Such files are collected instead of being rejected at once, since an override may name another file.
     outside: dict[tuple[str, str], Path] = {}
     for name, values in nodes.items():
         if name == _EVERYONE:
@@ -406,11 +414,11 @@ def read(
     return nodes
 
 
-WRITTEN = ("memory_file", "restart_file")  #: parameters whose files a run may make itself
+WRITTEN = ("memory_file", "restart_file")  #: parameters whose files a run may create itself
 
 
 def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, Path] | None) -> Path:
-    """Return the file for a path named in untrusted data: its copy, a new one made by a run, or the file itself."""
+    """Return the file for a path in untrusted data: its copy, a new file for a run to write, or the file itself."""
     if copies is not None and parameter in copies:
         return copies[parameter].resolve()
     if copies is not None and parameter.rpartition(".")[2] in WRITTEN:
@@ -419,7 +427,7 @@ def _stands_for(parameter: str, value: str, folder: Path, copies: Mapping[str, P
 
 
 def content(path: Path) -> str:
-    """Return a hash of a file's content, or of its name if missing, unreadable, or above the size limit."""
+    """Return a hash of a file's content, or the file's name if it is missing, unreadable or above the size limit."""
     try:
         return hashlib.sha256(files.contents(path)).hexdigest()
     except OSError:
@@ -438,7 +446,7 @@ def _fingerprint(table: NodeParameters) -> str:
 
 
 def _identity(fingerprints: Mapping[str, str]) -> str:
-    """Return a run id derived from the scenario's content, so that two runs of it produce the same messages."""
+    """Return a run ID derived from a scenario's content, so that two runs of the scenario produce the same messages."""
     return _hash(fingerprints)[:16]
 
 
@@ -448,10 +456,10 @@ def _hash(fingerprints: Mapping[str, str]) -> str:
 
 
 def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mapping[str, str], run_id: str) -> Scenario:
-    """Build the scenario from parameter tables and a run id.
+    """Build the scenario from parameter tables and a run ID.
 
     Raises:
-        InputError: the nodes have different values of a shared parameter.
+        InputError: the nodes have different values for a shared parameter.
     """
     agreed = next(iter(tables.values()))
     for node, table in tables.items():
@@ -480,13 +488,14 @@ def load(
     Args:
         path: ROS 2 parameter file, or the name of a scenario that comes with lathe_rc, such as ``piston``.
         overrides: ``NODE.PARAM=VALUE``, or ``PARAM=VALUE`` for shared parameters, applied in order.
-        complete: whether omitted parameters get their defaults, as in files of `Scenario.to_yaml`; otherwise models of
-            drives that are not given are taken from the drives, see `lathe_rc.cell.models`.
-        copies: copies of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; it is data then
-            and names no other files. None: the user's own, unless it is in a bag (`lathe_rc.allowed_code`).
+        complete: whether omitted parameters take their defaults, as in files written by `Scenario.to_yaml`; otherwise,
+            drive models that are not given are taken from the drives (see `lathe_rc.cell.models`).
+        copies: copies of the files of a bag's scenario, by NODE.PARAM, all in the folder of ``path``; the scenario is
+            then untrusted data and may not name other files. None: the scenario is the user's own, unless it is in a
+            bag (`lathe_rc.allowed_code`).
 
     Raises:
-        InputError: the input is invalid; one line for the first error.
+        InputError: the input is invalid; the one-line message describes the first error.
 
     Example:
         >>> import lathe_rc

@@ -99,6 +99,7 @@ class WiredCell(Protocol):
     warnings: list[str]
     unchecked: list[str]
     factors: dict[str, float]
+    loops: dict[str, Any]
 
     @property
     def master(self) -> Any:
@@ -201,7 +202,7 @@ class Stage(ABC):
         """Check the stage in its wired cell before the start; overriding methods call this one.
 
         Args:
-            cell: wired cell; its ``warnings``, ``unchecked`` and ``factors`` receive the results.
+            cell: wired cell; its ``warnings``, ``unchecked``, ``factors`` and ``loops`` receive the results.
             cures: see `lathe_rc.cell.wiring.Cell.check`.
 
         Raises:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reuse of stages in a batch, by resetting everything that a run may change in a stage.
 
-A cell of a batch differs from the previous one in a few tables. Creating the other stages takes longer than copying
-the state that a run has changed, and their memories stay in the caches: without this module a cell of the
-batch benchmark takes 10 % longer (full cell, three nodes of twelve differ) or 3 % (two-channel cell, four of seven).
+A cell of a batch differs from the previous one in a few tables. Creating the other stages would take longer than
+copying the state that a run has changed, and their memory stays in the caches: without this module, a cell of the batch
+benchmark takes 10 % longer (full cell, in which three of twelve nodes differ) or 3 % longer (two-channel cell, four of
+seven).
 """
 
 import contextlib
@@ -25,7 +26,7 @@ from lathe_rc.cell.wiring import new_stage
 from lathe_rc.compiled.step import Entry
 from lathe_rc.extensions import is_ours
 
-#: what nobody changes; a compiler's types and an entry are those of stages in other threads too
+#: types of objects that are never changed; compiler types and entries are shared with stages in other threads
 _CONSTANT = (
     type(None), bool, int, float, complex, str, bytes, range, slice, type, enum.Enum, PurePath, np.generic, np.dtype,
     types.BuiltinFunctionType, types.ModuleType, Table, Entry, Type,
@@ -33,7 +34,7 @@ _CONSTANT = (
 
 
 class _Plain:
-    """Reference class with nothing but attributes; an object of another layout may have hidden state."""
+    """Reference class with nothing but attributes; an object with a different layout may have hidden state."""
 
 
 class UnknownPartError(Exception):
@@ -41,7 +42,7 @@ class UnknownPartError(Exception):
 
 
 class Start:
-    """Initial state of a stage, taken before its run.
+    """Initial state of a stage, recorded before its run.
 
     Args:
         stage: stage that has not run yet.
@@ -61,7 +62,7 @@ class Start:
             back()
 
     def _look(self, part: Any) -> None:
-        """Record a part of the stage and everything that it references."""
+        """Record a part of the stage and everything that the part references."""
         if isinstance(part, _CONSTANT) or id(part) in self._seen:
             return
         if isinstance(part, types.FunctionType) and part.__closure__ is None:
@@ -78,7 +79,7 @@ class Start:
             parts = part.values() if type(part) is dict else part
             self._back.append(partial(_refill, part, part.copy()))
         elif isinstance(part, np.random.Generator):
-            # The generator object must stay: it may be referenced elsewhere.
+            # The generator object must be kept, since it may be referenced elsewhere.
             bits = part.bit_generator
             self._back.append(partial(setattr, bits, "state", bits.state))
         elif isinstance(part, types.MethodType):
@@ -111,7 +112,10 @@ def _reset(part: Any, attributes: dict[str, Any]) -> None:
 
 
 def _refill(part: Any, content: Any) -> None:
-    """Restore the content of a list, dictionary or set; skip it if unchanged, as another thread may read it."""
+    """Restore the content of a list, dictionary or set.
+
+    An unchanged dictionary or set is skipped, since another thread may be reading it.
+    """
     if isinstance(part, list):
         part[:] = content
     elif [*part] != [*content] or (
@@ -122,14 +126,14 @@ def _refill(part: Any, content: Any) -> None:
 
 
 class StageCache:
-    """Cache of the newest stage of each name with its initial state, for cells run one after the other."""
+    """Cache of the newest stage of each name with its initial state, for cells that run one after another."""
 
     def __init__(self) -> None:
         self._stages: dict[str, Stage] = {}
-        self._starts: dict[str, Start | None] = {}  # of stages requested again; None: cannot be reset
+        self._starts: dict[str, Start | None] = {}  # of stages requested again; None if not resettable
 
     def take(self, name: str, table: NodeParameters) -> Stage:
-        """Return the stage of a node: the cached one if its table is equal, or a new one.
+        """Return the stage of a node: the cached one if its table is equal, otherwise a new one.
 
         The first stage with a table is not cached, since the next cell may have a different table.
         """
@@ -147,14 +151,14 @@ class StageCache:
             self._starts[name] = None
             with contextlib.suppress(UnknownPartError):
                 if made.is_compiled:
-                    # Before taking the start, so that its words are reset as well.
+                    # This precedes the recording of the initial state, so that the step's words are reset as well.
                     made.native()
                 self._starts[name] = Start(made)
         return made
 
 
 def _same(stage: Stage, table: NodeParameters) -> bool:
-    """Return whether a stage has an equal table; for third-party stages the run id counts as well."""
+    """Return whether a stage has an equal table; for third-party stages, the run ID is compared as well."""
     before = stage.shared
     if before is table:
         return True

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State files of nodes, with which another process can replace a node with bit-identical results.
+"""State files of nodes, from which another process can replace a node with bit-identical results.
 
-The format is Python's pickle, restricted. Arrays are written as type, shape and bytes, parameter tables not at all: the
-reading node has its own. Only classes that occur in a fresh state of the node are allowed. A file that another user
-owns or may write is rejected, since its content is trusted.
+The format is a restricted form of Python's pickle. Arrays are written as type, shape and bytes; parameter tables are
+not written, since the reading node has its own. Only classes that occur in a fresh state of the node are allowed. A
+file that another user owns or can write is rejected, since its content is trusted.
 """
 
 import enum
@@ -24,7 +24,7 @@ from lathe_rc.files import contents, sealed, unsealed
 
 _MOST = 2**28  # largest state file [B]
 _TABLE, _ARRAY, _NUMBER, _KIND, _ENUM = "table", "array", "number", "kind", "enum"
-_NUMBERS = "biuf"  # kinds of elements
+_NUMBERS = "biuf"  # allowed kinds of array elements
 _Name = tuple[str, str]
 
 
@@ -57,7 +57,7 @@ def _dtype(text: object) -> np.dtype[Any]:
 
 
 class _Reader(pickle.Unpickler):
-    """Restricted unpickler of a state file that allows only given classes; without them it records all classes."""
+    """Restricted unpickler for state files: it allows only the given classes or, if None, records all classes."""
 
     def __init__(self, stream: io.BytesIO, table: Table, classes: frozenset[_Name] | None) -> None:
         super().__init__(stream)
@@ -103,9 +103,9 @@ def dump(state: Mapping[str, object]) -> bytes:
 
 
 def save(path: Path, *parts: bytes) -> None:
-    """Write a state, and later changes of it, each part as returned by `dump`.
+    """Write a state and later changes to it, each part as returned by `dump`.
 
-    The file is replaced atomically: a reader finds the previous or the new state, even if this process is killed.
+    The file is replaced atomically: a reader sees either the previous or the new state, even if this process is killed.
 
     Raises:
         LatheError: the file cannot be written.
@@ -144,14 +144,14 @@ def load(path: Path, table: Table, fresh: Mapping[str, object], *others: type) -
     try:
         _check_owner(path)
         stream, state = io.BytesIO(unsealed(contents(path, _MOST))), dict[str, Any]()
-        # Each part has its own reader: the names of one are unknown to the next.
+        # Each part needs its own reader, since references in a part do not extend to other parts.
         while stream.tell() < stream.getbuffer().nbytes:
             state |= _Reader(stream, table, frozenset(classes)).load()
     except LatheError:
         raise
     except OSError as error:
         raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
-    except Exception as error:  # noqa: BLE001 - pickle lets through whatever a damaged file leads to
+    except Exception as error:  # noqa: BLE001 - pickle can raise any exception on a damaged file
         raise LatheError(f"{path}: not a state of this node ({type(error).__name__}: {shown(error)})") from None
     if state.keys() != fresh.keys():
         raise LatheError(f"{path}: not a state of this node")

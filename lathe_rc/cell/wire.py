@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """CDR encoding and decoding of blocks, at the rate that a cell needs.
 
-rosbags encodes and decodes any message, at 10 µs each. All blocks of a topic, however, have equal bytes except for a
-few numbers and the samples. So for each length of block one message is encoded by rosbags, the offsets of the numbers
-are found by changing them, and from then on only those offsets are written or read. A message that does not match the
-layout is decoded by rosbags and analysed again; no CDR code is hand-written. CDR leaves open padding content, byte
-order, and padding of the encapsulation, and a publisher may set a frame: such a block is re-encoded by rosbags, 10 to
-50 µs, and then read like our own.
+rosbags encodes and decodes any message, in 10 µs each. All blocks of a topic, however, have equal bytes except for a
+few numbers and the samples. For each block length, one message is therefore encoded by rosbags, the offsets of the
+numbers are found by changing the numbers, and from then on only the bytes at those offsets are written or read. A
+message that does not match the layout is decoded by rosbags and analysed again; no CDR code is written by hand. CDR
+does not specify the content of padding, the byte order or the padding of the encapsulation, and a publisher may set a
+frame: a block that differs in these respects is re-encoded by rosbags, which takes 10 to 50 µs, and then read like one
+from lathe_rc.
 """
 
 import struct
@@ -22,11 +23,11 @@ from lathe_rc.cell.block import Block
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
-_SHIFT = 4  # CDR aligns relative to the end of its 4-byte header: this many bytes in front align it in memory as well
+_SHIFT = 4  # CDR aligns relative to the end of its 4-byte header; this many bytes in front align it in memory as well
 # Numbers that differ between blocks: the stamp, and the fields after the strings of a BlockInfo.
 _STAMP = struct.Struct("<iI")  # sec, nanosec
 _INFO = struct.Struct("<QI?3xQ")  # first_index, step_ns, last, companions
-NUMBERS = ("sec", "nanosec", "first_index", "step_ns", "last", "companions")  #: what differs, by name
+NUMBERS = ("sec", "nanosec", "first_index", "step_ns", "last", "companions")  #: names of these numbers
 _NOTHING, _ANYTHING = (0, 0, 0, 0, False, 0), (0x01010101, 0x01010101, 2**56 + 1, 0x01010101, True, 2**56 + 1)
 _Numbers = tuple[int, int, int, int, bool, int]
 
@@ -48,7 +49,7 @@ class Layout:
 
     Attributes:
         run_id, source, samples: see `Block`.
-        template: a message with all numbers and samples 0.
+        template: message in which all numbers and samples are 0.
         stamp, info: offsets of the stamp and of the numbers of a BlockInfo.
         fields: element type and offset of the samples by name.
         constant: start, end and content of the constant bytes.
@@ -86,7 +87,7 @@ class Layout:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """Unaligned numpy type of the message: `NUMBERS`, and by name the fields with all their samples."""
+        """Unaligned NumPy type of the message: `NUMBERS`, and the fields with all their samples, by name."""
         info = [self.info + place for place in (0, 8, 12, 16)]
         fields = [(dtype, (self.samples,)) for dtype, _ in self.fields.values()]
         return np.dtype(
@@ -133,7 +134,7 @@ class Encoder:
 
     Args:
         msgtype: message type.
-        run_id: identity of the run.
+        run_id: ID of the run.
         source: fully qualified name of the node.
         step_ns: sampling step [ns].
     """
@@ -143,7 +144,7 @@ class Encoder:
         self._scratches: dict[int, _Scratch] = {}
 
     def prepare(self, samples: int) -> None:
-        """Determine the layout for a length ahead of its first block."""
+        """Determine the layout for a block length before the first block of that length."""
         self._scratch(samples)
 
     def _scratch(self, samples: int) -> _Scratch:
@@ -153,7 +154,7 @@ class Encoder:
         return scratch
 
     def block(self, first: int, signals: Signals, whole: Samples | None, *, last: bool, companions: int) -> Block:
-        """Return a block for readers in the same process, without encoding; it holds the arrays themselves (`Pool`)."""
+        """Return an unencoded block for readers in the same process; it holds the arrays themselves (see `Pool`)."""
         samples = next(iter(signals.values())).size
         log_ns = START_NS + (first + samples - 1) * self._step_ns
         run_id, source, step_ns = self._run_id, self._source, self._step_ns
@@ -163,13 +164,13 @@ class Encoder:
         """Encode a block as a message.
 
         Args:
-            first: index of its first sample.
-            signals: samples of the block, arrays of shape (n,) by field.
+            first: index of the block's first sample.
+            signals: samples of the block, as arrays of shape (n,) by field.
             last: whether the run ends with this block.
             companions: see BlockInfo.msg.
 
         Returns:
-            The stamp [ns], which is that of its last sample, and the bytes.
+            The time stamp [ns], which is that of the last sample, and the bytes.
         """
         samples = next(iter(signals.values())).size
         scratch = self._scratch(samples)
@@ -188,11 +189,12 @@ class Decoder:
 
     Args:
         msgtype: message type.
-        fields: requested fields; default: all.
-        admit: called first with run and source of a block unlike the previous one; may raise.
+        fields: requested fields; None: all.
+        admit: called with the run and source of each block whose layout is not that of the previous one; may raise an
+            error to reject the block.
 
     Attributes:
-        message: last decoded block, as `Encoder` encodes it; the received bytes unless these were encoded differently.
+        message: last decoded block, encoded as by `Encoder`: the received bytes, unless these were encoded differently.
     """
 
     def __init__(
@@ -204,7 +206,7 @@ class Decoder:
         self.message = b""
 
     def prepare(self) -> None:
-        """Create the rosbags codec of the type ahead of the first block."""
+        """Create the rosbags codec of the message type before the first block arrives."""
         messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
 
     def decode(self, data: bytes) -> Block:
@@ -235,7 +237,7 @@ class Decoder:
         )
 
     def decode_all(self, whole: bytes, places: Samples) -> Iterator[Block]:
-        """Decode several blocks, joining consecutive ones, in a fraction of the time of single calls.
+        """Decode several blocks, joining consecutive ones, in a fraction of the time of separate calls.
 
         Args:
             whole: bytes that contain all blocks, possibly among others.
@@ -249,14 +251,14 @@ class Decoder:
         while start < len(places):
             begin, length = int(begins[start]), int(lengths[start])
             first = self.decode(data := whole[begin : begin + length])
-            if self.message is not data:  # encoded differently: its samples have other offsets
+            if self.message is not data:  # the block was encoded differently, so its samples have other offsets
                 yield first
                 start += 1
                 continue
             assert self._layout is not None, "that has been learned"
             other = np.flatnonzero(lengths[start:] != length)
             stop = start + int(other[0]) if other.size else len(places)
-            # A strided view with a record at each byte, without a copy: indexing selects the starts of blocks.
+            # A strided view with a record at each byte, created without copying; indexing selects the starts of blocks.
             anywhere: Samples = np.ndarray(len(whole) - length + 1, f"V{length}", whole, strides=(1,))
             records = anywhere[begins[start:stop]].view(self._layout.dtype)
             count = self._following(records, first)
@@ -269,7 +271,7 @@ class Decoder:
         constant = records.view(np.uint8).reshape(records.size, -1)[:, self._layout.same]
         fits = (constant == constant[0]).all(axis=1)
         counts = np.arange(records.size, dtype=np.uint64) * np.uint64(first.samples)
-        # In uint64, as in the message: a first index of a damaged block may be any number.
+        # Computed in uint64, as in the message: the first index of a damaged block may be any number.
         fits &= records["first_index"] == np.uint64(first.first_index) + counts
         fits &= records["step_ns"] == first.step_ns
         return int(np.argmin(fits)) if not fits.all() else records.size
@@ -286,7 +288,7 @@ class Decoder:
         )
 
     def _learn(self, data: bytes) -> tuple[Layout, bytes]:
-        """Return the layout of a block that differs from the previous layout, and the block itself."""
+        """Return the layout of a block that does not match the previous one, and the block, re-encoded if necessary."""
         try:
             message = messages.decode(self._type, data)
         except ValueError as error:

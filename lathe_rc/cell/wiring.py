@@ -11,10 +11,12 @@ from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
 from lathe_rc.cell.scenario import kind_of
 from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
 
@@ -163,6 +165,7 @@ class Cell:
             a remedy; one line each. Set by `check`.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error decreases from cycle to cycle. Set by `check`.
+        loops: each learning node with the drives that it commands. Set by `check`.
         stages: by node name, in the order of the forward edges.
         wiring: see `Wiring`.
         dense: publisher of each topic with one block per block, by relative topic.
@@ -181,6 +184,7 @@ class Cell:
     ) -> None:
         self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
+        self.loops: dict[str, Loop] = {}
         self._tables = nodes
         with explain_overflow(nodes):
             made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
@@ -298,6 +302,7 @@ class Cell:
             seconds = (self.master.expected_samples or math.inf) * self.master.shared.step
             self.warnings = [doubt for stage in self.stages.values() for doubt in stage.warnings(seconds)]
             self.factors.clear()
+            self.loops.clear()
             for stage in self.stages.values():
                 stage.check_cell(self, cures=cures)
 
@@ -306,3 +311,9 @@ class Cell:
         """Return the stability margin of each learning controller, 1 less its factor of a cycle; None if unknown."""
         learners = (name for name, stage in self.stages.items() if stage.learns)
         return {name: 1.0 - self.factors[name] if name in self.factors else None for name in learners}
+
+    @property
+    def drive_margins(self) -> dict[str, DriveMargin]:
+        """Return the drive margin of each learning controller that provides its factors."""
+        found = {name: loop.drive_margin() for name, loop in self.loops.items() if name in self.factors}
+        return {name: margin for name, margin in found.items() if margin}

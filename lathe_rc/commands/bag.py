@@ -17,22 +17,25 @@ from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.bag.reading.tachogram import make as make_tachogram
+from lathe_rc.bag.repairing.recover import Choice
+from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 from lathe_rc.commands import options, tables
-from lathe_rc.errors import LossyRunError
+from lathe_rc.errors import InputError, LossyRunError, shown
+from lathe_rc.names import instead
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)
-_LOSSY = LossyRunError.exit_code  # if messages are missing
+_LOSSY = LossyRunError.exit_code  # exit code if messages are missing
 _SIMULATED = 10**17  # [ns] upper bound of simulated time: three years; the system clock passed it in 1973
 
 
 @click.group()
 def bag() -> None:
-    """Ask bags: what is in them, are they whole; save what is left of a broken one; take the tachogram out."""
+    """Inspect, verify and recover bags, and extract the tachogram."""
 
 
 def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the first and last revolution of the part, if the bag has one; memory use does not grow with the bag."""
+    """Return the numbers of the part's first and last revolution; None without a part. Memory use is bounded."""
     if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
         return None
     ends = part.FirstAndLast(types)
@@ -46,9 +49,9 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @options.as_json
 @click.pass_context
 def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
-    """Topics, rates, span, scenario and the form error of the part.
+    """Show topics, rates, time span, scenario and the form error of the part.
 
-    Of a damaged bag: what can be read of it, and the damage; exit code 3.
+    For a damaged bag, show the readable content and the damage; exit code 3.
     """
     with Source(path, partial=True) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
@@ -130,8 +133,8 @@ def _date(log_ns: int) -> str | None:
 def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     """Verify sequence, gaps, numbers, checksums and recorded digests.
 
-    Exit code 0: clean, 3: lossy, 1: wrong, 2: no bag, or one that cannot be read. Code and files that it names and
-    does not hold get a line each.
+    Exit code 0: clean, 3: lossy, 1: wrong, 2: not a bag, or unreadable. Code and files that the bag names but does not
+    contain are listed, one per line.
     """
     found = check_bag(path)
     summary = {
@@ -163,7 +166,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
 @options.as_json
 @click.pass_context
 def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: bool) -> None:
-    """Copy what is whole of a broken bag to a new one; exit code 0: no message is missing, 3: some are."""
+    """Copy the intact content of a damaged bag to a new one; exit code 0: no message is missing, 3: some are."""
     target = output or path.with_name(f"{path.stem if path.is_file() else path.name}_recovered")
     found = recover_bag(path, target)
     summary = {
@@ -183,6 +186,57 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         click.echo(f"{found.saved} messages saved, {found.skipped} skipped, {found.lost_bytes} B lost")
         click.echo(f"bag: {target}")
     ctx.exit(_LOSSY if found.lossy else 0)
+
+
+@bag.command("copy")
+@click.argument("paths", metavar="BAG...", type=options.PATH, nargs=-1, required=True)
+@click.option("-o", "--output", type=options.PATH, required=True, help="folder of the new bag")
+@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
+@click.option("--without", multiple=True, metavar="TOPIC", help="left out; repeatable")
+@click.option("--start", type=click.FloatRange(0), default=0.0, help="[s] from the first message on")
+@click.option("--end", type=click.FloatRange(0), help="[s] from the first message on; default: to the end")
+@options.as_json
+@click.pass_context
+def copy_bags(
+    ctx: click.Context,
+    paths: tuple[Path, ...],
+    output: Path,
+    topics: tuple[str, ...],
+    without: tuple[str, ...],
+    start: float,
+    end: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Copy chosen messages of bags to a new one, byte for byte: filter, cut, merge, or convert from SQLite to MCAP.
+
+    The order is that of the log times. Exit code 3: a bag is damaged, and its damaged parts are left out.
+    """
+    first, known = [], set[str]()
+    for path in paths:
+        with Source(path, partial=True) as source:
+            first.append(source.first_ns)
+            known |= source.topics.keys() | {each.topic for each in source.unread}
+    for topic in (*topics, *without):
+        if topic not in known:
+            raise InputError(
+                f"no topic {shown(topic)!r} in {', '.join(map(str, paths))}; {instead(topic, sorted(known))}"
+            )
+    if end is not None and end <= start:
+        raise InputError(f"--end {end:g} with --start {start:g}; allowed: an end after the start")
+    from_ns = min(first) + round(start * 1e9)
+    to_ns = 2**64 if end is None else min(first) + round(end * 1e9)
+    found = copy_chosen(paths, output, Choice(frozenset(topics), frozenset(without), from_ns, to_ns))
+    damage = [f"{each.path}: {what}" for each in found for what in each.damage]
+    if as_json:
+        bags = [{"bag": str(each.path), "saved": each.saved, "damage": list(each.damage)} for each in found]
+        click.echo(json.dumps({"output": str(output), "bags": bags}))
+    else:
+        for what in damage:
+            click.echo(what)
+        click.echo("\n".join(f"{each.saved} messages of {each.path}" for each in found))
+        click.echo(f"bag: {output}")
+    ctx.exit(_LOSSY if any(each.lossy for each in found) else 0)
 
 
 @bag.command()

@@ -15,7 +15,7 @@ from lathe_rc.commands import options
 @options.allow_code
 @options.as_json
 def budget(scenario: str, revolutions: float | None, overrides: tuple[str, ...], *, as_json: bool) -> None:
-    """Tell what causes make of the form error of a SCENARIO: it runs offline with one after the other switched off."""
+    """Show what each cause contributes to the form error of a SCENARIO, from offline runs with causes switched off."""
     from lathe_rc.commands import outcome
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.commands.progress import watched_budget

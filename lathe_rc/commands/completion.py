@@ -2,7 +2,7 @@
 """Command ``lathe completion``: shell scripts for command-line completion.
 
 Click computes the completions, see `lathe_rc.commands.completers`. Click's own scripts append a blank to every word,
-also to a node whose parameter is still missing, and those for zsh and fish call the `lathe` of the PATH in place of
+even to a node whose parameter is still missing, and those for zsh and fish call the `lathe` on the PATH instead of
 ./lathe.
 """
 
@@ -16,7 +16,7 @@ import platformdirs
 from lathe_rc.errors import InputError, shown
 
 _MARK = "# completion of lathe_rc"
-_POSIX, _FISH = "[ ! -r {0} ] || . {0}", "test -r {0}; and source {0}"  # the line of a start-up file
+_POSIX, _FISH = "[ ! -r {0} ] || . {0}", "test -r {0}; and source {0}"  # line in a start-up file
 _SHELLS = ("bash", "zsh", "fish")
 
 
@@ -33,9 +33,9 @@ def _startup(shell: str) -> Path:
 @click.option("--install", is_flag=True, help="put it into the file that the shell reads when it starts")
 @click.option("--remove", is_flag=True, help="take it out of there")
 def completion(shell: str | None, *, install: bool, remove: bool) -> None:
-    """Make the shell complete commands, options, scenarios, nodes, parameters: print the script, or install it.
+    """Print or install the shell script that completes commands, options, scenarios, nodes and parameters.
 
-    SHELL is that of $SHELL if none is given.
+    SHELL defaults to that of $SHELL.
     """
     if install and remove:
         raise InputError("--install with --remove; allowed: one of them")

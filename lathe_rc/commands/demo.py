@@ -14,7 +14,7 @@ class Demo(NamedTuple):
     """Cell of a demonstration.
 
     Attributes:
-        scenario: name of its scenario.
+        scenario: name of the cell's scenario.
         announcement: text printed before the run.
         title: title of the figure.
         overrides: overrides of the scenario, as for ``--set``.
@@ -62,10 +62,11 @@ DEMOS = {
 @click.option("--revolutions", type=click.FloatRange(min=1), default=60.0, show_default=True)
 @click.option("--folder", type=options.PATH, default=Path("bags"), show_default=True, help="for results")
 def demo(name: str, revolutions: float, folder: Path) -> None:
-    """Turn an oval-barrel piston: processes over DDS, learning, everything recorded.
+    """Turn an oval-barrel piston in separate processes over DDS, with learning and full recording.
 
-    NAME is piston (one channel, the default), two_channel (a piezo channel learns what the coarse one leaves) or
-    interrupted (a keyway, force on the drive and a wandering speed, by the disturbance controller and by its peer).
+    NAME is piston (one channel, the default), two_channel (a piezo channel learns the residual error of the coarse one)
+    or interrupted (a keyway, force on the drive and a varying speed, with the disturbance controller and, for
+    comparison, with another law).
     """
     process_launcher.server().preload({})  # the server imports concurrently with this process
     _show(DEMOS[name], revolutions, folder)

@@ -38,7 +38,7 @@ def table(found: Measurement, revolutions: list[int]) -> Table:
 
 
 def _chosen(text: str, whole: int) -> list[int]:
-    """Parse revolutions such as 1,4,10-12 into indices from 0; without a text, select some spread over all."""
+    """Parse revolutions such as 1,4,10-12 into indices from 0; an empty text selects some spread over the run."""
     if not text:
         return tables.spread(whole)
     chosen: list[int] = []
@@ -53,7 +53,7 @@ def _chosen(text: str, whole: int) -> list[int]:
 
 
 def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float | None) -> Lay | str | None:
-    """Return the surface along the part, or the reason for its absence; None: no nose radius in command and bag.
+    """Return the surface along the part, or the reason for its absence; None without a nose radius in command or bag.
 
     Raises:
         InputError: the command names a nose radius, but there is no surface.
@@ -90,7 +90,7 @@ def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float
 def measure(
     bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
 ) -> None:
-    """Measure the part that a recorded run has turned: form error, roundness, roughness by revolution."""
+    """Measure the part turned in a recorded run: form error, roundness and roughness by revolution."""
     recording = reader.read_bag(bag)
     found = part.measured(recording, cutoff=cutoff)
     surface = _surface(bag, recording, found, nose_radius)

@@ -15,7 +15,7 @@ _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help
 
 
 class _PassingThrough(click.Command):
-    """Command that passes on unknown options, and handles only a leading -h or --help itself."""
+    """Command that passes on unknown options and handles only a leading -h or --help itself."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Show the help for a leading -h or --help; pass on all other arguments."""

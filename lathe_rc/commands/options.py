@@ -58,7 +58,7 @@ start = click.option(
 
 length = click.option("--revolutions", type=POSITIVE, help="length of each run")
 
-# --- of the sweep and the tuning
+# --- sweep and tuning
 
 tie = click.option(
     "--tie",

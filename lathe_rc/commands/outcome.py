@@ -60,11 +60,13 @@ def facts(result: harness.Result) -> list[str]:
 
 
 def _margins(result: harness.Result) -> list[str]:
-    """Return the stability margins of all learning controllers in one line."""
+    """Return stability margins and drive margins of all learning controllers, one line each."""
     margins = [
         f"{name} {'not known' if margin is None else f'{margin:.4g}'}" for name, margin in result.margins.items()
     ]
-    return [f"stability margin: {', '.join(margins)}"] if margins else []
+    drives = [f"{name} {margin}" for name, margin in result.drive_margins.items()]
+    lines = {"stability margin": margins, "drive margin": drives}
+    return [f"{name}: {', '.join(each)}" for name, each in lines.items() if each]
 
 
 def _lateness(lateness: Lateness) -> list[str]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def check_place(path: Path) -> None:
-    """Check before any computation that an image file can be written.
+    """Check, before any computation, that an image file can be written.
 
     Raises:
         InputError: no image can be written to the path.

@@ -10,14 +10,14 @@ from rich.text import Text
 from lathe_rc import harness, messages
 from lathe_rc.analysis.form_errors import turns_before
 
-_HEIGHT = 14  # lines
-_NARROWEST = 40  # characters
-_POINTS = 4  # of a curve for each character across
-_STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}  # of rich, by plotext's colours
+_HEIGHT = 14  # height of the plot [lines]
+_NARROWEST = 40  # smallest width of the plot [characters]
+_POINTS = 4  # points of a curve per character of width
+_STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}  # styles of rich, by plotext's colours
 
 
 def show(result: harness.Result, console: Console) -> None:
-    """Print the plot to a terminal that can display it, but not to a pipe or a file."""
+    """Print the plot if the output is a terminal that can display it, not a pipe or a file."""
     seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
     if seen and (text := drawn(result, console.width)):
         console.print(text)

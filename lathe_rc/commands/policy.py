@@ -28,7 +28,7 @@ def policy(
     overrides: tuple[str, ...],
     output: Path | None,
 ) -> None:
-    """Make the SROS2 policy of a SCENARIO: an enclave for each process, the least that its nodes need."""
+    """Generate the SROS2 policy of a SCENARIO: one enclave per process, with the least permissions its nodes need."""
     loaded = scenarios.load(scenario, overrides)
     split = scenarios.split(loaded, groups)
     made = security.policy(loaded, groups=split, namespace=namespace, beside=beside)

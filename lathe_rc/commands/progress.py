@@ -18,7 +18,7 @@ from lathe_rc.analysis.budget import Budget
 from lathe_rc.cell.scenario import Scenario
 
 _REFRESH = 0.1  # [s] between updates of the progress line
-_LOG_PERIOD = 2.0  # [s] between lines where there is no terminal
+_LOG_PERIOD = 2.0  # [s] between lines without a terminal
 _INTERRUPTED = 130  # exit code
 
 
@@ -49,7 +49,7 @@ class Watch:
         self._bar.stop()
 
     def _log(self, event: harness.Event, now: float) -> None:
-        """Print a progress line at intervals if the output is no terminal."""
+        """Print a progress line at intervals if the output is not a terminal."""
         if event["event"] == "compiling" and not self._compiles:
             self._compiles = True
             self._bar.console.print(f"compiling {len(event['nodes'])} stages, once on this machine: some 20 s")
@@ -72,7 +72,7 @@ class Watch:
                 return  # more frequent updates are not readable, and would slow an offline run down
             self._due[kind] = now + _REFRESH
         if kind == "checked":
-            # Not before: the output of a rejected scenario is only one line.
+            # Not earlier, because the output of a rejected scenario is a single line.
             self._step = event["step"]
             update(self._task, total=event["samples"])
             self._bar.start()
@@ -94,12 +94,12 @@ class Watch:
                 error=f"error {event['rms_error'] * 1e6:.3g} µm RMS",
             )
         elif kind == "stall" and event["member"] != self._silent:
-            self._silent = event["member"]  # every other member reports a silent time master
+            self._silent = event["member"]  # all other members report a silent time master
             self._bar.console.print(f"{event['member']} is silent at block {event['blocks']}: the cell stands still")
 
 
 def watched_budget(scenario: Scenario) -> Budget:
-    """Return the budget of a scenario, and show the number of finished runs meanwhile."""
+    """Return the budget of a scenario, showing the number of finished runs meanwhile."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -198,4 +198,4 @@ TROUBLE: dict[str, Callable[[harness.Event], str]] = {
     "warning": lambda event: f"warning: {event['message']}",
     "behind": lambda event: str(event["message"]),
     "safe": lambda event: f"{event['why']}; the run ends at sample {event['end']}",
-}  #: lines for events that are printed in any case
+}  #: lines for events that are always printed

@@ -18,7 +18,7 @@ from lathe_rc.commands import options
 @click.option("--once", is_flag=True, help="end when all publishers are gone")
 @click.option("--hold", type=click.FloatRange(min=0, min_open=True, max=60), help="[s] that messages wait for others")
 def record(bag: Path, topics: tuple[str, ...], hold: float | None, **values: Any) -> None:
-    """Record any topics into a new BAG, in the order of their publication; Ctrl-C ends it.
+    """Record any topics into a new BAG, in the order of publication; Ctrl-C ends the recording.
 
     Exit code 3: messages are missing.
     """

@@ -13,7 +13,7 @@ from lathe_rc.errors import InputError
 @click.argument("stages", nargs=-1)
 @options.allow_code
 def reference(stages: tuple[str, ...]) -> None:
-    """Print the reference of nodes, topics, messages and parameters as Markdown, or that of some STAGES alone."""
+    """Print the reference of nodes, topics, messages and parameters as Markdown, or only that of some STAGES."""
     for kind in stages:
         if kind not in TABLES:
             raise InputError(f"no stage {kind!r}; {TABLES.instead(kind)}")

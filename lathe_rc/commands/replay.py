@@ -21,7 +21,7 @@ from lathe_rc.commands import options
 @click.option("--as-cell", is_flag=True, help="as the nodes that made it; begins when a recorder node is ready")
 @options.allow_code
 def replay(bag: Path, topics: tuple[str, ...], **values: Any) -> None:
-    """Send the messages of a BAG again, with /clock; services ~/pause, ~/resume and ~/toggle_paused."""
+    """Publish the messages of a BAG again, with /clock and the services ~/pause, ~/resume and ~/toggle_paused."""
     from lathe_rc.nodes import replayer
 
     sys.exit(replayer.run({"bag": str(bag), "topics": list(topics), **values}, ["--ros-args"]))

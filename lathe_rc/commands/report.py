@@ -14,7 +14,7 @@ from lathe_rc.commands import options
 @options.allow_code
 @click.option("--budget", is_flag=True, help="what the form error is made of, by some ten runs of the bag's scenario")
 def report(bag: Path, output: Path, *, budget: bool) -> None:
-    """Tell what a recording holds on one page: result, figures, what was lost; it opens without network."""
+    """Write a recording as one page with result, figures and losses; the page opens without a network."""
     from lathe_rc.view import report as reporting
 
     gathered = reporting.write_report(bag, output, with_budget=budget)

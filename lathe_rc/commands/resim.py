@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command ``lathe resim``: re-simulation of a recorded run behind its spindle, unchanged or with another controller."""
+"""Command ``lathe resim``: re-simulation of a run from its recorded spindle, unchanged or with another controller."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from lathe_rc.commands import completers, options, tables
 from lathe_rc.errors import InputError
 
 _DIFFERENT = 1  # exit code if the results of an unchanged run differ from the recording
-_UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # and factor for it
+_UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # unit and factor
 
 
 def _table(found: Resimulation) -> Table:
@@ -39,7 +39,7 @@ def _table(found: Resimulation) -> Table:
 
 
 def _drive_table(drive: Identified) -> Table:
-    """Return a table of the identified parameters and those of the scenario."""
+    """Return a table of the identified parameters and of the scenario's parameters."""
     columns = ("parameter", "unit", "identified", "standard error", *(["scenario"] if drive.before else []))
     table = tables.table(*columns, title=f"{drive.node} from {drive.command} and {drive.position[0]}", left=2)
     for name in drive_fit.PARAMETERS:
@@ -90,7 +90,7 @@ def _topics(given: Sequence[str]) -> dict[str, str]:
 
 
 def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | None) -> tuple[list[Identified], str]:
-    """Identify the drives of a bag without a scenario, and return them with the reason why it is not re-simulated."""
+    """Identify the drives of a bag without a scenario; return them with the reason why the bag is not re-simulated."""
     with Source(bag) as source:
         recorded = Recorded(source, topics)
         recorded.check_names(["encoder", "tool", "coarse/command", "coarse/state"])
@@ -141,9 +141,9 @@ def resim(
     identified: bool,
     as_json: bool,
 ) -> None:
-    """Run the cell of a BAG again behind its recorded spindle; unchanged, every bit must come out as recorded.
+    """Run the cell of a BAG again with its recorded spindle; an unchanged cell must reproduce every recorded bit.
 
-    A BAG that holds no scenario needs --scenario; its drive can be identified without (docs/bags.md).
+    A BAG without a scenario needs --scenario; its drive can be identified without one (docs/bags.md).
     """
     topics = _topics(topic)
     console = tables.console()
@@ -233,7 +233,7 @@ def _show(console: Console, found: Resimulation, output: Path | None) -> None:
 
 
 def _write_form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
-    """Write the tool's recorded position over the angle."""
+    """Write the recorded tool position as a function of the angle."""
     with Source(bag) as source:
         found = identify.form(Recorded(source, topics))
     identify.write_form(path, found)

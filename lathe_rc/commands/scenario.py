@@ -10,7 +10,7 @@ from lathe_rc.cell.scenario import Scenario
 def load(
     name: str, overrides: Sequence[str], *, revolutions: float | None = None, speed_factor: float | None = None
 ) -> Scenario:
-    """Load a scenario from a file, or by a name without ``.yaml``, which is also searched in ``config``.
+    """Load a scenario from a file, or by a name without ``.yaml``, which is also looked up in ``config``.
 
     Args:
         name: file or name of the scenario.
@@ -19,7 +19,7 @@ def load(
         speed_factor: pace of the run; None: as in the scenario.
 
     Raises:
-        InputError: there is no such scenario, or it is not valid.
+        InputError: there is no such scenario, or the scenario is invalid.
     """
     loaded = scenarios.load(name, overrides)
     asked = {"revolutions": revolutions, "speed_factor": speed_factor}
@@ -29,7 +29,7 @@ def load(
 
 
 def split(scenario: Scenario, groups: Sequence[str]) -> list[list[str]] | None:
-    """Return the nodes of each ``--group``; None if the option is not given: as in the scenario.
+    """Return the nodes of each ``--group``; None if the option is not given, so that the scenario's groups apply.
 
     Raises:
         InputError: a node is unknown, or named twice.

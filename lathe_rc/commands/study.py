@@ -20,7 +20,7 @@ from lathe_rc.study import STUDIES, Result, Study, StudyParameters
 
 
 def _value(row: Row, text: str) -> object:
-    """Parse the string of a parameter: 1,2,3 for a list parameter; a string parameter takes it unchanged."""
+    """Parse a parameter's string, such as 1,2,3 for a list; a string parameter keeps the string unchanged."""
 
     def scalar(part: str) -> Value:
         return part if row.type is str else ros_yaml.parse_value(part, f"--set {row.name}")
@@ -37,7 +37,7 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     """Return the parameters of a study from ``PARAM=VALUE`` strings, applied in order.
 
     Raises:
-        InputError: a parameter or value is not allowed; the message names the first one in one line.
+        InputError: a parameter or value is not allowed; the one-line message names the first one.
     """
     rows = study.parameters.rows()
     values: dict[str, object] = {}
@@ -124,7 +124,7 @@ class _Studies(click.Group):
         """Return the command of a study; None if there is no such study.
 
         Raises:
-            InputError: a third-party study cannot be imported, or is no study.
+            InputError: a third-party study cannot be imported, or is not a study.
         """
         return _StudyCommand(cmd_name, STUDIES[cmd_name]) if cmd_name in STUDIES else None
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lathe_rc.sweep.page import Written
     from lathe_rc.sweep.sweep import Sweep
 
-_BEST = 5  # cells that are shown
+_BEST = 5  # number of displayed cells
 
 
 def check_crew(scheduler: str | None, workers: int | None) -> None:
@@ -61,7 +61,7 @@ def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
 def space_of(
     vary: Sequence[str], draw: Sequence[str], tie: Sequence[str], sample: str, seeds: int, cells: Path | None
 ) -> "lathe_rc.Space":
-    """Return the space given by options; with a sample, ranges without a count belong to the sample."""
+    """Return the space given by options; with ``sample``, ranges without a count are sampled."""
     from lathe_rc.sweep.space import Space, given
 
     varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
@@ -134,7 +134,7 @@ def run(
     as_json: bool,
     **how: Any,
 ) -> None:
-    """Compute variations of a SCENARIO into a table; its rows are not computed again."""
+    """Compute variations of a SCENARIO into a table; existing rows are not computed again."""
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.commands.progress import SweepWatch
 
@@ -148,7 +148,7 @@ def run(
 
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
-    """Return the cells with the smallest maximum error, with their varied parameters, errors and margin."""
+    """Return the cells with the smallest maximum error, and their varied parameters, errors and margins."""
     columns = ["cell", *found.folder.targets, "tool.max_error", "tool.rms_error", "margin"]
     table = found.table().select(columns).sort_by("tool.max_error")
     return [each for each in table.slice(0, _BEST).to_pylist() if each["tool.max_error"] is not None]
@@ -191,7 +191,7 @@ def _formatted(name: str, value: object) -> str:
 @options.allow_code
 @options.as_json
 def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, as_json: bool) -> None:
-    """Show what is in the FOLDER of a sweep, and write FOLDER/page.html and its figures: maps, sensitivity, yield."""
+    """Show the results in the FOLDER of a sweep; write FOLDER/page.html and figures: maps, sensitivity and yield."""
     from lathe_rc.sweep import row
     from lathe_rc.sweep.folder import Folder
     from lathe_rc.sweep.sweep import Sweep

@@ -10,12 +10,12 @@ from rich.text import Text
 
 
 def console() -> Console:
-    """Return a console for the standard output, without highlighting, markup and line wrapping, which splits paths."""
+    """Return a console for standard output, without highlighting, markup or line wrapping, which would split paths."""
     return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
 def spread(whole: int, count: int = 10) -> list[int]:
-    """Return at most ``count`` indices below ``whole``, including the first and the last, denser at the beginning."""
+    """Return up to ``count`` indices below ``whole``, including the first and the last, denser at the beginning."""
     return sorted({round(place) - 1 for place in np.geomspace(1, whole, count).tolist()})
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lathe_rc.sweep.tuning import Trial, Tuning
 
 _LAWS = ("normal:", "uniform:")
-_STEPS = 5  # of the history that are shown
+_STEPS = 5  # number of displayed steps of the history
 
 
 @click.command()
@@ -93,7 +93,7 @@ def tune(
     as_json: bool,
     **search: Any,
 ) -> None:
-    """Search the parameters of a SCENARIO that meet goals best; the same command goes on where it was stopped."""
+    """Search for the parameters of a SCENARIO that best meet goals; the same command resumes a stopped search."""
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.commands.progress import SweepWatch
     from lathe_rc.sweep import history
@@ -192,7 +192,7 @@ def _results(tuning: "Tuning", trial: "Trial") -> dict[str, str]:
 
 
 def _cost_of(start: "Trial", best: "Trial") -> str:
-    """Describe the difference in stability margin between the start and the best trial, in a sentence."""
+    """Describe in a sentence how the stability margins of the start and the best trial differ."""
     before, margin = start.score.margin, best.score.margin
     if math.isnan(before):
         return f"the best has {margin:.4g} of margin; the start was refused before it had one"
@@ -201,7 +201,7 @@ def _cost_of(start: "Trial", best: "Trial") -> str:
 
 
 def _history(tuning: "Tuning") -> str:
-    """Return the successive improvements of the first goal as one line of text."""
+    """Return the successive improvements of the first goal as a line of text."""
     column = tuning.objectives.goals[0].column
     steps: dict[str, int] = {}
     for trial in tuning.improvements:

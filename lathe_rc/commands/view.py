@@ -68,7 +68,7 @@ def view(
     once: bool,
     as_json: bool,
 ) -> None:
-    """Show a BAG in Rerun: the part in three dimensions, form error, signals, learning, revolution by revolution."""
+    """Show a BAG in Rerun: the part in three dimensions, form error, signals and learning, revolution by revolution."""
     places = {"--output": output, "--web": web, "--connect": connect}
     if len(given := [name for name, value in places.items() if value]) > 1:
         raise InputError(f"{' with '.join(given)}; allowed: one of them")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps as functions of addresses, called by a program without Python, and by a single stage with little overhead.
+"""Steps as functions that take addresses: called by a program without Python, or by one stage with little overhead.
 
-The function for a kind of step is in a separate generated module, whose compiled code is cached:
-it depends on the types of the memory and the ports, not on their values.
+The function for a kind of step is in a separate generated module, whose compiled code is cached; the code depends on
+the types of the memory and the ports, not on their values.
 """
 
 import hashlib
@@ -56,11 +56,11 @@ def enter(memory, first, start, samples, fields, reached):
 
 _PLACE = re.compile(r'File "([^"]+)", line (\d+)')
 _WRONG = ("Unknown attribute", "No implementation", "Cannot unify", "Cannot", "Untyped global", "Invalid use", "Use of")
-BROKEN = -2  #: where a step has come to that has raised an exception: Numba prints it, and the function returns 0
+BROKEN = -2  #: sample reached by a step that raised an exception, which Numba prints; the function returns 0
 
 
 def broken() -> LatheError:
-    """Return the error of a step that has raised an exception."""
+    """Return the error for a step that has raised an exception."""
     return LatheError(
         "the step has raised an exception, which Numba has printed on the error stream of its process; "
         "without @kernel Python says where"
@@ -68,10 +68,10 @@ def broken() -> LatheError:
 
 
 class AddressTable:
-    """Layout of the address table of a step: positions of the addresses of its arrays.
+    """Layout of the address table of a step: positions of the addresses of the step's arrays.
 
-    First the number of inputs of float64; then the inputs of uint8, where a zero address represents no input;
-    then the outputs; and last the inputs of float64, so that their number does not affect the other positions.
+    The table contains the number of float64 inputs; the uint8 inputs, where a zero address represents no input; the
+    outputs; and finally the float64 inputs, so that their number does not affect the other positions.
 
     Args:
         inputs, outputs: element types of the arrays of all fields of all ports.
@@ -79,9 +79,9 @@ class AddressTable:
     Attributes:
         places: positions of the arrays, in order.
         size: size of the table.
-        flags: number of positions of inputs of uint8.
-        floats: number of inputs of float64.
-        first: position of the first input of float64.
+        flags: number of positions for uint8 inputs.
+        floats: number of float64 inputs.
+        first: position of the first float64 input.
     """
 
     def __init__(self, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]) -> None:
@@ -95,17 +95,17 @@ class AddressTable:
 
 
 class CompiledStep:
-    """Step with its memory, as a function of addresses.
+    """Step with its memory, as a function that takes addresses.
 
     Args:
-        step: step function, see `lathe_rc.cell.stage`.
+        step: step function (see `lathe_rc.cell.stage`).
         memory: memory of the step.
         inputs, outputs: element types of the arrays of all fields of all ports.
 
     Attributes:
         name: name of the generated module.
-        words: words of the memory, see `lathe_rc.compiled.struct_view.Struct`.
-        update: updates the layout of the memory, see `lathe_rc.compiled.struct_view.Struct.update`.
+        words: words of the memory (see `lathe_rc.compiled.struct_view.Struct`).
+        update: updates the layout of the memory (see `lathe_rc.compiled.struct_view.Struct.update`).
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class CompiledStep:
 
 
 def _cause(told: str) -> str:
-    """Return Numba's reason for a compilation error in one line: the innermost location, and the error there."""
+    """Return Numba's reason for a compilation error as one line: the innermost location, and the error there."""
     places = [found for found in _PLACE.findall(told) if not Path(found[0]).name.startswith("step_")]
     words = [line.strip() for line in told.splitlines()]
     why = next((line for line in reversed(words) if line.startswith(_WRONG)), next(filter(None, words), "no reason"))
@@ -165,7 +165,7 @@ def _call(
 
 
 class Entry:
-    """Function of addresses for a kind of step, memory and ports (see `CompiledStep`)."""
+    """Function that takes addresses, for one kind of step, memory and ports (see `CompiledStep`)."""
 
     def __init__(
         self, step: Step, memory: StructView, inputs: Sequence[np.dtype[Any]], outputs: Sequence[np.dtype[Any]]
@@ -183,7 +183,7 @@ class Entry:
             raise InputError(_cause(str(error))) from error
 
 
-_entry = cache(Entry)  # shared by all equal arguments
+_entry = cache(Entry)  # one entry for all calls with equal arguments
 
 
 def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence[np.dtype[Any]]) -> str:
@@ -192,7 +192,7 @@ def _text(step: Step, memory: StructView, table: AddressTable, outputs: Sequence
     def arrays(begin: int, kinds: Iterable[np.dtype[Any]]) -> str:
         return "".join(f"{_FIELDS[kind]}(fields, {place}, samples), " for place, kind in enumerate(kinds, begin))
 
-    # A third-party step gets a tuple, which it may unpack; built-in ones are compiled once for any number of inputs.
+    # A third-party step gets a tuple, which it may unpack; a built-in step is compiled once for any number of inputs.
     read = f"ports(fields + {8 * table.first}, word(fields, 0), samples)"
     return _MODULE.format(
         step=f"{step.__module__}.{step.__qualname__}",
@@ -211,18 +211,18 @@ def is_compiled(function: object) -> bool:
 
 
 def step_of(stage: type, loop: Step, sample: object) -> Step:
-    """Convert a loop function into the step of a class of stages; compiled if the called function is a kernel."""
+    """Return a loop function as the step of a stage class, compiled if the function that it calls is a kernel."""
     loop.__module__, loop.__qualname__ = stage.__module__, f"{stage.__qualname__}.step"
     return kernel(loop) if is_compiled(sample) else loop
 
 
 def _source(module: str) -> str:
-    """Return the hash that distinguishes versions of a step; built-in steps have a cache each."""
+    """Return the text that distinguishes versions of a step; each version of the built-in steps has its own cache."""
     return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
 
 
 def is_kept(name: str) -> bool:
-    """Return whether the compiled code of a module is in the cache of this machine, undamaged."""
+    """Return whether the cache of this computer contains the compiled code of a module, undamaged."""
     files = list(cache_folder().glob(f"*/{name}.*"))
     # Reading verifies the files: a damaged file is removed and compiled again.
     return any(path.suffix == ".nbi" for path in files) and None not in [read_kept(path) for path in files]
@@ -233,7 +233,7 @@ def _module(name: str, text: str, memory: StructView) -> ModuleType:
     """Create a module from source code, without a file; only its compiled code is stored."""
     module = ModuleType(f"lathe_rc_steps.{name}")
     vars(module)["MEMORY"] = memory
-    # Numba looks a function's module up by its name when it loads compiled code.
+    # Numba looks up a function's module by name when it loads compiled code.
     sys.modules[module.__name__] = module
-    exec(compile(text, f"/lathe_rc_steps/{name}.py", "exec"), vars(module))  # noqa: S102 - written here
+    exec(compile(text, f"/lathe_rc_steps/{name}.py", "exec"), vars(module))  # noqa: S102 - generated here
     return module

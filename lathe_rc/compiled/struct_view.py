@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Structs at an address, for kernels: a NamedTuple whose members are read on use.
+"""Structs at an address, for kernels: NamedTuples whose members are read only when used.
 
 Numba passes a NamedTuple of arrays by value: each call copies seven words per array and counts references. A
-`StructView` is one word, the address of the layout described in `lathe_rc.compiled`. The caller that creates a layout
-(`Struct`) keeps the arrays alive, and changes no word during a call.
+`StructView` is a single word, the address of the layout described in `lathe_rc.compiled`. The caller that creates a
+layout (`Struct`) must keep the arrays alive, and must not change any word during a call.
 
-The shapes of the arrays of a NamedTuple that is `sized` are part of the type: the compiler then unrolls the loops over
-matrices of two or six rows. Use it for few and small arrays, since each shape is compiled separately.
+If a NamedTuple is `sized`, the shapes of its arrays are part of the type, so that the compiler unrolls the loops over
+matrices of two or six rows. Use `sized` only for a few small arrays, since each shape is compiled separately.
 """
 
 import ctypes
@@ -63,10 +63,10 @@ class StructView(types.Type):
 
 
 def explain_unfit(value: object, name: str = "") -> str:
-    """Return the reason why a value cannot be laid out, with the name of the member; empty if it can.
+    """Return the reason why a value cannot be laid out, with the name of the member; empty if it can be laid out.
 
     Args:
-        value: NamedTuple of arrays of float64, int64 or uint8, constants, and NamedTuples of those.
+        value: NamedTuple of float64, int64 or uint8 arrays, constants, and NamedTuples of these.
         name: name of the value, for nested members.
     """
     if isinstance(value, tuple) and hasattr(value, "_fields"):
@@ -89,14 +89,14 @@ def explain_unfit(value: object, name: str = "") -> str:
 
 
 class _Layout(NamedTuple):
-    """Layout of all values of a type; ``words`` packs their leaves."""
+    """Layout common to all values of a type; ``words`` packs their arrays and constants."""
 
     kind: StructView
     words: struct.Struct
 
 
 def _spread(value: tuple[Any, ...], sorts: list[Any], leaves: list[Any]) -> None:
-    """Collect the properties that determine the layout of a NamedTuple, and its arrays and constants, in order."""
+    """Collect, in order, the properties that determine a NamedTuple's layout, and its arrays and constants."""
     kind = type(value)
     sorts.append(kind)
     known = kind in _SIZED
@@ -162,7 +162,7 @@ class Struct:
 
     Attributes:
         kind: type of the NamedTuple.
-        words: shape (size,).
+        words: words of the layout, shape (size,).
     """
 
     def __init__(self, value: tuple[Any, ...]) -> None:
@@ -171,7 +171,7 @@ class Struct:
         for part in leaves:
             words += _words(part) if isinstance(part, np.ndarray) else (part,)
         self.kind, pack = _layout(tuple(sorts))
-        # A struct without members needs an address as well.
+        # A struct without members also needs an address.
         self.words = np.frombuffer(bytearray(pack.pack(*words)) or bytearray(8), np.int64)
         self._floats = self.words.view(np.float64)
         self._value = value  # keeps the arrays alive
@@ -184,7 +184,7 @@ class Struct:
     def _update(self, kind: StructView, begin: int, value: tuple[Any, ...], known: tuple[Any, ...]) -> None:
         for (member, place), part, before in zip(kind.members.values(), value, known, strict=True):
             at = begin + place
-            # A stage creates a new tuple each time, mostly of the same arrays: then nothing has to be written.
+            # A stage creates a new tuple each time, mostly of the same arrays, which need not be written again.
             if part is before:
                 continue
             if isinstance(member, StructView):
@@ -201,7 +201,7 @@ def address(array: npt.NDArray[Any]) -> int:
     """Return the address of a contiguous array, 10 times as fast as NumPy."""
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # it is a buffer
-    except (TypeError, ValueError):  # it is read-only, or empty
+    except (TypeError, ValueError):  # the array is read-only or empty
         return array.ctypes.data
 
 
@@ -228,7 +228,7 @@ class _Members(AttributeTemplate):
 
 
 def _load(builder: Any, address: Any, kind: ir.Type) -> Any:
-    """Load the value at an address, constant during a call, so that it can be read once for a whole loop."""
+    """Load the value at an address, marked as constant during a call so that it can be read once for a whole loop."""
     loaded = builder.load(builder.inttoptr(address, kind.as_pointer()))
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
@@ -258,7 +258,7 @@ def _member(context: Any, builder: Any, kind: StructView, address: Any, name: st
         return words[0]
     if isinstance(member, types.Array):
         where, *shape = (_load(builder, word, _WORD) for word in words)
-        # Constants instead of loads: the compiler can unroll loops over them.
+        # Constants instead of loads, so that the compiler can unroll loops over them.
         if name in kind.shapes:
             shape = [_WORD(length) for length in kind.shapes[name]]
         return _array(context, builder, member, where, shape)
@@ -273,9 +273,9 @@ _lower(StructView)(_member)
 
 
 class Ports(types.Type):
-    """Type of the input arrays of a step, of any number: consecutive entries in a table of addresses.
+    """Type of any number of input arrays of a step: consecutive entries in an address table.
 
-    A kernel uses ``len`` and an index, as with a tuple; a tuple would be a different type for each length.
+    A kernel uses ``len`` and indexing as with a tuple, but a tuple would have a different type for each length.
     """
 
     def __init__(self) -> None:
@@ -297,7 +297,7 @@ def _at(_context: object, _address: Any, kind: Any) -> Any:
 
 
 def _array_of(element: types.Type) -> Any:
-    """Return the Numba implementation that reads an array of some element type."""
+    """Return the Numba implementation that reads an array of a given element type."""
     kind = types.Array(element, 1, "C")
 
     def array(_context: object, _table: Any, _number: Any, _samples: Any) -> Any:
@@ -354,13 +354,13 @@ def _call(_context: object, _address: Any, _a: Any, _b: Any, _c: Any, _d: Any, _
     return _INT(*[_INT] * 7), code
 
 
-at: Any = intrinsic(_at)  #: (address, type): the NamedTuple of a `StructView` type that stands there
-floats: Any = _array_of(types.float64)  #: (table, number, size): the float64 whose address stands in a table
-octets: Any = _array_of(types.uint8)  #: the same of uint8
-word: Any = intrinsic(_word)  #: (table, number): the whole number that stands in a table
-ports: Any = intrinsic(_ports)  #: (table, count, size): the `Ports` whose addresses stand in a table
-store: Any = intrinsic(_store)  #: (address, value): write a whole number
-call: Any = intrinsic(_call)  #: (address, six whole numbers): call an `lathe_rc.jit.entry`
+at: Any = intrinsic(_at)  #: (address, type): the NamedTuple of a `StructView` type at an address
+floats: Any = _array_of(types.float64)  #: (table, number, size): the float64 array whose address is in a table
+octets: Any = _array_of(types.uint8)  #: the same for a uint8 array
+word: Any = intrinsic(_word)  #: (table, number): the integer in a table
+ports: Any = intrinsic(_ports)  #: (table, count, size): the `Ports` whose addresses are in a table
+store: Any = intrinsic(_store)  #: (address, value): write an integer
+call: Any = intrinsic(_call)  #: (address, six integers): call a `lathe_rc.jit.entry`
 _counted: Any = intrinsic(_count)
 _numbered: Any = intrinsic(_port)
 

@@ -13,7 +13,8 @@ frequency w, its derivative of order k is d·Ω0·w^k and lasts about 1/w. The f
 
 The filter models the rounding to a count as white noise. This is wrong where the counts per sample c are near a ratio
 p/m of small integers: the rounding then repeats every m samples except for a beat of m·|c - p/m| per sample, which the
-filter follows if the beat is slow enough.
+filter follows if the beat is slow enough. The time of the last edge (`lathe_rc.signals.edge_time`) gives the angle at
+each sample to the turn in a tick of its clock, for any c.
 """
 
 from collections.abc import Collection
@@ -39,7 +40,8 @@ class AngleFilterTable(NamedTuple):
 
     Attributes:
         step: sampling step [s].
-        quantum: angle of a count [rad]; 0 for an ideal encoder.
+        quantum: angle of a count, or of a tick of the edges' clock, by which a reading is rounded down [rad]; 0 for an
+            ideal encoder.
         order: number of states: 4, or 3 without γ.
         intensity: noise intensity of the last state, per second.
         state: φ [rad], Ω [rad/s], α [rad/s²], γ [rad/s³], shape (4,).
@@ -56,7 +58,9 @@ class AngleFilterTable(NamedTuple):
     before: Array
 
 
-def angle_filter(step: float, counts: int, nominal: float, deviation: float, frequency: float) -> AngleFilterTable:
+def angle_filter(
+    step: float, counts: int, nominal: float, deviation: float, frequency: float, edge_clock: float = 0.0
+) -> AngleFilterTable:
     """Create an angle filter in its initial state.
 
     Args:
@@ -65,8 +69,11 @@ def angle_filter(step: float, counts: int, nominal: float, deviation: float, fre
         nominal: nominal speed Ω0 [rad/s].
         deviation: expected amplitude of the speed deviation, relative to Ω0.
         frequency: highest expected frequency of the deviation [rad/s].
+        edge_clock: resolution of the time stamps of the encoder's edges [s]; 0: there are none.
     """
     quantum = _TURN / counts if counts else 0.0
+    if edge_clock:
+        quantum = min(quantum, nominal * edge_clock)
     order = 4 if quantum <= nominal * step else 3
     spread = deviation * nominal * frequency ** np.arange(4.0)  # of Ω and its derivatives
     variances = np.array([quantum, _LEAST_SPREAD * nominal, spread[1], spread[2]]) ** 2

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the memory of repetitive control: learning at the grid points, reading between them.
+"""Kernels for the memory of repetitive control: learning at the grid points and reading between them.
 
-Samples come in blocks, and grid points lie anywhere between them. A block is therefore processed in passes: assignment
-of the points to the samples (`find`), learning of the points (`_learn_piece`), and set points of the drive (`_send`).
-The passes do the same operations in the same order as a sample-by-sample loop, but mostly vectorised by eight.
+Samples arrive in blocks, and grid points may lie anywhere between samples. A block is therefore processed in passes:
+points are assigned to samples (`find`), points are learned (`_learn_piece`), and the drive's set points are computed
+(`_send`). The passes perform the same operations in the same order as a sample-by-sample loop, but most of them are
+vectorised in groups of eight.
 """
 
 from typing import NamedTuple
@@ -21,26 +22,27 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
-PIECE = 512  #: grid points learned at a time
+PIECE = 512  #: number of grid points learned at a time
 
-# Indices in the integer state: next grid point to learn, samples seen, first point of the smoothed chunk, grid point
-# from which errors are learned, whether a cycle ended in the current sample, whether the memory was replaced since the
-# last sample, whether learning is on, whether the channel has joined, cycles in the log, whether to stop after each.
+# Indices in the integer state: next grid point to learn, whether any sample has arrived, first point of the smoothed
+# chunk, grid point from which errors are learned, whether a cycle ended in the current sample, whether the memory was
+# replaced since the last sample, whether learning is on, whether the channel has joined, number of cycles in the log,
+# whether to stop after each cycle.
 NEXT, SEEN, CHUNK, FROM, ENDED, REPLACED, LEARNS, JOINED, LOGGED, ASKS = range(10)
 INTEGERS = 10
-# Indices in the real state: sum of squares and largest error of the current cycle and of the last one, the newest
-# three angles and errors, v and v' of Wk2, its last place and input, state of the lead-lag term.
+# Indices in the real state: sum of squares and largest error of the current cycle and of the previous one, the last
+# three angles and errors, v and v' of Wk2, last read position and value, state of the lead-lag term.
 SQUARES, LARGEST, CYCLE_SQUARES, CYCLE_LARGEST, ANGLES, ERRORS, INVARIANT, PLACE, INPUT, LAG = (
     0, 1, 2, 3, 4, 7, 10, 12, 13, 14,
 )  # fmt: skip
 REALS = 15
-NO_CHUNK = -(1 << 62)  # further back than any grid point
+NO_CHUNK = -(1 << 62)  # lower than the index of any grid point
 
 DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: reasons for `advance` to return
 LOG = 64  #: largest number of completed cycles in the log
 
-_BACK = 8  # grid points by which a jittering angle may turn back behind the cycle being read
-ROOM = _BACK + 8  #: grid points stored in addition to a cycle, for the points around a read position
+_BACK = 8  # number of grid points by which a jittering angle may step back behind the cycle being read
+ROOM = _BACK + 8  #: number of grid points stored in addition to a cycle, for the points around a read position
 
 
 @inlined
@@ -50,25 +52,26 @@ def soft(u: float) -> float:
 
 
 class AngleMemory(NamedTuple):
-    """Memory of repetitive control with its law, for kernels.
+    """Memory and law of repetitive control, for kernels.
 
     Attributes:
-        delay: samples until a measured error is visible.
+        delay: number of samples until a measured error is available.
         grid: memory points per revolution.
-        cycle: memory points in a cycle.
+        cycle: memory points per cycle.
         gain: learning gain.
         ramp: grid points over which the gain rises.
         join_below: largest error of a cycle at which the channel joins [m].
-        ratio, reach: parameters of an exponential Q; ratio below 0: chunks are smoothed outside the kernel.
-        law, looks_ahead: law of the correction, and grid points that it reads ahead.
+        ratio, reach: parameters of an exponential Q; if ``ratio`` is negative, chunks are smoothed outside the kernel.
+        law, looks_ahead: correction law, and number of grid points that it reads ahead.
         settings: parameters of the correction.
-        memory: learned points, in number a power of two [m].
+        memory: learned points [m]; their number is a power of two.
         chunk: points of the previous cycle, smoothed by Q.
-        scratch: scratch for the smoothing.
-        windows: angles and errors of a block, preceded by the newest three before it, shape (2, n + 3) or more.
-        ahead: lead, its rate and bend along a block, shape (3, n) or more.
-        sample, work: scratch for the points learned at a time.
-        whole, real: integer and real state, indexed by the constants of the module.
+        scratch: scratch array for smoothing.
+        windows: angles and errors of a block, preceded by the last three before it, shape (2, n + 3) or more.
+        ahead: lead, and first and second time derivatives of the read angle, for each sample of a block, shape (3, n)
+            or more.
+        sample, work: scratch arrays for the points learned at a time.
+        whole, real: integer and real state, indexed by the module's constants.
         log: last sample, sum of squares, largest error, learning flag and joined flag of each cycle, shape (LOG, 5).
     """
 
@@ -97,14 +100,14 @@ class AngleMemory(NamedTuple):
 
 @inlined
 def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Array) -> None:
-    """Begin a block: store its angles and errors after the newest three of the block before, shape (n + 3,).
+    """Begin a block: store its angles and errors after the last three of the previous block, shape (n + 3,).
 
-    Errors are available starting at sample ``delay``; up to it the stored angle is constant, so nothing is learned.
+    Errors are available from sample ``delay`` on; before it the stored angle is constant, so nothing is learned.
     """
     n, per_radian, delay = error.size, m.grid / _TURN, m.delay
     whole, real, angles, errors = m.whole, m.real, m.windows[0, : error.size + 3], m.windows[1, : error.size + 3]
     if whole[REPLACED] and n:
-        # Errors still delayed belong to the memory that was replaced.
+        # Errors that are still delayed belong to the replaced memory.
         whole[REPLACED] = 0
         whole[FROM] = int(np.ceil(angle[0] * per_radian))
     start = min(max(delay - first, 0), n)
@@ -130,24 +133,24 @@ def begin(m: AngleMemory, first: int, angle: Array, past_angle: Array, error: Ar
 def find(
     m: AngleMemory, start: int, point: int, stop: int, angles: Array, angle: Array, lead: Array
 ) -> tuple[int, int, int, int]:
-    """Assign the grid points from ``point`` up to ``stop`` to the samples in whose interval of angle they lie.
+    """Assign the grid points from ``point`` up to ``stop`` to the samples whose angle intervals contain them.
 
     The search stops after the sample in which a cycle ends.
 
     Returns:
-        The sample reached, the number of points assigned, the reason of the stop (`SMOOTH`: at the last point), and
+        The sample reached, the number of points assigned, the reason for stopping (`SMOOTH`: at the last point), and
         whether a cycle ended in the current sample.
     """
     cycle, per_radian, looks_ahead, ended = m.cycle, m.grid / _TURN, m.looks_ahead, m.whole[ENDED]
     sample, place = m.sample, m.work[6]
     for j in range(stop - point):
         place[j] = (point + j) / per_radian
-    place[stop - point] = np.inf  # ends the search below without a test of the count
+    place[stop - point] = np.inf  # sentinel, so that the search below need not test the count
     count = 0
     to_end = cycle - point % cycle
     for k in range(start, angle.size):
         before, now = angles[k + 1], angles[k + 2]
-        # Half a revolution in a sample is a wrong angle, and could not be learned from.
+        # A step of more than half a revolution means a wrong angle, from which nothing could be learned.
         if abs(angles[k + 3] - now) > np.pi:
             return k, count, JUMPED, ended
         if now > before:
@@ -179,7 +182,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
         k = sample[j]
         work[0, j], work[1, j] = angles[k + 1], angles[k + 2]
         work[2, j], work[3, j], work[4, j], work[5, j] = errors[k], errors[k + 1], errors[k + 2], errors[k + 3]
-    delta = place  # the place of a point is not needed after its error is known
+    delta = place  # reuses the array: the position of a point is not needed once its error is known
     for j in range(count):
         u = (place[j] - work[0, j]) * (1.0 / (work[1, j] - work[0, j]))
         delta[j] = cubic(work[2, j], work[3, j], work[4, j], work[5, j], u)
@@ -193,7 +196,7 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
     else:
         for j in range(count):
             memory[(point + j) & mask] = memory[(point + j - cycle) & mask]
-    # Summed one after the other: the order must not depend on the division of the points into chunks.
+    # Summed one by one: the order must not depend on the division of the points into chunks.
     squares, largest = real[SQUARES], real[LARGEST]
     end = cycle - 1 - point % cycle
     for j in range(count):
@@ -226,7 +229,7 @@ def _learn(
     angles: Array,
     errors: Array,
 ) -> tuple[int, int]:
-    """Learn from sample ``start`` of the block until the caller has to act.
+    """Learn from sample ``start`` of the block on, until the caller must act.
 
     Returns:
         The sample of the block reached, and the reason as for `_step`.
@@ -255,7 +258,7 @@ def _learn(
 
 @kernel
 def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
-    """Compute the set point of the drive from the memory at ``place`` [grid point]."""
+    """Compute the set point of the drive from the memory at ``place`` [grid points]."""
     law, per_radian, settings, memory, real = m.law, m.grid / _TURN, m.settings, m.memory, m.real
     i = int(np.floor(place))
     u = place - i
@@ -282,7 +285,7 @@ def _command(m: AngleMemory, place: float, rate: float, bend: float) -> float:
 def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> None:
     """Fill ``told`` with the set points of the drive for samples ``start`` to ``stop`` of the block.
 
-    The memory may be ahead of these samples by a block, since it stores more than the cycle they read.
+    The memory may be a block ahead of these samples, since it stores more than the cycle that they read.
     """
     per_radian, lead, rate, bend = m.grid / _TURN, m.ahead[0], m.ahead[1], m.ahead[2]
     if m.law == 0:
@@ -329,10 +332,10 @@ def _end_cycle(m: AngleMemory, sample: int) -> None:
 
 @kernel
 def advance(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> tuple[int, int]:
-    """Advance from sample ``start`` of a block to its end (`DONE`), or until the caller has to act.
+    """Advance from sample ``start`` of a block to its end (`DONE`), or until the caller must act.
 
     Args:
-        m: memory, with the lead of the block and after `begin`.
+        m: memory, after `begin` and with the lead of the block filled in.
         first: index of the block's first sample.
         start: sample of the block to start at.
         angle: measured spindle angle [rad], shape (n,).

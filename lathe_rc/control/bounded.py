@@ -23,7 +23,7 @@ _WITHIN = 1.0 + 1e-9
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of velocity, acceleration and jerk of a motion; its initial velocity may exceed them.
+    """Bounds on the velocity, acceleration and jerk of a motion; the initial velocity may exceed its bound.
 
     Attributes:
         velocity: largest velocity [m/s].
@@ -46,13 +46,13 @@ class Bounds:
 
 
 def motion(start: float, velocity: float, end: float | None, bounds: Bounds, step: float) -> Array:
-    """Compute a motion to rest: a fifth-degree polynomial, within 5 % of the shortest duration the bounds allow.
+    """Compute a motion to rest: a fifth-degree polynomial that lasts at most 5 % longer than the bounds require.
 
     Args:
         start: initial position [m]; the initial acceleration is 0.
         velocity: initial velocity [m/s].
         end: final position [m]; None for the earliest stop.
-        bounds: bounds of the motion; an initial velocity above the bound is not exceeded.
+        bounds: bounds of the motion; if the initial velocity exceeds its bound, it becomes the largest velocity.
         step: sampling step [s].
 
     Returns:
@@ -65,7 +65,7 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
         raise LatheError(f"a command of {start} with a rate of {velocity} is taken over; allowed: finite numbers")
     highest = max(bounds.velocity, abs(velocity))
     length = abs(velocity) * step if end is None else abs(end - start)
-    # Lower bound of the duration, from the peaks of a rest-to-rest motion.
+    # Lower bound for the duration, from the peaks of a rest-to-rest motion.
     duration = max(step, 1.875 * length / highest, (60.0 * length / bounds.jerk) ** (1 / 3) / 2.0)
     while True:
         way = velocity * duration / 2.0 if end is None else end - start
@@ -78,12 +78,12 @@ def motion(start: float, velocity: float, end: float | None, bounds: Bounds, ste
         duration *= _LONGER
     samples = int(np.ceil(duration / step))
     positions: Array = start + path(np.minimum(np.arange(1, samples + 1) * step, duration))
-    positions[-1] = start + way if end is None else end  # without rounding error: the command stays at this position
+    positions[-1] = start + way if end is None else end  # exact, since the command stays at this position
     return positions
 
 
 def prepare() -> None:
-    """Import the SciPy module used by `motion` in advance: importing it at the first motion would stall a run."""
+    """Import the SciPy module of `motion` in advance, since an import at the first motion would stall a run."""
     motion(0.0, 0.0, 0.0, Bounds(1.0, 1.0, 1.0), 1.0)
 
 
@@ -95,7 +95,7 @@ class Mode(IntEnum):
     RETRACT = 2  #: the command moves to the retracted position, out of the part
 
 
-_MODE, _PLACE = 0, 1  # indices in the state of a takeover: its mode, and the samples of its path already output
+_MODE, _PLACE = 0, 1  # indices in the state of a takeover: mode, and number of samples of the path already output
 
 
 class TakeoverTable(NamedTuple):
@@ -104,7 +104,7 @@ class TakeoverTable(NamedTuple):
     Attributes:
         path: positions of the motion; in the mode FOLLOW, offsets added to the controller's command [m], shape (n,).
         whole: mode, and number of samples of the path already output.
-        given, wanted: the last two samples of the command after and before the takeover [m].
+        given, wanted: the last two samples of the command sent to the drive, and of the controller's command [m].
     """
 
     path: Array
@@ -115,13 +115,13 @@ class TakeoverTable(NamedTuple):
 
 @inlined
 def follows(takeover: TakeoverTable) -> bool:
-    """Return whether the controller's command passes unchanged."""
+    """Return whether the controller's command passes through unchanged."""
     return bool(takeover.whole[_MODE] == Mode.FOLLOW.value and takeover.whole[_PLACE] >= takeover.path.size)
 
 
 @inlined
 def _keep_last(last: Array, samples: Array) -> None:
-    """Update the last two samples with a block of any length."""
+    """Update the last two samples from a block of any length."""
     if samples.size > 1:
         last[0], last[1] = samples[-2], samples[-1]
     elif samples.size == 1:
@@ -145,10 +145,10 @@ def take_over(takeover: TakeoverTable, command: Array) -> None:
 
 
 class Takeover:
-    """Takeover of a command for hold or retraction, and its return to the controller, without a jump of position.
+    """Takeover of a command for a hold or a retraction, and return to the controller, without a jump in position.
 
-    The velocity does not jump either, unless the command is faster than the bounds allow. For a command out of reach,
-    where no drive can be, the motion begins at the end of the reach.
+    The velocity does not jump either, unless the command is faster than the bounds allow. If the command is out of
+    reach, where no drive can be, the motion begins at the limit of the reach.
 
     Args:
         bounds: bounds of the takeover's own motions.
@@ -156,11 +156,11 @@ class Takeover:
         step: sampling step [s].
         reach: largest distance between the start and the end of a motion [m].
         carries: whether a motion begins with the velocity of the command, limited to the bounds; False for a command
-            of steps and noise, which has no meaningful velocity.
+            that consists of steps and noise and so has no meaningful velocity.
 
     Attributes:
         table: state for `take_over`.
-        skipped: distance between the command and the start of the last motion, if out of reach [m]; 0 within reach.
+        skipped: distance from the command to the start of the last motion [m]; 0 unless the command was out of reach.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Takeover:
 
     @property
     def remaining(self) -> int:
-        """Samples until the end of the current motion."""
+        """Number of samples until the end of the current motion."""
         return self.table.path.size - int(self.table.whole[_PLACE])
 
     def change(self, mode: Mode) -> None:
@@ -203,8 +203,8 @@ class Takeover:
     def _way(self, velocity: float, *, to_goal: bool) -> Array:
         """Compute the path to rest or to the retracted position.
 
-        A command that moves away from the retracted position is first stopped: a single motion would go far into the
-        part.
+        A command that moves away from the retracted position is stopped first, since a single motion would go far into
+        the part.
         """
         start, step = self.newest, self._step
         if not to_goal:
@@ -221,6 +221,6 @@ class Takeover:
         return within
 
     def _carried(self, command: Array) -> float:
-        """Velocity of the last two samples, limited to the bounds; a faster change is noise or a step."""
+        """Return the velocity of the last two samples, limited to its bound; a faster change is noise or a step."""
         highest = self._bounds.velocity if self._carries else 0.0
         return float(np.clip((command[1] - command[0]) / self._step, -highest, highest))

@@ -2,13 +2,13 @@
 """Corrections 1/W0 between the memory and the drive (papers 000 and 001).
 
     none                          the lead alone
-    lead_lag                      (1 + pT1)/(1 + pT2) after it
-    second_order_inverse          1 + a1·p + a2·p² of the memory with p² = Ω²s²  (s = d/dφ; exact at constant speed)
+    lead_lag                      (1 + pT1)/(1 + pT2) in addition to the lead
+    second_order_inverse          1 + a1·p + a2·p² of the memory, with p² = Ω²s²  (s = d/dφ; exact at constant speed)
     second_order_inverse_dynamic  the same with p² = Ω²s² + (dΩ/dt)·s
-    exact                         Wk2 then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
+    exact                         Wk2, then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
                                   angle domain, then its inverse in time
 
-a1 = 2ζ/ωn, a2 = 1/ωn² belong to a drive model e^{-pτ}/(1 + a1·p + a2·p²); its delay τ is compensated by the lead.
+The drive model is e^{-pτ}/(1 + a1·p + a2·p²) with a1 = 2ζ/ωn and a2 = 1/ωn²; the lead compensates its delay τ.
 """
 
 from dataclasses import dataclass
@@ -75,9 +75,10 @@ def invariant(
 ) -> float:
     """Compute the set point of the next sample by Wk2 and then Wk1 (law EXACT).
 
-    Wk2: a2Ω0²·v'' + a1Ω0·v' + v = Y in the angle (Runge-Kutta of fourth order, Y linear from ``before`` to ``y``
-    over ``distance`` [rad]). Wk1: v + a1·dv/dt + a2·d²v/dt² with the first and second time derivative of the angle,
-    ``rate`` and ``bend``; v' and v'' follow from Wk2 without differentiation. ``v`` holds v and v'.
+    Wk2 is a2Ω0²·v'' + a1Ω0·v' + v = Y with derivatives with respect to the angle (fourth-order Runge-Kutta, with Y
+    linear from ``before`` to ``y`` over ``distance`` [rad]). Wk1 is v + a1·dv/dt + a2·d²v/dt², where ``rate`` and
+    ``bend`` are the first and second time derivatives of the angle; v' and v'' follow from Wk2 without numerical
+    differentiation. ``v`` contains v and v'.
     """
     b1, b2 = a1 * nominal, a2 * nominal**2
     middle, half = 0.5 * (before + y), 0.5 * distance

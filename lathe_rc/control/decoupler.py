@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoupler of the force and the position loop (paper 004, Figs 5 and 10).
+"""Decoupler of the force and position loops (paper 004, Figs 5 and 10).
 
     F = W1·v1 + W4·x,  x = W2·v2,  y = x + W3·F
     v1 = u1 - K1·u2,   v2 = u2 - K2·u1
 
-The longitudinal feed causes force through W1, the cross feed moves the tool by W2. The depth of cut causes force
-through W4, the force deflects tool and part by W3. K1 = W2·W4/W1 cancels the effect of u2 on the force, K2 = W1·W3/W2
-that of u1 on the position. An inverse has more zeros than poles: one lag is added for each missing order. An integrator
-in K1 or K2 would accumulate the error of an inexact model without limit: 1/p is replaced by 1/(p + leak).
+The longitudinal feed produces a force through W1, and the cross feed moves the tool through W2. The depth of cut
+produces a force through W4, and the force deflects tool and part through W3. K1 = W2·W4/W1 cancels the effect of u2 on
+the force, and K2 = W1·W3/W2 that of u1 on the position. Since an inverse has more zeros than poles, one lag is added
+for each missing order. An integrator in K1 or K2 would accumulate the error of an inexact model without limit, so 1/p
+is replaced by 1/(p + leak).
 
-The paper uses mm, N and % of the full command; the channels here are in m, N and 1, converted once below.
+The paper uses mm, N and % of the full command; here the channels are in m, N and 1, converted once below.
 """
 
 from collections.abc import Mapping
@@ -25,7 +26,7 @@ from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 
 Array = npt.NDArray[np.float64]
 
-LAG = 1e-3  #: for each missing order of an inverse [s] (paper 004)
+LAG = 1e-3  #: lag added for each missing order of an inverse [s] (paper 004)
 LEAK = 0.05  #: leak of the integrators [rad/s]
 _OFF = System(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0), 0.0)
 
@@ -45,13 +46,13 @@ def gain(value: float) -> TransferFunction:
 
 @dataclass(frozen=True)
 class Channels:
-    """Transfer functions of the plant with its force and position loop.
+    """Transfer functions of the plant of the force and position loops.
 
     Attributes:
-        w1: force over the command of the longitudinal feed [N].
-        w2: position of the tool over the command of the cross feed [m].
-        w3: displacement added to the position over the force [m/N]; negative if the force pushes the tool away.
-        w4: force over the position of the tool [N/m].
+        w1: from the command of the longitudinal feed to the force [N].
+        w2: from the command of the cross feed to the position of the tool [m].
+        w3: from the force to the displacement added to the position [m/N]; negative if the force pushes the tool away.
+        w4: from the position of the tool to the force [N/m].
     """
 
     w1: TransferFunction
@@ -64,7 +65,7 @@ _W1 = gain(1179.0) * lags(0.17, 0.22)  # 11.79 N/%
 _W2 = TransferFunction((4.38e-3,), (0.045, 1.0, 0.0))  # 0.0438 mm/s/%
 _W4 = gain(233.3e3) * lags(0.075)  # 233.3 N/mm
 
-FULL_W1 = gain(1188.9) * lags(0.11304, 0.2679, 0.01659, 0.01659)  #: meets the paper's Fig. 12, which W1 does not
+FULL_W1 = gain(1188.9) * lags(0.11304, 0.2679, 0.01659, 0.01659)  #: reproduces the paper's Fig. 12, unlike W1
 PAPER = Channels(_W1, _W2, TransferFunction((0.385e-6,), (0.003, 0.0005, 1.0)), _W4)  #: as printed: W3 at 2.9 Hz
 REALISTIC = Channels(_W1, _W2, TransferFunction((-0.385e-6,), (0.003**2, 0.0005, 1.0)), _W4)  #: W3 at 53 Hz
 PRESETS: Mapping[str, Channels] = MappingProxyType({"paper": PAPER, "realistic": REALISTIC})
@@ -89,7 +90,7 @@ def inverse(transfer: TransferFunction, lag: float = LAG) -> TransferFunction:
 
 
 def _leaking(transfer: TransferFunction, leak: float) -> TransferFunction:
-    """Replace the integrators by 1/(p + leak), after cancellation against zeros at 0."""
+    """Replace the integrators by 1/(p + leak), after cancelling them against zeros at 0."""
     top, bottom = np.array(transfer.numerator), np.array(transfer.denominator)
     zeros, poles = (part.size - np.trim_zeros(part, "b").size for part in (top, bottom))
     both = min(zeros, poles)
@@ -103,12 +104,12 @@ def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tu
     """Compute the compensators K1 and K2 from a model of the plant.
 
     Args:
-        channels: model of the plant; that of paper 004 has reduced order.
+        channels: model of the plant; the model of paper 004 is of reduced order.
         lag: time constant of the lags in the inverses [s].
         leak: leak of the integrators [rad/s].
 
     Raises:
-        InputError: W1 or W2 has no stable inverse, ``lag`` is not positive or ``leak`` negative.
+        InputError: W1 or W2 has no stable inverse, ``lag`` is not positive, or ``leak`` is negative.
     """
     if leak < 0.0:
         raise InputError(f"decoupler: leak {leak:g} rad/s; allowed: 0 for none, or above")
@@ -135,10 +136,10 @@ def decouple_along(
 class Decoupler:
     """Decoupler of two loops by the compensators K1 and K2; at rest at 0 before the first sample.
 
-    v1 and v2 are not limited here, but by the drives.
+    The drives limit v1 and v2, not the decoupler.
 
     Args:
-        k1, k2: compensators from `compensators`; None for none.
+        k1, k2: transfer functions from `compensators`; None for no compensator.
         step_s: sampling step [s].
 
     Attributes:

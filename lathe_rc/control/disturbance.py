@@ -5,16 +5,16 @@ The drive is x + a1·dx/dt + a2·d²x/dt² = u(t - τ) + f. The disturbance, in 
 
     w = x + a1·dx/dt + a2·d²x/dt² - u(t - τ)
 
-with the measured position x and the command u. With a good model w does not depend on u, so that learning it closes no
-loop and cannot diverge. A wrong model closes a loop with the gain E = (Wi/Ŵi)·e^{pτ̂} - 1, which still converges to
+with the measured position x and the command u. With a good model, w does not depend on u, so learning w closes no loop
+and cannot diverge. A wrong model closes a loop with the gain E = (Wi/Ŵi)·e^{pτ̂} - 1, which still converges to
 x = r as long as |E| is below 1.
 
-**Memory** (repetitive control), over the angle: `lathe_rc.control.disturbance_memory`.
+**Memory** over the angle (repetitive control): `lathe_rc.control.disturbance_memory`.
 
 **Observer** (in time): L·w - L·F̂ with L = 1/(1 + p/ωo)³, the part of the disturbance not yet in the memory.
 
-**Identification** of a1 and a2: `lathe_rc.control.identification`. The effect of an error in the result repeats, and is
-learned as a part of f.
+**Identification** of a1 and a2: `lathe_rc.control.identification`. The effect of an error in the identified model
+repeats, and is therefore learned as part of f.
 
 Source: spec/robust.md.
 """
@@ -47,15 +47,15 @@ Integers = npt.NDArray[np.int64]
 _TURN = 2.0 * np.pi
 _SWINGS_IN = 10.0  # settling time of the drive, in units of a1
 
-# Indices in the integer state: current grid point, first grid point, whether there is one, learned revolutions,
-# whether a position has been received.
+# Indices in the integer state: current grid point, first grid point, whether there is a current grid point, number of
+# learned revolutions, whether a position has been received.
 _POINT, _FIRST, _BEGUN, _REVOLUTIONS, _SEEN = range(5)
 # Indices in the sums of a grid point: learned disturbance and its count, relative speed, dx/dt, d²x/dt², u - x.
 _SUM, _COUNT, _SPEED, _VELOCITY, _ACCELERATION, _REST = range(6)
 
 
 class FormAhead(NamedTuple):
-    """Desired form of the part for kernels: arguments of `lathe_rc.signals.profile_table.derivatives_at`."""
+    """Desired form of the part for kernels, as arguments of `lathe_rc.signals.profile_table.derivatives_at`."""
 
     heights: Array
     table: Array
@@ -70,18 +70,18 @@ class DisturbanceTable(NamedTuple):
     Attributes:
         step: sampling step [s].
         model: identified a1 [s] and a2 [s²], shape (2,).
-        late: samples until a measured position is available.
+        late: number of samples until a measured position is available.
         begins: first sample used for learning, after the transient of the drive.
-        whole, part: delay of the drive: whole samples, and the fraction of a sample.
+        whole, part: delay of the drive, as whole samples and a fraction of a sample.
         commands: past commands; sample n is at index n modulo the length, a power of two [m].
-        observer, observes: low-pass of the observer, and whether it is on.
+        observer, observes: low-pass of the observer, and whether the observer is on.
         learned: states of the observer's low-pass for the memory's prediction, shape (4,) [m].
         learner: low-pass of the learned disturbance.
         memory: memory of the disturbance over the angle.
-        identifier, identifies: low-pass of the identification, and whether it is on.
-        fit: accumulated measurements for the fit of the model.
+        identifier, identifies: low-pass of the identification, and whether identification is on.
+        fit: accumulated measurements for fitting the model.
         point: sums of the current grid point.
-        state: integer state, indexed by the constants of the module.
+        state: integer state, indexed by the module's constants.
     """
 
     step: float
@@ -125,16 +125,16 @@ def disturbance(
         step: sampling step [s].
         nominal_speed: speed Ω0 [rad/s].
         model: natural frequency [rad/s], damping and delay [s] of the drive.
-        feedback_delay: samples until a measured position is available.
-        observer_bandwidth: bandwidth of the observer [rad/s]; 0 for none.
+        feedback_delay: number of samples until a measured position is available.
+        observer_bandwidth: bandwidth of the observer [rad/s]; 0 for no observer.
         learning_bandwidth: bandwidth of the learned disturbance [rad/s].
         learning_gain: stationary gain of the memory's Kalman filters, below 1; 0 for no memory.
-        follows_speed: whether the slope of the disturbance over the speed is learned.
-        learned_waves: learned waves per revolution, see `lathe_rc.control.disturbance_memory.smoothing`.
+        follows_speed: whether the slope of the disturbance with respect to the speed is learned.
+        learned_waves: cut-off of S in waves per revolution, see `lathe_rc.control.disturbance_memory.smoothing`.
         points_per_revolution: memory points per revolution, a power of two.
         identification_bandwidth: bandwidth of the identification [rad/s].
         identify: whether the model is identified.
-        identification_forgetting: forgetting factor of the measurements per revolution.
+        identification_forgetting: forgetting factor applied to the measurements once per revolution.
 
     Raises:
         InputError: the filter S is wider than a revolution.
@@ -166,7 +166,7 @@ def disturbance(
 
 
 def forget(m: DisturbanceTable) -> None:
-    """Clear the memory over the angle and the fit; model and observer are kept."""
+    """Clear the memory over the angle and the fit; keep the model and the observer."""
     forget_all(m.memory)
     forget_measurements(m.fit)
     m.point[:] = 0.0
@@ -189,7 +189,7 @@ def observed(
     position: float,
     learning: bool,  # noqa: FBT001 - kernels take their arguments by position
 ) -> float:
-    """Process the position measured ``late`` samples ago; return the observed disturbance less the learned one [m].
+    """Process the position measured ``late`` samples ago; return the observed minus the learned disturbance [m].
 
     Args:
         m: model of drive and disturbance.
@@ -204,7 +204,7 @@ def observed(
     mask = m.commands.size - 1
     command = (1.0 - m.part) * m.commands[k & mask] + m.part * m.commands[(k - 1) & mask] if k >= 1 else 0.0
     known = expected(m.memory, angle, speed)
-    if not m.state[_SEEN]:  # the drive is assumed at rest at its first position
+    if not m.state[_SEEN]:  # the drive is assumed to be at rest at its first position
         m.state[_SEEN] = 1
         m.observer.position[:] = m.learner.position[:] = m.identifier.position[:] = position
         m.observer.command[:] = m.learner.command[:] = m.identifier.command[:] = position
@@ -237,7 +237,7 @@ def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -
     low, point, state = m.learner, m.point, m.state
     first, second = derivatives(low.position, low.bandwidth)
     beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second - low.command[STAGES]
-    lag = STAGES / low.bandwidth  # of a slow signal behind the low-pass: it belongs to the angle of that time before
+    lag = STAGES / low.bandwidth  # of the low-pass for slow signals, which thus belong to an earlier angle
     place = int(np.floor((angle - speed * lag) * (m.memory.value.size / _TURN)))
     low = m.identifier
     if not state[_BEGUN]:
@@ -278,13 +278,13 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
 
 @inlined
 def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
-    """Adopt the identified model, and correct filters and memory for the change of the model."""
+    """Adopt the identified model, and correct the filters and the memory for the change of the model."""
     a1, a2 = fitted(m.fit)
     if not (a1 > 0.0 and a2 > 0.0):
         return
     more1, more2 = a1 - m.model[0], a2 - m.model[1]
     m.model[0], m.model[1] = a1, a2
-    # The states of the low-passes belong to the old model: unchanged, they would cause a step of the disturbance.
+    # The states of the low-passes belong to the old model; left unchanged, they would cause a step in the disturbance.
     for low, known in ((m.observer, m.learned), (m.learner, m.learner.command)):
         first, second = derivatives(low.position, low.bandwidth)
         for place in range(known.size):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Memory of a disturbance that repeats with the angle, learned from revolution to revolution (repetitive control).
 
-For each grid point of the angle a Kalman filter estimates a value and its slope over the speed,
-F̂ = v + s·(Ω/Ω0 - 1): an effect that lags the cut shifts to another angle at a higher speed. The learned values pass a
-zero-phase filter S over the angle; the components that S removes decay by 10 % per revolution.
+For each grid point of the angle, a Kalman filter estimates a value and its slope with respect to the speed,
+F̂ = v + s·(Ω/Ω0 - 1), since an effect that lags the cut shifts to another angle at a higher speed. The learned values
+pass a zero-phase filter S over the angle; the components that S removes decay by 10 % per revolution.
 
 Source: spec/robust.md; learning over the position for non-circular cutting: Nakano, 1996.
 """
@@ -20,13 +20,13 @@ from lathe_rc.jit import inlined, kernel
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
-_TAIL = 5.0  # standard deviations at which S is cut off
+_TAIL = 5.0  # distance at which S is truncated [standard deviations]
 _HALF = float(np.sqrt(-2.0 * np.log(1.0 - np.sqrt(0.5))))  # where the twiced Gaussian is 1/2, for a deviation of 1
-_UNKNOWN = 1e4  # initial variance of a value, over that of a measurement
-_SLOPE = 1e2  # initial variance of its slope over the relative speed
-_SLOPE_DRIFT = 1e-2  # drift of the slope's variance in a revolution, over its initial variance
+_UNKNOWN = 1e4  # initial variance of a value, relative to that of a measurement
+_SLOPE = 1e2  # initial variance of its slope with respect to the relative speed
+_SLOPE_DRIFT = 1e-2  # increase of the slope's variance per revolution, relative to its initial value
 LEAK = 0.1  #: decay per revolution of the components that S does not pass
-_SETTLED = 8  # revolutions learned before the slope over the speed is learned
+_SETTLED = 8  # number of revolutions learned before the slope is learned
 
 
 class MemoryTable(NamedTuple):
@@ -34,11 +34,11 @@ class MemoryTable(NamedTuple):
 
     Attributes:
         nominal: nominal speed Ω0 [rad/s].
-        learns, drift: whether the memory is used, and the variance by which a value drifts in a revolution.
-        follows_speed: whether the slope over the speed is learned.
+        learns, drift: whether the memory is used, and the increase of a value's variance per revolution.
+        follows_speed: whether the slope with respect to the speed is learned.
         value, slope: value and slope by grid point, shape (n,) [m].
         spread: covariance of value and slope, shape (3, n).
-        fresh, speeds: measured deviation from the memory in the newest revolution [m], and its relative speed,
+        fresh, speeds: deviation from the memory measured in the latest revolution [m], and the relative speed there,
             shape (n,).
         smoothing: weights of S by grid point, shape (odd,).
     """
@@ -120,7 +120,7 @@ def expected(m: MemoryTable, angle: float, speed: float) -> float:
 
 @inlined
 def revolution_ended(m: MemoryTable, revolutions: int) -> None:
-    """End a revolution; after the eighth, begin to learn the slope over the speed."""
+    """End a revolution; after the eighth, begin to learn the slope with respect to the speed."""
     # In earlier revolutions the values themselves still change, which would be attributed to the speed.
     if revolutions == _SETTLED and m.follows_speed:
         m.spread[2] = _SLOPE

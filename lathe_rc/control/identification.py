@@ -3,15 +3,15 @@
 
     u(t - τ) = x + a1·dx/dt + a2·d²x/dt²        a1 = 2ζ/ωn, a2 = 1/ωn², τ known
 
-Both sides pass the same low-pass (ω/(p + ω))³, whose stages give the filtered derivatives without any numerical
+Both sides pass through the same low-pass (ω/(p + ω))³, whose stages give the filtered derivatives without numerical
 differentiation.
 
 **Learning controller**: least squares over the completed cycles, with a forgetting factor. One harmonic is enough for
 both coefficients; the speed of the spindle may vary.
 
 **Unknown disturbance** f that repeats with the angle: the difference from the previous revolution at the same angle
-cancels f. This requires a varying speed. In addition the equation itself is used with a small weight, and the given
-model as a prior, whose weight increases with f.
+cancels f. This requires a varying speed. In addition, the equation itself is used with a small weight, and the given
+model serves as a prior whose weight increases with f.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
-STAGES = 3  #: first-order stages of each low-pass
-_LEAST_EXCITED = 1e-6  # determinant of the normal equations, 1 for independent regressors
+STAGES = 3  #: number of first-order stages of each low-pass
+_LEAST_EXCITED = 1e-6  # smallest determinant of the normal equations, relative to that of orthogonal regressors
 
 
 class LowPass(NamedTuple):
@@ -34,7 +34,7 @@ class LowPass(NamedTuple):
 
     Attributes:
         bandwidth: ω [rad/s].
-        keep, take: feedback and input coefficient of a stage.
+        keep, take: feedback and input coefficients of a stage.
         position, command: values before and after each stage, shape (4,) [m].
     """
 
@@ -46,7 +46,7 @@ class LowPass(NamedTuple):
 
 
 def low_pass(bandwidth: float, step: float) -> LowPass:
-    """Create a low-pass of a ``bandwidth`` [rad/s], at rest at 0; ``step`` in s."""
+    """Create a low-pass with a given ``bandwidth`` [rad/s], at rest at 0; ``step`` is in s."""
     half = 0.5 * bandwidth * step
     return LowPass(
         bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(STAGES + 1), np.zeros(STAGES + 1)
@@ -55,7 +55,7 @@ def low_pass(bandwidth: float, step: float) -> LowPass:
 
 @inlined
 def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
-    """Advance the low-pass of one signal by a sample."""
+    """Advance the low-pass of one signal by one sample."""
     new = value
     for stage in range(STAGES):
         old = stages[stage]
@@ -66,7 +66,7 @@ def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
 
 @inlined
 def derivatives(stages: Array, bandwidth: float) -> tuple[float, float]:
-    """First and second time derivative of the output of a low-pass."""
+    """Compute the first and second time derivatives of a low-pass output."""
     first = bandwidth * (stages[STAGES - 1] - stages[STAGES])
     return first, bandwidth**2 * (stages[STAGES - 2] - 2.0 * stages[STAGES - 1] + stages[STAGES])
 
@@ -85,7 +85,8 @@ def add_products(sums: Array, place: int, velocity: float, acceleration: float, 
 def excited(vv: float, va: float, aa: float) -> bool:
     """Return whether dx/dt and d²x/dt² are linearly independent, from the sums of their squares and of their product.
 
-    The determinant is compared with that of orthogonal regressors: the two differ by orders of magnitude.
+    The determinant is compared with that of orthogonal regressors, since dx/dt and d²x/dt² differ by orders of
+    magnitude.
     """
     return bool(vv * aa - va * va > _LEAST_EXCITED * vv * aa > 0.0)
 
@@ -97,16 +98,16 @@ def coefficients(vv: float, va: float, aa: float, vr: float, ar: float) -> tuple
     return (vr * aa - ar * va) / determinant, (ar * vv - vr * va) / determinant
 
 
-_LOOK_BACK = 2  # samples of the command needed for a fractional delay
+_LOOK_BACK = 2  # earlier samples of the command needed for a fractional delay
 
 
 class IdentifierTable(NamedTuple):
     """State of a `DriveIdentifier` for kernels.
 
     Attributes:
-        delay, part: delay between the command and the visible position: whole samples, and the fraction of a sample.
+        delay, part: delay from the command to the available position, as whole samples and a fraction of a sample.
         commands: past commands; sample n is at index n modulo the length, a power of two [m].
-        low: low-pass of both sides.
+        low: low-pass for both sides of the equation.
         sums: sums of the normal equations.
     """
 
@@ -154,7 +155,7 @@ class Identified:
     Attributes:
         natural_frequency: ωn [rad/s].
         damping: ζ.
-        residual: RMS of the model residual over the RMS of the command.
+        residual: RMS of the model residual, relative to the RMS of the command.
     """
 
     natural_frequency: float
@@ -167,9 +168,9 @@ class DriveIdentifier:
 
     Args:
         model_delay: τ [s].
-        feedback_delay: samples until a measured position is visible.
-        bandwidth: λ of the filters [rad/s]: above the profile's harmonics, below the noise.
-        forgetting: weight of a cycle at the end of the next one, 0 to 1.
+        feedback_delay: number of samples until a measured position is available.
+        bandwidth: ω of the low-pass [rad/s]; above the profile's harmonics and below the noise.
+        forgetting: factor applied to the measurements at the end of a cycle, 0 to 1.
         step: sampling step [s].
         block: longest block [sample].
 
@@ -199,7 +200,7 @@ class DriveIdentifier:
         )
 
     def block(self, first: int, start: int, stop: int, position: Array) -> None:
-        """Process the positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
+        """Process positions ``start`` to ``stop`` of a block that begins at sample ``first`` [m]."""
         accumulate(self.table, first, start, stop, position)
 
     def commanded(self, first: int, command: Array) -> None:
@@ -207,10 +208,10 @@ class DriveIdentifier:
         command_sent(self.table, first, 0, command.size, command)
 
     def fit(self) -> Identified | None:
-        """Estimate the drive model, and apply the forgetting factor to the measurements so far.
+        """Estimate the drive model, then apply the forgetting factor to the measurements.
 
         Returns:
-            The model; None if the measurements do not determine it.
+            The model, or None if the measurements do not determine it.
         """
         s11, s12, s22, s1, s2, rest, command = self.table.sums
         found = None
@@ -224,18 +225,18 @@ class DriveIdentifier:
         return found
 
 
-_WHOLE = 3e-4  # weight of the equation itself relative to its difference from the previous revolution
+_WHOLE = 3e-4  # weight of the equation itself, relative to its difference from the previous revolution
 _UNSURE = (0.3, 0.4)  # relative standard deviations of the given a1 and a2
 
 
 class FitTable(NamedTuple):
-    """Accumulated measurements for the fit of a drive under a disturbance.
+    """Accumulated measurements for fitting the model of a drive under a disturbance.
 
     Attributes:
         given: a1 [s] and a2 [s²] of the given model, shape (2,).
         before: dx/dt, d²x/dt² and u - x of the previous revolution, shape (3, n).
         sums: sums of the normal equations, those of the differences first, shape (10,).
-        means: count, and sums of dx/dt, d²x/dt², u - x and (u - x)², which remove the influence of a constant force.
+        means: count, and sums of dx/dt, d²x/dt², u - x and (u - x)², used to remove the effect of a constant force.
         forgetting: factor applied to ``sums`` and ``means`` at the end of a revolution.
     """
 
@@ -252,7 +253,7 @@ def no_measurements(given: Array, points: int, forgetting: float) -> FitTable:
 
 
 def forget_measurements(m: FitTable) -> None:
-    """Reset a fit table to no measurements."""
+    """Discard all measurements of a fit table."""
     for array in (m.before, m.sums, m.means):
         array[:] = 0.0
 
@@ -266,7 +267,7 @@ def sum_up(
     acceleration: float,
     rest: float,
 ) -> None:
-    """Add dx/dt, d²x/dt² and u - x at grid point ``here``; ``again``: the previous revolution has a value there too."""
+    """Add dx/dt, d²x/dt² and u - x at grid point ``here``, where the previous revolution has a value if ``again``."""
     sums, before = m.sums, m.before
     if again:
         v, a, r = velocity - before[0, here], acceleration - before[1, here], rest - before[2, here]
@@ -283,16 +284,16 @@ def sum_up(
 
 @inlined
 def fitted(m: FitTable) -> tuple[float, float]:
-    """Fit a1 [s] and a2 [s²] by least squares; not above 0 if the measurements do not determine them."""
+    """Fit a1 [s] and a2 [s²] by least squares; they are not positive if the measurements do not determine them."""
     count, v, a, r, rr = m.means[0], m.means[1], m.means[2], m.means[3], m.means[4]
     whole, s = m.sums[5:].copy(), m.sums[:5].copy()
-    # Centred, so that a constant force is not taken for a lag.
+    # Centred, so that a constant force is not mistaken for a lag.
     for k, mean in enumerate((v * v, v * a, a * a, v * r, a * r)):
         whole[k] -= mean / count
     if not excited(whole[0], whole[1], whole[2]):
         return 0.0, 0.0
     a1, a2 = coefficients(whole[0], whole[1], whole[2], whole[3], whole[4])
-    # The force is assumed as large at the harmonics of the motion as at the others, where it equals the residual.
+    # The force is assumed to be as large at the harmonics of the motion as at the others, where it is the residual.
     left = _WHOLE * max(rr - r * r / count - a1 * whole[3] - a2 * whole[4], 0.0)
     sure1, sure2 = left / (_UNSURE[0] * m.given[0]) ** 2, left / (_UNSURE[1] * m.given[1]) ** 2
     s += _WHOLE * whole

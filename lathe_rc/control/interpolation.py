@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interpolation of a grid or a table: value and derivatives."""
+"""Interpolation in a grid or a table: values and derivatives."""
 
 from functools import lru_cache
 
@@ -14,9 +14,9 @@ Complex = npt.NDArray[np.complex128]
 
 @inlined
 def linear(places: Array, values: Array, place: float) -> float:
-    """Interpolate linearly between the increasing ``places``, constant beyond their ends; both of shape (n,)."""
+    """Interpolate linearly between increasing ``places``, with constant values beyond the ends; both of shape (n,)."""
     last = places.size - 1
-    if not place > places[0]:  # NaN has to end here: below it would index beyond the table
+    if not place > places[0]:  # NaN must return here; below, it would index beyond the table
         return float(values[0])
     if place >= places[last]:
         return float(values[last])
@@ -35,14 +35,14 @@ def cubic(before: float, left: float, right: float, after: float, u: float) -> f
 
 @kernel
 def read(ring: Array, i: int, u: float) -> float:
-    """Interpolate a ring, whose length is a power of two, at ``i`` + ``u`` by a cubic through the points i-1 to i+2."""
+    """Interpolate a ring of 2**k points at ``i`` + ``u`` by a cubic through the points i-1 to i+2."""
     mask = ring.size - 1
     return cubic(ring[(i - 1) & mask], ring[i & mask], ring[(i + 1) & mask], ring[(i + 2) & mask], u)
 
 
 @kernel
 def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Array, tile: Array, value: Array) -> None:
-    """Interpolate a ring ``back`` points before the angles ``angle`` + ``lead`` [rad] into ``value``, shape (n,).
+    """Fill ``value`` by interpolating a ring ``back`` points before ``angle`` + ``lead`` [rad], shape (n,).
 
     ``tile``, shape (5 or more, m), is scratch: points are fetched m at a time, so that the interpolation vectorises.
     """
@@ -63,9 +63,9 @@ def read_along(ring: Array, per_radian: float, back: int, angle: Array, lead: Ar
 
 @kernel
 def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float]:
-    """Interpolate value and first two derivatives [1/point, 1/point²] at ``i`` + ``u`` from the points i-3 to i+4.
+    """Interpolate value and first two derivatives [1/point, 1/point²] of a ring at ``i`` + ``u`` (points i-3 to i+4).
 
-    The derivatives are central differences of fourth order at the grid points, interpolated like the value.
+    The derivatives are fourth-order central differences at the grid points, interpolated like the value.
     """
     mask = ring.size - 1
     a, b, c, d = ring[(i - 3) & mask], ring[(i - 2) & mask], ring[(i - 1) & mask], ring[i & mask]
@@ -81,7 +81,7 @@ def read_derivatives(ring: Array, i: int, u: float) -> tuple[float, float, float
     return cubic(c, d, e, f, u), first / 12.0, second / 12.0
 
 
-# Gauss points between two grid points, their weights, the weights of the four points there and their distances.
+# Gauss points between two grid points, their weights, and the weights and distances of the four grid points there.
 _U = (np.polynomial.legendre.leggauss(8)[0] + 1.0) / 2.0
 _WEIGHT = np.polynomial.legendre.leggauss(8)[1] / 2.0
 _TAPS = np.stack(
@@ -96,24 +96,24 @@ _DISTANCE = np.arange(-1, 3)[:, None] - _U
 
 
 def cubic_response(radians: Array) -> Array:
-    """Compute the frequency response of `read` at ``radians`` per point, averaged over the position between points.
+    """Compute the frequency response of `read` at ``radians`` per point, averaged over the positions between points.
 
-    The interpolator also generates images at multiples of the sampling rate less this frequency; they are attenuated
-    by the drive and neglected here. The result has shape (n,).
+    The interpolator also generates images at multiples of the sampling rate minus this frequency, which the drive
+    attenuates; they are neglected here. The result has shape (n,).
     """
     return _cubic_response(np.asarray(radians, np.float64).tobytes())
 
 
 @lru_cache(maxsize=256)
 def _cubic_response(content: bytes) -> Array:
-    """Compute `cubic_response` from the bytes of ``radians``, with a cache: similar loops share frequencies."""
+    """Compute `cubic_response` from the bytes of ``radians``, cached because similar loops share frequencies."""
     radians = np.frombuffer(content)
     phase = np.cos(_DISTANCE[None] * radians[:, None, None])
     return np.asarray((phase * _TAPS * _WEIGHT).sum(axis=(1, 2)))
 
 
 def derivative_responses(radians: Array) -> tuple[Array, Complex, Array]:
-    """Compute the frequency responses of the three results of `read_derivatives`, per point, shape (n,) each."""
+    """Compute the frequency responses of all results of `read_derivatives` at ``radians`` per point, shape (n,)."""
     value = cubic_response(radians)
     first = 1j * (8.0 * np.sin(radians) - np.sin(2.0 * radians)) / 6.0
     second = (16.0 * np.cos(radians) - np.cos(2.0 * radians) - 15.0) / 6.0

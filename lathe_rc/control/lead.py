@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lead laws: angle by which the memory is read ahead of the spindle to compensate a delay T0.
+"""Lead laws: angle by which the memory is read ahead of the spindle to compensate for a delay T0.
 
-    constant_angle          T0·Ω0                        right at the nominal speed only
+    constant_angle          T0·Ω0                        exact at the nominal speed only
     variable                T0·Ω(t)                      paper 000, eq. (20)
     variable_second_order   T0·Ω(t) + (T0²/2)·dΩ/dt      the next term of φ(t+T0) - φ(t)
     exact_preview           φ(t+T0) - φ(t)               for a speed law known in advance
 
-A value read at ψ = φ + lead acts T0 later. A correction that differentiates the memory with respect to time needs
-dψ/dt and d²ψ/dt² as well: to first order in T0 the speed and the acceleration at t + T0.
+A value read at ψ = φ + lead acts T0 later. A correction that differentiates the memory with respect to time also
+needs dψ/dt and d²ψ/dt²: to first order in T0, these are the speed and the acceleration at t + T0.
 """
 
 from enum import IntEnum
@@ -36,11 +36,11 @@ class PreviewTable(NamedTuple):
 
     Attributes:
         step: sampling step [s].
-        law: number of a `LeadLaw`.
+        law: value of a `LeadLaw`.
         lead_time: T0 [s].
         constant: lead angle added to that of the law [rad].
         nominal, lines, tachogram: parameters of the speed law.
-        history: ring of the measured speed, initially NaN [rad/s].
+        history: ring buffer of the measured speed, initially NaN [rad/s].
     """
 
     step: float
@@ -63,7 +63,7 @@ def look_ahead(
     rate: Array,
     bend: Array,
 ) -> None:
-    """Fill lead [rad] and, if ``wanted``, its read rate [rad/s] and bend [rad/s²] for a block, shape (n,)."""
+    """Fill the lead [rad] of a block and, if ``wanted``, dψ/dt [rad/s] and d²ψ/dt² [rad/s²], shape (n,)."""
     step, law, lead_time, constant = preview.step, preview.law, preview.lead_time, preview.constant
     nominal, lines, tachogram, history = preview.nominal, preview.lines, preview.tachogram, preview.history
     if law < 2 and not wanted:
@@ -73,7 +73,7 @@ def look_ahead(
     window = history.size
     place = first % window
     for k in range(speed.size):
-        # The new speed overwrites the oldest one of the ring, which is NaN until the ring is full.
+        # The new speed overwrites the oldest one in the ring, which is NaN until the ring is full.
         oldest = history[place]
         acceleration = 0.0 if np.isnan(oldest) else (speed[k] - oldest) / (window * step)
         history[place] = speed[k]
@@ -94,14 +94,14 @@ def look_ahead(
 
 
 class Preview:
-    """Lead angle and its rates for a lead time.
+    """Lead angle and time derivatives of the read angle, for a lead time.
 
     Args:
         law: lead law.
         lead_time: T0 [s].
         speed_law: nominal speed Ω0; for ``EXACT_PREVIEW`` also its deviations.
         step: sampling step [s].
-        window: samples over which dΩ/dt is the difference of the measured speed; it lags by half the window.
+        window: number of samples between the measured speeds whose difference gives dΩ/dt, which lags by half of it.
         constant: lead angle [rad] added to that of the law, independent of the speed.
 
     Attributes:
@@ -119,7 +119,7 @@ class Preview:
     def block(self, first: int, speed: Array, *, rates: bool = True) -> tuple[Array, Array, Array]:
         """Compute lead [rad], dψ/dt [rad/s] and d²ψ/dt² [rad/s²] for the measured ``speed`` [rad/s], shape (n,) each.
 
-        Without ``rates`` the latter two are empty; the choice has to be the same for all blocks.
+        Without ``rates`` the latter two are empty; the choice must be the same for all blocks.
         """
         lead = np.empty(speed.size)
         rate, bend = (np.empty(speed.size), np.empty(speed.size)) if rates else (np.empty(0), np.empty(0))

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of a command: stroke, velocity, acceleration, jerk.
+"""Limits on the stroke, velocity, acceleration and jerk of a command.
 
-A command is a position or a velocity. A command within all limits passes bit-identical. Stroke and velocity limits
-take effect early, so that the output can still stop at them within the limits of acceleration and jerk. A command
-beyond the limits is followed as fast as they allow. With e the remaining distance, the velocity relative to that of the
-command is at most min(√(A·e/2), (J·e²/9)^(1/3)), which permits a stop at the command; with Δv the remaining velocity
-difference, the acceleration relative to that of the command is at most √(J·Δv/2), and towards a limit of the velocity
-at most √(J·Δv). If the output would exceed a limit while the jerk reduces its acceleration to 0, it brakes. Clipped
-samples are reported.
+A command is a position or a velocity. A command within all limits passes unchanged, bit for bit. Stroke and velocity
+limits take effect early, so that the output can still stop at them within the acceleration and jerk limits A and J. A
+command beyond the limits is followed as fast as they allow. With e the remaining distance, the velocity relative to
+that of the command is at most min(√(A·e/2), (J·e²/9)^(1/3)), which permits stopping at the command. With Δv the
+remaining velocity difference, the acceleration relative to that of the command is at most √(J·Δv/2), or √(J·Δv) towards
+a velocity limit. The output brakes if it would otherwise exceed a limit while the jerk reduces its acceleration to 0.
+Clipped samples are reported.
 """
 
 from typing import NamedTuple
@@ -19,15 +19,15 @@ from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 
-_SHORT_OF = 0.98  # part of the velocity allowed by the limits that is used when they are approached
+_SHORT_OF = 0.98  # fraction of the allowed velocity that is used when approaching a limit
 _CLOSE = 1.0 + 1e-9  # tolerance factor of a limit, for rounding errors
 
 
 class CommandLimits(NamedTuple):
-    """Limits of a command's stroke, velocity, acceleration and jerk; inf for none.
+    """Limits on a command's stroke, velocity, acceleration and jerk; inf for no limit.
 
     Attributes:
-        stroke: largest displacement to each side [m].
+        stroke: largest displacement in either direction [m].
         velocity: largest velocity [m/s].
         acceleration: largest acceleration [m/s²].
         jerk: largest jerk [m/s³].
@@ -53,24 +53,24 @@ def _clip(value: float, limit: float) -> float:
 def _stopping(limits: CommandLimits, step: float, distance: float) -> float:
     """Compute the largest velocity that permits a stop within ``distance``."""
     if distance <= 0.0:
-        return 0.0  # not inf · 0
+        return 0.0  # avoids inf · 0
     curved = float(np.cbrt(limits.jerk * distance * distance / 9.0))
     return min(float(np.sqrt(0.5 * limits.acceleration * distance)), curved, distance / step)
 
 
 @kernel
 def _reach(jerk: float, change: float) -> float:
-    """Compute the largest acceleration that the jerk can reduce to 0 within a change of the velocity."""
+    """Compute the largest acceleration that the jerk can reduce to 0 within a given velocity change."""
     return float(np.sqrt(jerk * change)) if change > 0.0 else 0.0
 
 
 @kernel
 def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float) -> bool:
-    """Return whether a velocity and an acceleration keep the limits, now and while the jerk reduces the latter to 0.
+    """Return whether ``v`` and ``a`` stay within the limits, now and while the jerk reduces ``a`` to 0.
 
     ``before`` is the acceleration of the previous sample.
     """
-    # Velocity gained while the jerk reduces the acceleration to 0; half a step of it is already in v.
+    # Velocity gained while the jerk reduces the acceleration to 0; v already includes half a step of it.
     rise = max(abs(a) * (0.5 * abs(a) / limits.jerk - 0.5 * step), 0.0) if v * a > 0.0 else 0.0
     return (
         abs(v) <= limits.velocity * _CLOSE
@@ -82,7 +82,7 @@ def _keeps(limits: CommandLimits, step: float, v: float, a: float, before: float
 
 @kernel
 def _can_stop(limits: CommandLimits, step: float, coming: float, v: float, a: float) -> bool:
-    """Return whether a stop within the stroke is possible after a sample with velocity ``v``, acceleration ``a``."""
+    """Return whether a stop within the stroke is possible after a sample with velocity ``v`` and acceleration ``a``."""
     if limits.stroke == np.inf:
         return True
     needs = abs(a) / limits.jerk
@@ -113,15 +113,15 @@ def _next(
     v: float,
     a: float,
 ) -> tuple[bool, float]:
-    """Compute whether the next sample can follow the command exactly, and its acceleration.
+    """Return whether the next sample can follow the command exactly, and the acceleration of that sample.
 
     Args:
         limits: limits of the command.
         step: sampling step [s].
         v_goal: velocity of a sample that follows the command exactly.
-        v_wanted: unlimited velocity of any other sample.
+        v_wanted: desired velocity, before limiting, of a sample that cannot follow exactly.
         pulling: acceleration of the command.
-        coming: rest position for a velocity of 0 from now on.
+        coming: position at which the output comes to rest if its velocity is 0 from now on.
         v: velocity of the previous sample.
         a: acceleration of the previous sample.
     """
@@ -133,7 +133,7 @@ def _next(
         room = limits.stroke - np.sign(v_wanted) * coming
         allowed = min(allowed, _stopping(limits, step, room), max(0.5 * room / step, 0.0))
     found = _towards(limits, step, _clip(v_wanted, _SHORT_OF * allowed), pulling, v, a)
-    # Brake now if a limit would be passed later even with the acceleration reduced to 0 at once.
+    # Brake now if a limit would be exceeded later even with the acceleration reduced to 0 immediately.
     after = v + found * step
     too_fast = abs(after + 0.5 * found * abs(found) / limits.jerk) > limits.velocity
     if too_fast or not _can_stop(limits, step, coming, after, found):
@@ -153,7 +153,7 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
         wanted: position command [m].
     """
     p, v, a, goal_before, moving_before = state[0], state[1], state[2], state[3], state[4]
-    # Velocity and acceleration of the command are fed forward; only the remaining difference is controlled.
+    # The command's velocity and acceleration are fed forward; only the remaining difference is controlled.
     goal = _clip(wanted, limits.stroke)
     moving = _clip((goal - goal_before) / step, limits.velocity)
     pulling = _clip((moving - moving_before) / step, limits.acceleration)
@@ -162,7 +162,7 @@ def keep_position(limits: CommandLimits, step: float, state: Array, wanted: floa
     v_goal = (goal - p) / step
     free, found = _next(limits, step, v_goal, v_wanted, pulling, p, v, a)
     if free:
-        p, v = goal, v_goal  # not p + v·step: the command has to pass bit-identical
+        p, v = goal, v_goal  # not p + v·step: the command must pass bit for bit
     else:
         v += found * step
         p += v * step
@@ -179,7 +179,7 @@ def keep_velocity(limits: CommandLimits, step: float, state: Array, coming: floa
         step: sampling step [s].
         state: velocity and acceleration of the output, velocity of the command. Updated in place; the first element
             is the new output.
-        coming: position where the drive comes to rest with an output of 0 from now on [m].
+        coming: position at which the drive would come to rest with an output of 0 from now on [m].
         wanted: velocity command [m/s].
     """
     v, a, moving_before = state[0], state[1], state[2]
@@ -197,7 +197,7 @@ class LimiterTable(NamedTuple):
         limits: limits of the command.
         step: sampling step [s].
         state: state for `keep_position`.
-        clipped: ring of flags for clipped samples; sample n is at index n modulo the length.
+        clipped: ring buffer of flags for clipped samples; sample n is at index n modulo the length.
     """
 
     limits: CommandLimits
@@ -208,7 +208,7 @@ class LimiterTable(NamedTuple):
 
 @kernel
 def limit(limiter: LimiterTable, first: int, wanted: Array, given: Array) -> None:
-    """Limit the position command ``wanted`` of a block starting at sample ``first`` into ``given``, shape (n,) [m]."""
+    """Fill ``given`` with the limited position command ``wanted`` of a block at sample ``first``, shape (n,) [m]."""
     mask = limiter.clipped.size - 1
     for k in range(wanted.size):
         limiter.clipped[(first + k) & mask] = keep_position(limiter.limits, limiter.step, limiter.state, wanted[k])
@@ -216,7 +216,7 @@ def limit(limiter: LimiterTable, first: int, wanted: Array, given: Array) -> Non
 
 
 def rest() -> Array:
-    """Initial state of a limited command at rest at 0, for `keep_position` or `keep_velocity`."""
+    """Return the initial state of a limited command at rest at 0, for `keep_position` or `keep_velocity`."""
     return np.zeros(5)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Crash-safe file for the memory of a controller."""
+"""Crash-safe file for a controller's memory."""
 
 import errno
 import io
@@ -17,11 +17,11 @@ Array = npt.NDArray[np.float64]
 
 _FORMAT = 1
 _NAMES = {"format.npy", "grid.npy", "points.npy"}
-_ROOM = 1 << 16  # [B] in addition to the memory: headers, the other numbers, archive overhead
+_ROOM = 1 << 16  # space for headers, other numbers and archive overhead, in addition to the memory [B]
 
 
 def save(path: Path, points: Array, grid: int) -> None:
-    """Write a memory to a file atomically: a temporary file is synced to disk and renamed.
+    """Write a memory to a file atomically, through a temporary file that is synced to disk and renamed.
 
     Args:
         path: NumPy archive (.npz) to write.
@@ -43,17 +43,17 @@ def load(path: Path, cycle: int, grid: int) -> Array:
 
     Args:
         path: file written by `save`.
-        cycle: grid points in the cycle of the controller.
+        cycle: grid points in a cycle of the controller.
         grid: points per revolution of the controller.
 
     Raises:
-        InputError: the file is missing, is not a saved memory, or has another grid or cycle.
+        InputError: the file is missing, is not a saved memory, or has a different grid or cycle.
     """
     try:
         version, own_grid, points = _read(path, cycle, grid)
     except LatheError:
         raise
-    except Exception as error:  # noqa: BLE001 - zipfile and NumPy raise whatever broken bytes lead to
+    except Exception as error:  # noqa: BLE001 - zipfile and NumPy raise various exceptions for corrupt data
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a saved memory"
         raise InputError(f"{path}: the memory cannot be loaded ({reason}); name a file that `save` wrote") from None
     if version != _FORMAT:
@@ -68,10 +68,10 @@ def load(path: Path, cycle: int, grid: int) -> Array:
 
 
 def _read(path: Path, cycle: int, grid: int) -> tuple[int, int, npt.NDArray[Any]]:
-    """Read format, points per revolution and points from a file of limited size.
+    """Read the format, the points per revolution and the points from a file of limited size.
 
     Raises:
-        InputError: the file is too large, or not an archive with the expected arrays.
+        InputError: the file is too large, or is not an archive with the expected arrays.
         ValueError: an array is malformed; zipfile and NumPy raise further exceptions.
     """
     largest = 8 * cycle + _ROOM

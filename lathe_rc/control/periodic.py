@@ -7,13 +7,13 @@
     u2(t) = (h11·I + h12·s·v·δ̃)·s,   I' = s·v·δ̃,   s = sat(y_F)
     τ·δ̃' + δ̃ = δ,   δ̃(0) = 0,   δ = 1 where (S(u) - u)·v ≥ 0 and δ0 elsewhere
 
-S limits at ±S0. The paper does not define sat; here it is the unit saturation. r, y and u are dimensionless as in the
-paper; positions in metres have to be scaled by the caller.
+S limits its argument to ±S0. The paper does not define sat; here it is the unit saturation. r, y and u are
+dimensionless, as in the paper; the caller must scale positions in metres.
 
 Additions to the paper, on by default:
 
 - The memory is read through a Gaussian filter of standard deviation σ, symmetric in time; the samples on both sides of
-  t - T̄ are all in the past. Without the filter the memory grows at frequencies where the factor of a period exceeds 1,
+  t - T̄ are all in the past. Without the filter the memory grows at frequencies where its factor per period exceeds 1,
   see `lathe_papers.formulas.hyperstability.learning_factor`.
 - Anti-windup: while (S(u) - u)·v < 0, I is constant and the memory stores the value read, limited to ±S0. The switch
   alone only slows down the windup.
@@ -45,7 +45,7 @@ class PeriodicGains:
         switch_time: τ [s].
         switch_low: δ0 [1].
         memory_filter: σ of the Gaussian filter of the memory [s]; 0 for none.
-        reference_gain: χ* of eq. 12 [1], for the integral of eq. 15 only; with T* = 0 it meets eq. 14 for all drives.
+        reference_gain: χ* of eq. 12 [1], used only in eq. 15; with T* = 0 it satisfies eq. 14 for all drives.
         doc: source of the parameters.
     """
 
@@ -72,7 +72,7 @@ PRESETS = {
         40.0, 200.0, 150.0, 0.17, 0.01, 15.0, 0.5, 0.1, 110.0,
         "paper 002, eqs 20 and 21; not for a quantised measurement",
     ),
-    # By the analysis: T and T* so that with σ = 0.1 s the learning factor is below 1 at every corner and level of y_F.
+    # T and T* are chosen by analysis: with σ = 0.1 s, the learning factor is below 1 at every corner and level of y_F.
     "quantised": PeriodicGains(
         2.5, 1.0, 1.0, 0.4, 0.055, 15.0, 0.5, 0.1, 10.0,
         "for steps of 1e-4 in y and u; checked on all 32 corners of eq. 1",
@@ -83,7 +83,7 @@ PRESETS = {
 def _check(
     gains: PeriodicGains, *, limit: float, step_s: float, memory_filter: float, quantisation: tuple[float, float]
 ) -> None:
-    """Check the parameters of the law; raise an `InputError` for one out of its range."""
+    """Check the parameters of the law; raise an `InputError` if one is out of range."""
     positive = {
         "h0": gains.h0, "h11": gains.h11, "lead": gains.lead, "lag": gains.lag, "switch_time": gains.switch_time,
         "limit": limit, "step": step_s,
@@ -102,8 +102,8 @@ def _check(
         raise InputError(f"periodic law: switch_low = {gains.switch_low:g}; allowed: between 0 and 1")
 
 
-_REACH = 5.0  # of the Gaussian, in standard deviations
-_CHUNK = 128  # samples of the memory smoothed at a time, if the period allows
+_REACH = 5.0  # reach of the Gaussian [standard deviations]
+_CHUNK = 128  # number of memory samples smoothed at a time, if the period allows
 # Indices in the state: I, δ̃, the integral of eq. 15, its lower bound, the least distance of both so far, the largest
 # demand |u|, the largest |sample| stored, whether learning is frozen, number of samples with a limited command.
 _INTEGRATOR, _SWITCH, _POPOV, _BOUND, _CLEARANCE, _DEMAND, _MEMORY, _FROZEN, _SATURATED, _SIZE = range(10)
@@ -121,7 +121,7 @@ class PeriodicLaw(NamedTuple):
         keep: decay factor of δ̃ per sample.
         switch_low: δ0.
         anti_windup: False for the paper's law.
-        measurement_step, command_step: quantisation; 0 for none.
+        measurement_step, command_step: quantisation of y and u; 0 for none.
         step: sampling step [s].
         reference_gain: χ* of eq. 12.
         knows_ideal: False if S(u) of the previous period approximates the ideal input u°.
@@ -152,7 +152,7 @@ class PeriodicState(NamedTuple):
         reference, output: states of the filters.
         ring: stored samples of u1, shape (samples + reach,); sample n is at index n modulo the length.
         smoothed: smoothed memory of the current chunk, shape (chunk,).
-        window: scratch for the samples of the chunk and their neighbours, shape (chunk + 2·reach,).
+        window: scratch array for the samples of the chunk and their neighbours, shape (chunk + 2·reach,).
         ideal: u° over a period, shape (samples,).
     """
 
@@ -176,7 +176,7 @@ def _smooth(law: PeriodicLaw, state: PeriodicState, n: int) -> None:
     middle = window[reach : reach + chunk]
     for k in range(chunk):
         smoothed[k] = weights[0] * middle[k]
-    # The outer loop goes over the weights: each sample is summed in the same order, and the inner loop vectorises.
+    # The outer loop runs over the weights, so that each sum has the same order, and the inner loop vectorises.
     for j in range(1, reach + 1):
         weight = weights[j]
         left, right = window[reach - j : reach - j + chunk], window[reach + j : reach + j + chunk]
@@ -188,7 +188,7 @@ def _smooth(law: PeriodicLaw, state: PeriodicState, n: int) -> None:
 def _monitor(law: PeriodicLaw, state: PeriodicState, n: int, wanted: float, v: float, applied: float) -> None:
     """Update the integral of eq. 15 and its bound.
 
-    With θ = χ*·r̂ + u° the integrand is -μ·v = (S(u) - u° - χ*·v)·v, where u° is the input that keeps y at r.
+    With θ = χ*·r̂ + u°, the integrand is -μ·v = (S(u) - u° - χ*·v)·v, where u° is the input that keeps y at r.
     """
     values = state.values
     place = n % law.samples
@@ -254,20 +254,20 @@ def _block(
 
 @kernel
 def freeze(state: PeriodicState, on: bool) -> None:  # noqa: FBT001 - kernels take their arguments by position
-    """Freeze the memory and I, or resume their learning."""
+    """Freeze the memory and I, or resume updating them."""
     state.values[_FROZEN] = 1.0 if on else 0.0
 
 
 @kernel
 def achieved(state: PeriodicState, row: Array) -> None:
-    """Fill in largest demand, largest memory, saturated samples, Popov integral, its bound and the clearance."""
+    """Fill ``row``: largest demand and memory, number of saturated samples, Popov integral, its bound and clearance."""
     values = state.values
     row[0], row[1], row[2] = values[_DEMAND], values[_MEMORY], values[_SATURATED]
     row[3], row[4], row[5] = values[_POPOV], values[_BOUND], values[_CLEARANCE]
 
 
 def samples_in(period: float, step_s: float) -> int:
-    """Number of samples in a period [s].
+    """Return the number of samples in a period [s].
 
     Raises:
         InputError: the period is not a whole number of steps.
@@ -285,7 +285,7 @@ def samples_in(period: float, step_s: float) -> int:
 
 
 class PeriodicController:
-    """Nonlinear periodic controller with a memory; initially at rest at 0 with an empty memory.
+    """Nonlinear periodic controller, initially at rest at 0 with an empty memory.
 
     Args:
         gains: parameters of the law, such as a preset of `PRESETS`.
@@ -293,7 +293,7 @@ class PeriodicController:
         limit: S0, equal to the limit of the drive [1].
         step_s: sampling step [s].
         memory_filter: σ of the Gaussian filter of the memory [s], 0 for none; None for the value in ``gains``.
-        anti_windup: see the module; False for the paper's switch alone.
+        anti_windup: whether to use the anti-windup described in the module; False for the paper's switch alone.
         measurement_step, command_step: quantisation of y and u [1]; 0 for none.
         ideal: u°, the input that keeps y at r, over the first period, shape (period/step,); None uses the command
             applied one period earlier, which is the same after learning.
@@ -358,7 +358,7 @@ class PeriodicController:
             window=np.zeros(chunk + 2 * reach),
             ideal=np.zeros(samples) if ideal is None else ideal.copy(),
         )
-        # Contribution of a falling adaptive gain: the integral of (h11·I + χ*) over I is never below this bound.
+        # Contribution of a decreasing adaptive gain: the integral of (h11·I + χ*) over I is never below this bound.
         self.state.values[_BOUND] = -(gains.reference_gain**2) / (2.0 * gains.h11)
         self.state.values[_CLEARANCE] = -self.state.values[_BOUND]
 

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parallel PID controller of sampled signals.
+"""Parallel PID controller for sampled signals.
 
     u = P·e + I·∫e dt + D·N·p/(p + N)·e,   e = set point - measurement
 
 Integral and derivative are exact for an error that is linear between the samples at which the controller computes.
 While the command is at a limit and the error drives it further out, the integral is held (clamping). Converters
-round the measurement to the step of the ADC, and the command to that of the DAC. With a set point of limited rate,
+round the measurement to the step of the ADC, and the command to that of the DAC. With a rate-limited set point,
 smoothed as 1 - e^{-t/T}, the tool enters the cut without overshoot of the force.
 
 The integral can be frozen. While another controller provides the command, a waiting controller with ramp or smoothing
-sets its set point equal to the measurement: when it resumes, the set point starts there, as at the start of a run.
+sets its set point equal to the measurement, so that the set point starts there when control resumes, as at the start
+of a run.
 
 Source: paper 004, Figs 11 and 12. The paper uses mm, N and % of the full command; here the units are m, N and 1.
 """
@@ -33,7 +34,7 @@ _INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _ST
 
 @dataclass(frozen=True)
 class PidGains:
-    """Gains of a parallel PID, in the unit of the command over that of the error.
+    """Gains of a parallel PID, in units of the command per unit of the error.
 
     Args:
         proportional: P.
@@ -71,8 +72,8 @@ class PidGains:
         return whole
 
 
-FORCE = PidGains(0.52733e-2, 1.4848e-2, 0.046435e-2, 1874.8107)  #: of the force loop [1/N] (paper 004, Fig. 12)
-POSITION = PidGains(13510.2, 110691.7, 452.539, 4147.9572)  #: of the position loop [1/m] (paper 004, Fig. 11)
+FORCE = PidGains(0.52733e-2, 1.4848e-2, 0.046435e-2, 1874.8107)  #: gains of the force loop [1/N] (paper 004, Fig. 12)
+POSITION = PidGains(13510.2, 110691.7, 452.539, 4147.9572)  #: gains of the position loop [1/m] (paper 004, Fig. 11)
 
 
 class PidTable(NamedTuple):
@@ -80,14 +81,14 @@ class PidTable(NamedTuple):
 
     Attributes:
         proportional: P.
-        integral: weight of the sum of two errors in the integral.
-        derivative: weight of the difference of two errors in the derivative.
+        integral: weight of the sum of two successive errors in the integral.
+        derivative: weight of the difference between two successive errors in the derivative.
         decay: decay factor of the derivative per computation.
         low, high: limits of the command.
-        adc, dac: steps of the converters; 0 for none.
+        adc, dac: steps of the converters; 0 for no rounding.
         ramp: largest change of the set point from one computation to the next; 0 for no limit.
         approach: fraction of the remaining change of the set point made per computation; 1 for no smoothing.
-        divisor: samples between two computations.
+        divisor: number of samples between two computations.
     """
 
     proportional: float
@@ -105,14 +106,14 @@ class PidTable(NamedTuple):
 
 @inlined
 def control(pid: PidTable, state: Array, n: int, set_point: float, measurement: float) -> float:
-    """Compute the command of sample ``n``, and update ``state`` with its counters of limited samples."""
+    """Compute the command of sample ``n``, and update ``state``, including its counters of limited samples."""
     if n % pid.divisor:
         return float(state[_COMMAND])
     way = set_point - state[_SET_POINT]
     move = pid.approach * way
     if pid.ramp > 0.0:
         move = min(max(move, -pid.ramp), pid.ramp)
-    # Not by the sum: with its rounding error the set point might never be reached.
+    # At the end the set point itself, since a rounding error of the sum might keep it from being reached.
     wanted = set_point if move == way else state[_SET_POINT] + move
     read = quantise(measurement, pid.adc)
     if state[_WAITS] > 0.0 and (pid.ramp > 0.0 or pid.approach < 1.0):
@@ -159,19 +160,19 @@ class Pid:
         gains: gains P, I, D and filter N.
         low, high: limits of the command, in its unit.
         step: sampling step [s].
-        adc: step of the converter of the measurement, in its unit; 0 for none.
-        dac: step of the converter of the command, in its unit; 0 for none.
+        adc: step of the measurement's converter, in the unit of the measurement; 0 for no rounding.
+        dac: step of the command's converter, in the unit of the command; 0 for no rounding.
         ramp: largest rate of the set point, in its unit per s; 0 for no limit.
         smoothing: time constant of the set point [s]; 0 for none.
-        divisor: the command is computed at samples that are multiples of it, and held between them.
+        divisor: the command is computed at samples that are multiples of ``divisor``, and held in between.
 
     Attributes:
         table: constants for `control`.
         state: state for `control`.
 
     Raises:
-        InputError: a lower limit not below the upper one, a negative converter step, ramp or smoothing, or a divisor
-            below 1.
+        InputError: the lower limit is not below the upper one, a converter step, the ramp or the smoothing is negative,
+            or the divisor is below 1.
     """
 
     def __init__(
@@ -222,9 +223,9 @@ class Pid:
 
     @property
     def slowed(self) -> int:
-        """Number of computations in which ramp or smoothing changed the set point."""
+        """Number of computations in which the ramp or the smoothing changed the set point."""
         return int(self.state[SLOWED])
 
     def block(self, first: int, set_point: Array, measurement: Array, command: Array) -> None:
-        """Compute the commands of a block starting at sample ``first``; arrays of shape (n,), ``command`` is output."""
+        """Compute the commands of a block starting at sample ``first`` into ``command``; arrays of shape (n,)."""
         control_along(self.table, self.state, first, set_point, measurement, command)

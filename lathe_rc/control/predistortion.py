@@ -4,10 +4,11 @@
     y(z) = x(z) + C(z)·F(ap(z)),  ap = D(z) - y(z)
 
 y is the resulting radius and x the set point of the cross feed, both relative to the nominal radius; D is the depth of
-cut at that radius; C the compliance along the shaft (`lathe_rc.analysis.shaft`) and F the force as a function of
-the depth of cut. Both x and the deflection change the depth and so the force: y is the root of this equation. For the
-path that cancels the deflection, y = w, the depth is known, D - w, and so is the path: x = w - C·F(D - w). Subtracting
-the deflection measured on a part without predistortion is not sufficient, because a deeper cut deflects the shaft more.
+cut at that radius, C the compliance along the shaft (`lathe_rc.analysis.shaft`), and F the force as a function of the
+depth of cut. Both x and the deflection change the depth and thus the force, so y is the root of this equation. The path
+that cancels the deflection gives y = w; its depth of cut is therefore D - w, and the path is x = w - C·F(D - w).
+Subtracting the deflection measured on a part without predistortion is not sufficient, because a deeper cut deflects the
+shaft more.
 
 If C, F or D are not known accurately, the error of the last part corrects the path (iterative learning control):
 
@@ -16,8 +17,8 @@ If C, F or D are not known accurately, the error of the last part corrects the p
 The error then changes by the factor 1 - γ/(1 + C·F') per part, a contraction for any 0 < γ < 2 as long as the force
 does not decrease with the depth of cut.
 
-Source: paper 004, whose upper level computes the path from a model of the deformation and corrects it by the deviation
-of the profile; neither is printed there.
+Source: paper 004, whose upper control level computes the path from a model of the deformation and corrects it by the
+deviation of the profile; the paper prints neither.
 """
 
 from collections.abc import Callable
@@ -33,10 +34,10 @@ from lathe_rc.jit import kernel
 from lathe_rc.signals.table import read_table, write_table
 
 Array = npt.NDArray[np.float64]
-ForceLaw = Callable[[Array], Array]  #: force [N] by depth of cut [m], at each height; never falling with the depth
+ForceLaw = Callable[[Array], Array]  #: force [N] for a depth of cut [m] at each height, not decreasing with it
 
 _COLUMNS = ("height_mm", "offset_um")
-_CLOSEST = 1e-9  # [m] between two heights
+_CLOSEST = 1e-9  # smallest distance between two heights [m]
 
 
 def proportional(stiffness: float | Array) -> ForceLaw:
@@ -61,9 +62,9 @@ def turned(compliance: Array, law: ForceLaw, depth: float | Array, path: Array) 
         depth: D [m], a scalar or one value per height.
         path: x [m], shape (m,).
     """
-    # F never decreases with the depth: there is one root, and the deflection is at most that of a rigid shaft's cut.
+    # F never decreases with the depth: there is one root, and the deflection is at most that at a rigid shaft's depth.
     low, high = path, path + compliance * law(depth - path)
-    # To the last bit of the radius, which takes about fifty bisections.
+    # Down to the last bit of the radius, which takes about fifty bisections.
     least = np.spacing(np.maximum(np.abs(low), np.abs(high)))
     while np.any(high - low > least):
         middle = (low + high) / 2.0
@@ -79,7 +80,7 @@ def cancelling(compliance: Array, law: ForceLaw, depth: float | Array, wanted: f
 
 
 def contraction(compliance: Array, stiffness: float | Array, gain: float) -> float:
-    """Compute the largest error factor from part to part; ``stiffness`` is dF/dap [N/m], ``gain`` γ."""
+    """Compute the largest error factor from part to part; ``stiffness`` is dF/dap [N/m], ``gain`` is γ."""
     return float(np.abs(1.0 - gain / (1.0 + compliance * stiffness)).max())
 
 
@@ -88,7 +89,7 @@ class PathTable(NamedTuple):
 
     Attributes:
         heights, offsets: heights along the part and offsets of the cross feed [m], shape (m,).
-        beyond: number of samples so far beyond the ends, shape (1,).
+        beyond: number of samples so far beyond the ends of the path, shape (1,).
     """
 
     heights: Array
@@ -116,7 +117,8 @@ class Predistortion:
         table: path for `offset_along`.
 
     Raises:
-        InputError: no points, different numbers of heights and offsets, heights not increasing, or a value not finite.
+        InputError: there are no points, the numbers of heights and offsets differ, the heights do not increase, or a
+            value is not finite.
     """
 
     def __init__(self, heights: Array, offsets: Array) -> None:
@@ -136,7 +138,7 @@ class Predistortion:
 
     @property
     def beyond(self) -> int:
-        """Number of samples so far beyond the ends of the path, where the offset is that of the end."""
+        """Number of samples so far beyond the ends of the path, where the offset is that of the nearer end."""
         return int(self.table.beyond[0])
 
     def block(self, height: Array, set_point: Array) -> None:
@@ -148,8 +150,8 @@ class Predistortion:
 
         Args:
             heights: increasing heights of the measurements [m], shape (k,); the error is interpolated linearly between
-                them, and constant beyond their ends.
-            error: radius of the last part less the desired radius, y - w [m], shape (k,): the mean over a revolution.
+                these heights, and constant beyond their ends.
+            error: radius of the last part minus the desired radius, y - w [m], averaged over a revolution, shape (k,).
             gain: γ; values below 1 average over parts.
 
         Raises:

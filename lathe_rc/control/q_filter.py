@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zero-phase smoothing filters over the angle: the Q of repetitive control (paper 001: Q = 1 + Wф).
 
-All have Q(0) = 1 and a width fixed in angle. With the width κ in grid points they agree at low frequencies,
-Q(ν) ≈ 1 - (κν)² for ν radians per grid point, so that `q_time` has the same meaning for each:
+All filters have Q(0) = 1 and a width fixed in angle. With the width κ in grid points they agree at low frequencies,
+Q(ν) ≈ 1 - (κν)² for ν radians per grid point, so that `q_time` has the same meaning for each of them:
 
     exponential      1/(1 + 4κ²·sin²(ν/2))      kernel r^|j|: two first-order recursions
     Gaussian         exp(-(κν)²)                kernel of standard deviation √2·κ
     moving average   sin(aν)/(aν), a = √6·κ     running sum
     FIR              Kaiser-windowed low-pass, flat up to a pass frequency
 
-A filter is applied to a fixed number of grid points at a time (`chunk`), with `reach` more on each side. The start
-of a chunk is fixed on the grid, so results are bit-identical for all block lengths. The cost of a point does not
-depend on the width for the exponential and the moving average, and grows with its logarithm for the others.
+A filter is applied to a fixed number of grid points at a time (`chunk`), with `reach` further points on each side. The
+start of a chunk is fixed on the grid, so results are bit-identical for all block lengths. The cost per point does not
+depend on the width for the exponential filter and the moving average, and grows with the logarithm of the width for
+the others.
 """
 
 from abc import ABC, abstractmethod
@@ -26,13 +27,13 @@ from lathe_rc.jit import kernel
 
 Array = npt.NDArray[np.float64]
 
-_TAIL = 1e-12  # weight at which a kernel is cut off
-_EDGES = 256  # frequencies at which the ripple of a band is checked
-_CHUNK = 256  # grid points filtered at a time, if the kernel is no longer
+_TAIL = 1e-12  # weight at which a kernel is truncated
+_EDGES = 256  # number of frequencies at which the ripple of a band is checked
+_CHUNK = 256  # grid points filtered at a time, unless the kernel is longer
 
 
 class QFilter(ABC):
-    """Base class of the zero-phase filters over the grid of the memory.
+    """Base class of the zero-phase filters on the grid of the memory.
 
     Args:
         reach: grid points used on each side of a point.
@@ -41,7 +42,7 @@ class QFilter(ABC):
     Attributes:
         reach: as given.
         chunk: grid points that `smooth` computes at a time.
-        ratio: ratio of the recursions of `Exponential`, which kernels compute themselves; below 0 for other filters.
+        ratio: ratio of the recursions of `Exponential`, which kernels compute themselves; negative for other filters.
 
     Raises:
         InputError: the filter is wider than the cycle allows.
@@ -56,7 +57,7 @@ class QFilter(ABC):
                 "points"
             )
         self.reach = reach
-        # At least as long as the reach: the cost of the margins is then at most twice that of the points.
+        # At least as long as the reach, so that the margins cost at most twice as much as the points.
         self.chunk = min(max(_CHUNK, reach), cycle - reach)
 
     @abstractmethod
@@ -70,13 +71,13 @@ class QFilter(ABC):
 
 @kernel
 def two_sided(ratio: float, reach: int, points: Array, scratch: Array, smoothed: Array) -> None:
-    """Run the forward and backward recursion of `Exponential` in one loop; ``scratch`` is as long as ``points``."""
+    """Run the forward and backward recursions of `Exponential` in one loop; ``scratch`` is as long as ``points``."""
     gain = (1.0 - ratio) / (1.0 + ratio)
     last = points.size - 1
     forward = backward = 0.0
     for k in range(points.size - reach):
         forward = ratio * forward + points[k]
-        # The backward sum excludes the point itself, which is in the forward sum.
+        # The backward sum excludes the point itself, which the forward sum includes.
         scratch[last - k] = backward
         backward = ratio * backward + points[last - k]
         if k >= reach:
@@ -120,15 +121,15 @@ def _running_mean(reach: int, end: float, points: Array, smoothed: Array) -> Non
 
 
 class MovingAverage(QFilter):
-    """Moving average over the angle; the points at both ends are weighted by their fraction inside the window.
+    """Moving average over the angle; the two end points are weighted by their fractions inside the window.
 
     Args:
-        width: κ in grid points; the window extends √6·κ grid angles to each side.
+        width: κ in grid points; the window extends √6·κ grid angles in each direction.
         cycle: grid points in a cycle.
     """
 
     def __init__(self, width: float, cycle: int) -> None:
-        side = max(np.sqrt(6.0) * width - 0.5, 0.0)  # beyond the half of the middle point
+        side = max(np.sqrt(6.0) * width - 0.5, 0.0)  # beyond the middle point's half-width
         super().__init__(ceil(side), cycle)
         self._end = float(side - (self.reach - 1)) if self.reach else 0.0
 
@@ -192,7 +193,7 @@ class Gaussian(Weights):
     """
 
     def __init__(self, width: float, cycle: int) -> None:
-        # Capped: a kernel longer than the cycle is rejected below, and need not be computed.
+        # Capped, since a kernel longer than the cycle is rejected below and need not be computed.
         reach = min(ceil(2.0 * width * np.sqrt(-np.log(_TAIL))), cycle)
         super().__init__(np.exp(-((np.arange(reach + 1) / max(2.0 * width, _TAIL)) ** 2)), cycle)
 
@@ -202,7 +203,7 @@ class LowPass(Weights):
 
     Args:
         passed: end of the pass band [rad per grid point].
-        stopped: begin of the stop band [rad per grid point].
+        stopped: start of the stop band [rad per grid point].
         ripple: largest deviation from 1 in the pass band and from 0 in the stop band [1].
         cycle: grid points in a cycle.
 
@@ -219,16 +220,16 @@ class LowPass(Weights):
         taps, beta = scipy.signal.kaiserord(-20.0 * np.log10(ripple / 2.0), (stopped - passed) / np.pi)
         bands = np.concatenate((np.linspace(0.0, passed, _EDGES), np.linspace(stopped, np.pi, _EDGES)))
         wanted = np.repeat([1.0, 0.0], _EDGES)
-        taps = min(taps | 1, 2 * cycle + 1)  # odd, for a middle point; a kernel far too long is rejected below
+        taps = min(taps | 1, 2 * cycle + 1)  # odd, for a middle point; a kernel that is far too long is rejected below
         while True:
             taper = scipy.signal.firwin(taps, (passed + stopped) / 2.0, window=("kaiser", beta), fs=2.0 * np.pi)
             super().__init__(np.asarray(taper[taps // 2 :]), cycle)
             if np.abs(self.response(bands) - wanted).max() <= ripple:
                 break
-            taps += 2  # Kaiser's formula is short of a point or two where the transition is wide
+            taps += 2  # for a wide transition, Kaiser's formula is a point or two short
 
 
-_EXACT, _CLOSE = 1e-9, 1e-6  # tolerance of Q(0), and of the difference between response and smoothing
+_EXACT, _CLOSE = 1e-9, 1e-6  # tolerances of Q(0), and of the difference between response and smoothing
 _WAVES = 7
 
 
@@ -251,7 +252,7 @@ def check(q: QFilter) -> None:
         )
     if abs(response[0] - 1.0) > _EXACT:
         raise InputError(f"Q(0) = {response[0]:.10g}; allowed: 1, or the memory forgets what does not change")
-    # Sum of waves of all frequencies, each with its own phase: the result is right only for a linear zero-phase filter.
+    # Sum of sinusoids of all frequencies, each with its own phase: only a linear zero-phase filter gives this result.
     place = np.arange(-q.reach, q.chunk + q.reach)
     waves = np.cos(np.outer(radians, place) + np.arange(_WAVES)[:, None])
     smoothed = np.full(q.chunk, np.nan)

@@ -2,10 +2,10 @@
 """P-integrator: repetitive control whose memory is indexed by an angle.
 
     M(φ) = Q·M(φ - θ) + γ·δ(φ)          learned memory (paper 001, Fig. 2; γ = 1 in the papers)
-    A(φ) = (1/W0)·M(φ - θ + lead)       set point of the drive (paper 000, eq. 21 as reads of one memory)
+    A(φ) = (1/W0)·M(φ - θ + lead)       set point of the drive (paper 000, eq. 21, as reads of a single memory)
 
-θ is the cycle angle. With the spindle's angle for φ this is Fig. 1b of paper 000; with Ω0·t for φ the cycle is
-the fixed time θ/Ω0, its Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filter`) and 1/W0 (`correction`) have
+θ is the cycle angle. With the spindle angle as φ, this is Fig. 1b of paper 000; with Ω0·t as φ, the cycle is the
+fixed time θ/Ω0, as in Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filter`) and 1/W0 (`correction`) have
 modules of their own.
 """
 
@@ -26,21 +26,21 @@ from lathe_rc.errors import LatheError
 Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
-_LONGEST = 8192  # samples of a block
+_LONGEST = 8192  # largest number of samples in a block
 _ROOM = {"windows": (2, _LONGEST + 3), "ahead": (3, _LONGEST)}  # shapes of the table's scratch arrays for a block
-LEARNING_DELAY = 3  #: samples from a measured error to its place in the memory: cubic interpolation looks ahead
+LEARNING_DELAY = 3  #: samples until a measured error is in the memory, since cubic interpolation looks ahead
 
 
 class Cycle(NamedTuple):
-    """Result of one cycle of the memory, over its grid points."""
+    """Result of one cycle of the memory, evaluated at its grid points."""
 
-    number: int  #: from 1
-    sample_index: int  #: sample at which its last grid point was learned
-    rms: float  #: of the measured error [m]
-    largest: float  #: magnitude of the measured error [m]
-    contraction: float  #: rms over that of the cycle before; NaN in the first
+    number: int  #: number of the cycle, from 1
+    sample_index: int  #: sample at which the last grid point of the cycle was learned
+    rms: float  #: RMS of the measured error [m]
+    largest: float  #: largest magnitude of the measured error [m]
+    contraction: float  #: ratio of ``rms`` to that of the previous cycle; NaN in the first cycle
     learning: bool
-    joined: bool = True  #: whether the channel learns from then on
+    joined: bool = True  #: whether the channel learns from this cycle on
 
 
 class AngleLostError(LatheError):
@@ -67,14 +67,14 @@ class RepetitiveController:
         preview: lead law.
         correction: 1/W0.
         nominal: nominal spindle speed Ω0 [rad/s].
-        delay: samples until a measured error is visible.
+        delay: number of samples until a measured error is available.
         join_below: largest error of a cycle [m] at which the channel begins to learn; inf for an immediate start.
         step: sampling step [s].
 
     Attributes:
         table: memory and law for `lathe_rc.control.angle_memory.advance`.
         preview: lead law.
-        correction: 1/W0; may be replaced by one of the same law between two blocks or at the end of a cycle.
+        correction: 1/W0; may be replaced by a correction of the same law between two blocks or at the end of a cycle.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class RepetitiveController:
             law=int(correction.law),
             looks_ahead=correction.looks_ahead,
             settings=np.zeros(7),
-            # Includes the points of the previous cycle that Q needs; a power of two, for indices by a mask.
+            # Includes the points of the previous cycle that Q needs; a power of two, so that a mask wraps the index.
             memory=np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()),
             chunk=np.empty(q.chunk),
             scratch=np.empty((2, q.chunk + 2 * q.reach)),
@@ -179,7 +179,7 @@ class RepetitiveController:
         self._replaced()
 
     def _replaced(self) -> None:
-        """Invalidate smoothed points and delayed errors after the memory was replaced."""
+        """Invalidate smoothed points and delayed errors after a replacement of the memory."""
         self.table.whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
         self.table.whole[angle_memory.REPLACED] = 1
 
@@ -192,7 +192,7 @@ class RepetitiveController:
         return points
 
     def remember(self, points: Array) -> None:
-        """Replace the learned memory by ``points`` in the order of `memory`; the channel counts as joined."""
+        """Replace the learned memory by ``points``, in the order of `memory`; the channel counts as joined."""
         memory = self.table.memory
         places = np.arange(memory.size) + self.table.whole[angle_memory.NEXT] - memory.size
         memory[places & (memory.size - 1)] = points[places % self._cycle]
@@ -209,7 +209,7 @@ class RepetitiveController:
         error: Array,
         command: Array,
     ) -> Iterator[Cycle]:
-        """Advance learning and command by a block of samples; all arrays have the shape (n,).
+        """Advance learning and command by a block of samples; all arrays have shape (n,).
 
         Args:
             first: index of the first sample.
@@ -223,8 +223,8 @@ class RepetitiveController:
             The cycles that end in this block; computation of the block continues after each.
 
         Raises:
-            AngleLostError: the spindle turned so fast that the memory would have been read at points not learned
-                yet, or turned back to points already overwritten, or its angle jumped.
+            AngleLostError: the spindle turned so fast that the memory would have been read at points not yet learned,
+                or turned back to points already overwritten, or its angle jumped.
         """
         wanted = self._correction.law is not CorrectionLaw.NONE
         n = angle.size
@@ -262,7 +262,7 @@ class RepetitiveController:
         return AngleLostError(f"sample {first + reached}: {why}", reached)
 
     def smooth(self) -> None:
-        """Apply Q to the previous cycle, for the chunk of grid points learned next."""
+        """Apply Q to the previous cycle, for the chunk of grid points to be learned next."""
         table, size, reach = self.table, self._q.chunk, self._q.reach
         base = int(table.whole[angle_memory.NEXT]) // size * size
         before = np.arange(base - self._cycle - reach, base - self._cycle + size + reach)
@@ -290,10 +290,10 @@ def largest_feedback_delay(
 ) -> int:
     """Compute the longest feedback delay [sample] at which every memory point is learned before it is read.
 
-    The newest point in the memory when sample n is commanded was measured D + 3 samples before (the cubic
+    The newest point in the memory when sample n is commanded was measured D + 3 samples earlier (the cubic
     interpolation of the error looks two samples ahead); the read reaches some grid points beyond
-    φ - θ + lead. So (D + 3)·Ω·step <= θ - lead - late - (looks_ahead + 1) grid angles. The Q filter adds no delay: it
-    is applied when a point is learned, to points one cycle older.
+    φ - θ + lead. Therefore (D + 3)·Ω·step <= θ - lead - late - (looks_ahead + 1) grid angles. The Q filter adds no
+    delay: when a point is learned, Q is applied to points one cycle older.
 
     Args:
         grid: memory points per revolution.
@@ -301,7 +301,7 @@ def largest_feedback_delay(
         lead: largest lead angle [rad].
         speed: largest spindle speed [rad/s].
         late: largest lag of the measured angle [rad], one count of the encoder.
-        looks_ahead: grid points after its place that a read uses.
+        looks_ahead: number of grid points after its position that a read uses.
         step: sampling step [s].
     """
     free = _TURN * revolutions - lead - late - (looks_ahead + 1) * _TURN / grid

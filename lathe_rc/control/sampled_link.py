@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corrective link of a sampled position servo (paper 003).
 
-The drive K/(p·(T1·p + 1)) behind a zero-order hold of period T is from sample to sample
+From sample to sample, the drive K/(p·(T1·p + 1)) behind a zero-order hold of period T is
 
     W(z) = (b1·z + b0)/((z - 1)·(z - d)),
     d = e^{-T/T1},  b1 = K·(T - T1 + T1·d),  b0 = K·(T1·(1 - d) - d·T)
 
-and the link D(z), placed before the hold, filters the error. Laws:
+and the link D(z), placed before the hold, filters the error. The laws are
 
     paper         D = K·T·(z - d)/(b1·z + b0)
     ripple_free   D = 1/(b1 + b0)·(z - d)/(z + b0/(b1 + b0))
 
 The paper's link makes D·W equal to the desired function K·(1 - T/2·jλ)/jλ, which is K·T/(z - 1). The loop settles in
-one period if K·T = 1, but at the samples only: the link cancels the zero -b0/b1, so that the command alternates for
+one period if K·T = 1, but only at the samples: because the link cancels the zero -b0/b1, the command alternates for
 many periods and the drive oscillates between the samples. The ripple-free link does not cancel the zero. Its command
 for a step is 1/(b1 + b0), -d/(b1 + b0), 0, 0, …: the drive accelerates for one period, decelerates to a stop in the
 next, and never reverses.
 
-With a measurement delayed by τ ≤ T the drive is B(z)/(z·(z - 1)·(z - d)) with
+With a measurement delayed by τ ≤ T, the drive is B(z)/(z·(z - 1)·(z - d)) with
 
     B = b1·z + b0 + K·T1·(1 - e)·(1 - d)·(z - 1) + K·(T - τ - T1·(1 - e))·(z - 1)·(z - d),  e = e^{-(T-τ)/T1}
 
@@ -37,7 +37,7 @@ from lathe_rc.jit import kernel
 Array = npt.NDArray[np.float64]
 Law = Literal["paper", "ripple_free"]
 
-_DIGITS = 9  # decimals of a pole magnitude that distinguish it from 1
+_DIGITS = 9  # decimals by which a pole magnitude is distinguished from 1
 
 
 @dataclass(frozen=True)
@@ -79,16 +79,16 @@ class SampledDrive:
 
     @property
     def numerator(self) -> Array:
-        """Numerator of W(z), falling powers of z, shape (2,)."""
+        """Numerator of W(z), in descending powers of z, shape (2,)."""
         return np.array([self.b1, self.b0])
 
     @property
     def denominator(self) -> Array:
-        """Denominator of W(z), falling powers of z, shape (3,)."""
+        """Denominator of W(z), in descending powers of z, shape (3,)."""
         return np.array([1.0, -1.0 - self.d, self.d])
 
     def late(self, delay: float) -> Array:
-        """Numerator B(z) with a measurement delay [s], shape (3,); z·(b1·z + b0) without a delay.
+        """Compute the numerator B(z) for a measurement delay [s], shape (3,); z·(b1·z + b0) without a delay.
 
         Raises:
             InputError: the delay is negative or exceeds a period.
@@ -106,14 +106,14 @@ class Link:
     """Corrective link D(z), the transfer function from error to command.
 
     Attributes:
-        numerator, denominator: falling powers of z, of the same length; the first of the denominator is 1.
+        numerator, denominator: coefficients in descending powers of z, equally many; the denominator's first is 1.
     """
 
     numerator: tuple[float, ...]
     denominator: tuple[float, ...]
 
 
-NONE = Link((1.0,), (1.0,))  #: the uncorrected loop
+NONE = Link((1.0,), (1.0,))  #: no correction
 
 
 def _link(numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Link:
@@ -122,7 +122,7 @@ def _link(numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Link:
 
 
 def towards(drive: SampledDrive, ratio: float) -> Link:
-    """Link that makes D·W equal to the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
+    """Return the link that makes D·W equal to the desired function with Te = ratio·T/2 (paper 003, eqs 5 and 6).
 
     Wd = K·(1 - jλ·T/2)·(1 + jλ·Te)/(jλ·(1 + jλ·T/2)) = (K·T/2)·((1 + ratio)·z + 1 - ratio)/(z·(z - 1))
     """
@@ -131,12 +131,12 @@ def towards(drive: SampledDrive, ratio: float) -> Link:
 
 
 def paper(drive: SampledDrive) -> Link:
-    """Corrective link of paper 003, equal to `towards` with ratio 1."""
+    """Return the corrective link of paper 003, equal to `towards` with ratio 1."""
     return _link(drive.gain * drive.period * np.array([1.0, -drive.d]), drive.numerator)
 
 
 def ripple_free(drive: SampledDrive, delay: float = 0.0) -> Link:
-    """Link whose command for a step is 0 after the second period.
+    """Return the link whose command for a step is 0 after the second period.
 
     Args:
         drive: drive that the link corrects.
@@ -159,7 +159,7 @@ def design(law: Law, drive: SampledDrive, delay: float = 0.0) -> Link:
 
 
 def closed_loop(drive: SampledDrive, link: Link, delay: float = 0.0) -> Array:
-    """Characteristic polynomial of the closed loop, falling powers of z, without pole-zero cancellation.
+    """Return the closed loop's characteristic polynomial in descending powers of z, without pole-zero cancellation.
 
     Args:
         drive: drive of the loop.
@@ -176,7 +176,7 @@ def closed_loop(drive: SampledDrive, link: Link, delay: float = 0.0) -> Array:
 
 
 def largest_pole(drive: SampledDrive, link: Link, delay: float = 0.0) -> float:
-    """Largest pole magnitude of the closed loop, rounded to 9 decimals; arguments as for `closed_loop`."""
+    """Return the largest pole magnitude of the closed loop, rounded to 9 decimals; arguments as for `closed_loop`."""
     return round(float(np.abs(np.roots(closed_loop(drive, link, delay))).max()), _DIGITS)
 
 
@@ -195,12 +195,12 @@ class LinkTable(NamedTuple):
 
 
 def table(link: Link, limit: float = np.inf) -> LinkTable:
-    """Constants of ``link`` for `correct`."""
+    """Return the constants of ``link`` for `correct`."""
     return LinkTable(np.array(link.numerator), np.array(link.denominator[1:]), float(limit))
 
 
 def rest(link: Link) -> Array:
-    """Zero initial state of a link for `correct`: past errors, then past commands."""
+    """Return the zero initial state of a link for `correct`: past errors, then past commands."""
     return np.zeros(2 * len(link.denominator) - 2)
 
 
@@ -228,7 +228,7 @@ class HeldLink(NamedTuple):
     Attributes:
         link: constants of the link.
         state: past errors and commands for `correct`.
-        divisor: samples in a period.
+        divisor: number of samples in a period.
         held: the held command, and the number of limited commands so far.
     """
 
@@ -250,16 +250,16 @@ def correct_along(link: HeldLink, first: int, set_point: Array, measurement: Arr
 
 
 class SampledLink:
-    """Controller with a sampled link: set point and measurement in, held command out.
+    """Controller that computes a held command from set point and measurement by a sampled link.
 
-    A command is computed every ``divisor`` samples, at multiples of it; this is the period T.
+    A command is computed at every sample that is a multiple of ``divisor``; this interval is the period T.
 
     Args:
         law: ``paper`` or ``ripple_free``.
         gain: K of the drive [1/s].
         lag: T1 of the drive [s].
         step: sampling step [s].
-        divisor: samples in a period.
+        divisor: number of samples in a period.
         delay: delay of the measurement [s]; only the ripple-free link accounts for it.
         limit: limit of the command's magnitude, in the unit of the position.
 
@@ -307,7 +307,7 @@ class SampledLink:
 
         Args:
             first: index of the first sample.
-            set_point: shape (n,).
+            set_point: set point, shape (n,).
             measurement: position, in the same unit, shape (n,).
             command: output, in the same unit, shape (n,).
         """

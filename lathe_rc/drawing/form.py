@@ -18,7 +18,7 @@ _IN_NOTEBOOK = 72.0  # [dots per inch]
 
 @dataclass(frozen=True)
 class TurnedForm:
-    """Form that a run has turned.
+    """Form turned in a run.
 
     Attributes:
         angle: spindle angle [rad], shape (samples,).
@@ -35,14 +35,14 @@ class TurnedForm:
     before: int
 
     def revolution(self, number: int) -> tuple[np.ndarray, slice]:
-        """Return the angle in a revolution [°], and the samples of the revolution."""
+        """Return the angles within a revolution [°], and the slice of its samples."""
         starts = self.errors.starts[number : number + 2] if number >= 0 else self.errors.starts[-2:]
         span = slice(int(starts[0]), int(starts[1]))
         return np.rad2deg(np.mod(self.angle[span], 2 * np.pi)), span
 
 
 class RunFigure(Figure):
-    """Figure that a notebook displays without an import of pyplot."""
+    """Figure that a notebook can display without importing pyplot."""
 
     def _repr_png_(self) -> bytes:
         """Return a small PNG image for a notebook."""
@@ -52,10 +52,10 @@ class RunFigure(Figure):
 
 
 def draw(run: TurnedForm, title: str = "", beside: tuple[str, TurnedForm] | None = None) -> RunFigure:
-    """Draw the desired form, the form error over angle in the first and last revolution, and by revolution.
+    """Draw the desired form, and the form error over angle (first and last revolution) and by revolution.
 
     Args:
-        run: form that the run has turned.
+        run: form turned in the run.
         title: title of the figure.
         beside: name and form of another run of the same part, whose errors are drawn as well.
 
@@ -127,14 +127,14 @@ def _beside(over_angle: Axes, curve: Axes, name: str, peer: TurnedForm) -> None:
 
 
 def learning(errors: FormErrors, before: int = 0) -> RunFigure:
-    """Draw a small plot of the form error by revolution; ``before``: number of revolutions before the first one."""
+    """Draw a small plot of the form error by revolution; ``before`` is the number of revolutions before the first."""
     figure = RunFigure(figsize=(5.0, 2.4), layout="constrained")
     _by_revolution(figure.subplots(), errors, before)
     return figure
 
 
 def _scale(errors: FormErrors) -> str:
-    """Choose the scale of an error axis: linear if an error is zero, which a logarithm cannot show."""
+    """Choose the scale of an error axis: linear if an error is zero, which a logarithmic axis cannot show."""
     return "log" if errors.rms.all() else "linear"
 
 

@@ -9,7 +9,7 @@ from lathe_rc.analysis.form_errors import FormErrors
 
 
 def errors_picture(errors: FormErrors, before: int) -> str:
-    """Return an image of the form error by revolution, if any; ``before``: number of revolutions before the first."""
+    """Return an image of the form error by revolution, if any; ``before`` revolutions precede the first one."""
     if not errors.rms.size:
         return ""
     from lathe_rc.drawing import form

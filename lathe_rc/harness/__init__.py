@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run of a scenario: offline, composed in one process, in groups of nodes, or with one process per node.
+"""Execution of a scenario: offline, composed in one process, in groups of nodes, or with one process per node.
 
     result = run(load(Path("config/piston.yaml")), mode="processes")
     print(result.errors.rms[-1], result.digest)
 
-Nodes report their events over one socket each (`lathe_rc.nodes.report`); the caller waits for events instead of
-polling. All child processes are terminated in every case. This package does not import rclpy.
+Nodes report their events over one socket per process (`lathe_rc.nodes.report`); the caller waits for events instead of
+polling. All child processes are terminated, however a run ends. This package does not import rclpy.
 """
 
 from lathe_rc.harness.processes import Event, Processes, free_domain, how_it_ended, with_recorder

@@ -26,19 +26,19 @@ from lathe_rc.names import absolute
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.process_launcher import Child, Start
 
-Event = Mapping[str, Any]  #: of a cell, as its nodes and the harness report them
+Event = Mapping[str, Any]  #: event of a cell, as reported by a node or the harness
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
 _GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
-_MOST_RESTARTS = 8  # of a process
+_MOST_RESTARTS = 8  # maximum number of restarts of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _NO_SIGN_OF_LIFE = {"stall", "foreign_message", "waits"}  # events of a stalled cell
 _LAST_WORDS = {"done", "error", "abandoned", "masterless"}  # events of a node that has finished or given up
 _LOOK = 0.05  # [s] between reads of a process's log
 _DOMAINS = 100  # domain_coordinator reserves 1 to 100
-# Each cell uses the next number, and each process starts at another one: a killed or orphaned process may still be in
-# the domain of a cell that has just ended.
+# Each cell uses the next number, and each process starts at a different one, because a killed or orphaned process may
+# still be in the domain of a cell that has just ended.
 _numbers = itertools.count(os.getpid() * 37)
 
 
@@ -56,7 +56,7 @@ def ignore(event: Event) -> None:
 
 @contextlib.contextmanager
 def free_domain(number: int | None = None) -> Iterator[int]:
-    """Reserve a ROS domain that no other program on this machine uses, or the given ``number``.
+    """Reserve a ROS domain that no other program on this computer uses, or the given ``number``.
 
     A given domain is yielded even if it is in use, since several cells may share it.
     """
@@ -74,7 +74,7 @@ def free_domain(number: int | None = None) -> Iterator[int]:
 
 
 def with_recorder(scenario: Scenario, bag: Path, *, keep: bool, snapshots: Path | None = None) -> Scenario:
-    """Return the scenario for its processes: with a recorder on ``bag``, and a spindle that waits for all members.
+    """Return the scenario for its processes: with a recorder for ``bag``, and a spindle that waits for all members.
 
     With ``snapshots``, the recorder also writes snapshots to that folder. Without ``keep``, the bag is temporary: it is
     not compressed, and there are no snapshots.
@@ -97,20 +97,20 @@ class Processes:
     """Processes of a cell from start to end, as a context manager that terminates all of them.
 
     Args:
-        scenario: scenario with a recorder, as `with_recorder` returns it.
+        scenario: scenario with a recorder, as returned by `with_recorder`.
         groups: names of the nodes in each process.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of all nodes.
         start: see `run`.
-        prefix: command prefix by the first node of a process, such as ``ip netns exec NAME``; the process is then
-            spawned as a new interpreter.
+        prefix: command prefix, such as ``ip netns exec NAME``, by the first node of a process; a process with a prefix
+            is spawned as a new interpreter.
 
     Attributes:
         pids: process ID by node.
         domain: the ROS domain in use.
         refused: number of messages from outside the cell that the nodes rejected, by sender; complete when the nodes
             have ended.
-        not_reached: scheduled events after the end of the run, by node; complete when the nodes have ended.
+        not_reached: events scheduled after the end of the run, by node; complete when the nodes have ended.
     """
 
     def __init__(
@@ -268,7 +268,7 @@ class Processes:
         return True
 
     def _goes_on(self, name: str) -> bool:
-        """Whether the cell handles the end of a node or process: its members wait, and then reach the safe state."""
+        """Return whether the cell handles the end of a node or process: its members wait, then reach the safe state."""
         masters = set(self._scenario.masters)
         waits = all(self._scenario.nodes[master].window for master in masters)
         return waits and "block0" in self._newest and not self._complete and not masters & set(name.split("+"))
@@ -295,7 +295,7 @@ class Processes:
             self._children[name].kill()
 
     def wait_for(self, kind: str, node: str | None = None, **values: object) -> Event:
-        """Wait for an event of a given kind, node and values.
+        """Wait for an event with a given kind, node and values.
 
         Raises:
             LatheError: a process failed before the event.
@@ -328,7 +328,7 @@ class Processes:
         return self._newest
 
     def _raise_failure(self, event: Event) -> None:
-        """Raise the error for the first failure; nodes that gave up because of another ("abandoned") are ignored."""
+        """Raise the error for the first failure; ignore nodes that gave up because of another node ("abandoned")."""
         node = event["node"]
         if event["event"] == "abandoned":
             self._is_no_cause(node)
@@ -350,14 +350,14 @@ class Processes:
         self._abandoned.update(name for name in self._children if node in name.split("+"))
 
     def _lose(self, name: str, why: str, error: type[LatheError] = LatheError) -> None:
-        """Raise the reason why a node or process ended, or store it until the time master reports the reaction."""
+        """Raise the error that says why a node or process ended, or store it until the cell's reaction is reported."""
         if not self._goes_on(name):
             self._hear_of_the_dead()
             raise error(self._with_the_lost(why))
         self._lost.append((name, why))
 
     def _hear_of_the_dead(self) -> None:
-        """Collect the exit reasons of dead processes that the time master has reported before their ``exit`` event."""
+        """Collect the exit reasons of processes that the time master has reported dead before their ``exit`` event."""
         for name in self._running:
             if self._restarts[name] or not self._dead & {absolute(self._namespace, node) for node in name.split("+")}:
                 continue
@@ -365,11 +365,11 @@ class Processes:
                 self._lost.append((name, self._end_of(name, self._children[name].wait(timeout=_GRACE))))
 
     def _end_of(self, name: str, code: int) -> str:
-        """Describe the end of a process, with the place of a crash or the last line of its log."""
+        """Describe the end of a process, with the location of a crash or the last line of the log."""
         return f"{how_it_ended({'node': name, 'code': code})}{self._crash(name) if code < 0 else self._tail(name)}"
 
     def _with_the_lost(self, message: str) -> str:
-        """Prepend the reasons of lost nodes to a message, unless it contains them already."""
+        """Prepend the reasons for lost nodes to a message, unless the message already contains them."""
         further = [why for name, why in self._lost if why.removeprefix(f"{name}: ") not in message]
         return "; ".join([*further, message])
 
@@ -384,7 +384,7 @@ class Processes:
         return f": {lines[-1].strip()}" if lines else ""
 
     def _crash(self, name: str) -> str:
-        """Return the innermost call of a crash in a library, as written by `faulthandler`; empty: no crash."""
+        """Return the innermost call of a crash in a library, as written by `faulthandler`; empty if there was none."""
         lines = self._log(name)
         start = next((place for place, line in enumerate(lines) if line.startswith("Current thread")), len(lines))
         return f" in {lines[start + 1].strip()}" if start + 1 < len(lines) else ""

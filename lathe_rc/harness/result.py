@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from lathe_rc import part
 from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.cell.latency_histogram import Lateness
@@ -34,19 +35,21 @@ class Result:
         scenario: the scenario of the run.
         mode: host of the run.
         samples: number of samples.
-        wall_s: wall time from block 0 until the last block is computed and recorded by every member [s].
+        wall_s: wall time from block 0 until every member has computed and recorded the last block [s].
         bag: path of the bag; None if nothing or only snapshots were recorded.
-        snapshots: bags of parts of the run, see `lathe_rc.bag.writing.snapshots`.
+        snapshots: bags of sections of the run (see `lathe_rc.bag.writing.snapshots`).
         recording: all signals of the run.
         refused: number of messages from outside the cell that the nodes rejected, by sender.
-        not_reached: scheduled events after the end of the run, by node.
-        unchecked: properties that the check before the start could not verify, because third-party laws or drives do
-            not declare them.
+        not_reached: events scheduled after the end of the run, by node.
+        unchecked: properties that the pre-start check could not verify, because third-party laws or drives do not
+            declare them.
         warnings: suspicious but allowed parameters, and settings that make the form error larger than necessary, each
-            with a remedy, from the check before the start.
-        margins: stability margin by learning controller, 1 less the largest factor of a cycle over all frequencies
-            and speeds (sup|Q - γZ| of repetitive control) [1]; None for a law without a factor.
-        lateness: lateness of the blocks; None if the run had no pace, as offline or with a ``speed_factor`` of 0.
+            with a remedy, as found by the pre-start check.
+        margins: stability margin by learning controller: 1 minus the largest factor per cycle over all frequencies
+            and speeds (sup|Q - γZ| for repetitive control) [1]; None for a law without a factor.
+        drive_margins: smallest relative error of the drive's response, at one frequency, with which learning diverges,
+            by learning controller.
+        lateness: lateness of the blocks; None if the run was not paced, that is offline or with ``speed_factor`` 0.
 
     Example:
         >>> import lathe_rc
@@ -74,6 +77,7 @@ class Result:
     unchecked: Sequence[str] = ()
     warnings: Sequence[str] = ()
     margins: Mapping[str, float | None] = field(default_factory=dict)
+    drive_margins: Mapping[str, DriveMargin] = field(default_factory=dict)
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -95,7 +99,7 @@ class Result:
         return self.recording.frame(topic)
 
     def plot(self, title: str | None = None) -> "Figure":
-        """Plot the desired form, the form error over the angle and by revolution (`lathe_rc.drawing.form.draw`).
+        """Plot the desired form, and the form error over angle and by revolution (`lathe_rc.drawing.form.draw`).
 
         Args:
             title: title of the figure; None: the scenario's name.
@@ -124,7 +128,7 @@ class Result:
 
     @property
     def errors(self) -> FormErrors:
-        """Form error by revolution; without revolutions if the scenario has no tool."""
+        """Form error by revolution; it has no revolutions if the scenario has no tool."""
         return self.recording.errors
 
     @cached_property
@@ -144,7 +148,7 @@ class Result:
 
     @cached_property
     def surface(self) -> Lay | str | None:
-        """Surface along the part, or the reason for its absence; None: no tool of the scenario has a `nose_radius`."""
+        """Surface along the part, or why it is absent; None if no tool of the scenario has a `nose_radius`."""
         tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
         radius = next((table.nose_radius for table in tools if table.nose_radius), 0.0)
         if not radius or not self.errors.rms.size:
@@ -190,6 +194,7 @@ class Result:
             "unchecked": list(self.unchecked),
             "warnings": list(self.warnings),
             "stability_margin": dict(self.margins),
+            "drive_margin": {name: margin._asdict() for name, margin in self.drive_margins.items()},
             "error_um": {
                 "first": of(0),
                 "last": of(-1),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run of one scenario in any host, from the checks to the bag.
+"""Execution of one scenario in any host, from the checks to the bag.
 
-The modules that write and read bags are imported only when a bag is requested, so other runs start faster.
+The modules that write and read bags are imported only when a bag is requested, so that other runs start faster.
 """
 
 import contextlib
@@ -42,13 +42,14 @@ def run(
 
     Args:
         scenario: the scenario to run; its spindle must have a number of revolutions.
-        mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node
+        mode: ``offline``: a loop in this process; ``composed``: all nodes in one process; ``processes``: each node in
             a process of its own.
-        groups: nodes that share a process, for ``processes``; all other nodes have their own; None: as in the scenario.
+        groups: groups of nodes that share a process, for ``processes``; every other node has its own; None: as in the
+            scenario.
         bag: folder to record to; None: nothing is recorded. If the recorder's ``mode`` is ``snapshot``, the folder of
-            the snapshots is named after it, and the recording of the whole run is deleted at its end.
-        watch: called with every event, from the thread that called `run`. The first is ``checked``, with the
-            number of samples and step [s]: after it, the run is no longer rejected.
+            the snapshots is named after this one, and the recording of the whole run is deleted at the end.
+        watch: called with every event, from the thread that called `run`. The event ``checked``, with the number of
+            samples and the step [s], indicates that the run has passed its checks.
         domain: ROS domain; None: a free one.
         namespace: ROS namespace of the cell; cells with different namespaces can share a domain.
         start: ``fork``: processes are forks of a server with preloaded imports; ``spawn``: each process is a new
@@ -83,7 +84,13 @@ def run(
 
         refuse_existing(place)
     result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
-    result = replace(result, unchecked=cell.unchecked, warnings=cell.warnings, margins=cell.margins)
+    result = replace(
+        result,
+        unchecked=cell.unchecked,
+        warnings=cell.warnings,
+        margins=cell.margins,
+        drive_margins=cell.drive_margins,
+    )
     if result.bag is not None:
         from lathe_rc.bag.check import write_digests
 

@@ -46,7 +46,8 @@ class EncoderRole(SpindleRole):
         super().__init__(node)
         device = self._device = cast("EncoderDeviceParameters", node.table)
         self._scale = device.counts_per_revolution / (2.0 * np.pi) if device.position == "angle" else 1.0
-        self._line = LineReader.open(Path(device.device), device.baud_rate) if device.source == "line" else None
+        timed, is_line = device.edge_clock > 0.0, device.source == "line"
+        self._line = LineReader.open(Path(device.device), device.baud_rate, timed=timed) if is_line else None
         self._came = 0.0  # arrival of the newest reading, monotonic [s]
         self._listens = self._lost = False
         self._unusable = 0  # joint states without a spindle position
@@ -112,11 +113,11 @@ class EncoderRole(SpindleRole):
 
     def _hear(self, readings: Iterator[Reading]) -> None:
         """Take encoder readings; readings from before the start of the run are ignored."""
-        for time_ns, count in readings:
+        for reading in readings:
             if not self.leads.running or self.leads.over or self._lost:
                 continue
             self._came = time.monotonic()
-            self.stage.hear(time_ns, count)
+            self.stage.hear(*reading)
             self.pace.schedule = min(self.pace.schedule, self._came - self.stage.counted.time)
 
     def start_run(self) -> None:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the cut: chip of a sample, cutting force, deflection of the edge, remembered surface.
+"""Kernels of the cut: chip of a sample, cutting force, deflection of the edge, stored surface.
 
-The equations are those of `lathe_rc.plants.cutting`, here sample by sample, so that the edge's motion can be solved
-together with the chip, see `lathe_rc.plants.tool_drive`.
+The equations are those of `lathe_rc.plants.cutting`, evaluated here sample by sample, so that the edge's motion can be
+solved together with the chip (see `lathe_rc.plants.tool_drive`).
 
 The surface behind the edge is stored until the edge meets it again a revolution later. It is stored as a function of
-the angle, so that it can be looked up at any speed. The surface between two samples is interpolated at the grid points
-between their angles.
+the angle, so that it can be looked up at any speed: from one sample to the next, it is interpolated at the grid points
+between the two angles.
 """
 
 from typing import NamedTuple
@@ -21,16 +21,16 @@ from lathe_rc.plants.cutting_force import Flank, SpecificForce, Wear, cutting_st
 from lathe_rc.plants.workpiece import hardness, missing
 from lathe_rc.transfer import System, step
 
-# Indices in the data of the last sample: its place on the grid, the surface there, the next grid point.
+# Indices in the data of the last sample: its position on the grid, the surface there, and the next grid point.
 _PLACE, _LEFT, _NEXT = 0, 1, 2
 
 
 class SurfaceTable(NamedTuple):
-    """Remembered surface of the part for kernels.
+    """Stored surface of the part, for kernels.
 
     Attributes:
-        ring: surface by grid point [m], modulo the size, which is a power of two.
-        last: place of the last sample on the grid, surface there, and next grid point; NaN before the first sample.
+        ring: surface by grid point [m]; grid point i is at index i modulo the size, a power of two.
+        last: position of the last sample on the grid, surface there, and next grid point; NaN before the first sample.
     """
 
     ring: Array
@@ -38,20 +38,20 @@ class SurfaceTable(NamedTuple):
 
 
 def blank(grid: int) -> SurfaceTable:
-    """Return the surface of an uncut part, with ``grid`` points in a revolution."""
+    """Return the surface of an uncut part, with ``grid`` points per revolution."""
     # A power of two, so that a mask wraps the index; a sample may be up to a revolution long.
     return SurfaceTable(np.zeros(1 << (2 * grid + 2).bit_length()), np.array([np.nan, 0.0, 0.0]))
 
 
 @inlined
 def goes_on(last: Array, place: float, grid: int) -> bool:
-    """Check that ``place`` [grid point] is at or beyond the last sample, by less than a revolution."""
+    """Return whether ``place`` [grid points] is at or beyond the last sample, by less than a revolution."""
     return bool(0.0 <= place - (place if np.isnan(last[_PLACE]) else last[_PLACE]) < grid)
 
 
 @kernel
 def surface_at(ring: Array, place: float) -> float:
-    """Return the remembered surface [m] at ``place`` [grid point]."""
+    """Return the stored surface [m] at ``place`` [grid points]."""
     i = int(np.floor(place))
     mask = ring.size - 1
     left = ring[i & mask]
@@ -60,11 +60,11 @@ def surface_at(ring: Array, place: float) -> float:
 
 @kernel
 def remember(ring: Array, last: Array, place: float, left: float) -> None:
-    """Store the surface ``left`` [m] at ``place`` [grid point], interpolated from the last sample to this one."""
+    """Store the surface ``left`` [m] at ``place`` [grid points], interpolated from the last sample to this one."""
     mask = ring.size - 1
     if np.isnan(last[_PLACE]):
         last[_PLACE], last[_LEFT], last[_NEXT] = place, left, np.ceil(place)
-    # Each grid point between the two samples; at a low spindle speed most samples pass none.
+    # Each grid point between the two samples; at a low spindle speed, most samples pass none.
     while last[_NEXT] <= place:
         u = 0.0
         if place > last[_PLACE]:
@@ -77,7 +77,7 @@ def remember(ring: Array, last: Array, place: float, left: float) -> None:
 _TURN = 2.0 * np.pi
 
 WEAR, _EDGE = 0, 1  #: indices in the state
-DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: reasons why a kernel stopped
+DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: reasons for a kernel to stop
 
 
 class Process(NamedTuple):
@@ -85,17 +85,17 @@ class Process(NamedTuple):
 
     Attributes:
         step: sampling step [s].
-        depth: [m].
+        depth: depth of cut with cross feed, tool and allowance at 0 [m].
         overlap: µ.
         sign: σ.
         material, wear, flank: see `lathe_rc.plants.cutting_force`.
-        radius: of the part, for the cutting path [m].
+        radius: radius of the part, for the length of the cutting path [m].
         lag, mode: systems of F and w.
-        lag_now, mode_now: change of the output of each system by a unit of its input in the same sample.
-        gaps: shape (m, 2).
-        spots: shape (m, 5).
-        heights, compliances: shape (m,).
-        grid: points in a revolution.
+        lag_now, mode_now: change of each system's output per unit of its input in the same sample.
+        gaps: windows without material, shape (m, 2).
+        spots: hard spots, shape (m, 5).
+        heights, compliances: table of the compliance, shape (m,).
+        grid: points per revolution.
     """
 
     step: float
@@ -123,8 +123,8 @@ class CutTable(NamedTuple):
     Attributes:
         process: constants.
         lag_state, mode_state: states of F and w.
-        state: VB, and the last place of the edge; NaN before the first sample.
-        surface: remembered surface.
+        state: VB, and the last position of the edge, NaN before the first sample.
+        surface: stored surface.
     """
 
     process: Process
@@ -137,7 +137,7 @@ class CutTable(NamedTuple):
 @inlined
 def _free(system: System, state: Array) -> float:
     """Return the next output of a system for an input of 0; the state is unchanged."""
-    # `step` would change the state, and the chip needs this output before the input, the force, is known.
+    # `step` would change the state, but the chip needs this output before the input (the force) is known.
     order = system.now.size
     value = 0.0
     for row in range(order):
@@ -150,7 +150,7 @@ def _free(system: System, state: Array) -> float:
 
 @inlined
 def pressed_by(process: Process, speed: float, wear: float) -> float:
-    """Return σ times the decrease of the flank force per metre of outward edge motion in a sample [N/m]."""
+    """Return σ times the decrease of the flank force per metre of outward edge motion within a sample [N/m]."""
     if process.flank.pressure == 0.0:
         return 0.0
     damping = flank_damping(process.flank, process.radius * speed, wear)
@@ -161,7 +161,7 @@ def pressed_by(process: Process, speed: float, wear: float) -> float:
 def meet(
     cut: CutTable, place: float, speed: float, height: float, angle: float, feed_velocity: float
 ) -> tuple[int, float, float, float]:
-    """Return the conditions of the cut at ``place`` [grid point]: stop reason, feed, cutting stiffness K, and σ·c."""
+    """Return the conditions of the cut at ``place`` [grid points]: stop reason, feed, cutting stiffness K, and σ·c."""
     process, state = cut.process, cut.state
     if not speed > 0.0:
         return _STANDS, 0.0, 0.0, 0.0
@@ -175,13 +175,13 @@ def meet(
 
 @inlined
 def held(cut: CutTable) -> float:
-    """Return the force [N] of a sample without a chip, which decays with the lag of the force."""
+    """Return the force [N] of a sample without a chip, which decays with the force's lag."""
     return _free(cut.process.lag, cut.lag_state)
 
 
 @inlined
 def _moved(cut: CutTable, base: float) -> float:
-    """Return the motion of the edge since the last sample, without its deflection [m]."""
+    """Return the motion of the edge since the last sample, excluding its deflection [m]."""
     before = cut.state[_EDGE]
     return 0.0 if np.isnan(before) else base - before
 
@@ -201,18 +201,18 @@ def chip_of(
 ) -> float:
     """Return the depth of cut [m] of a sample: negative without contact, NaN if the edge is drawn in without bound.
 
-    ``displacement`` is the displacement of the tool drives under the force `held`; they yield by ``give`` [m/N] to the
-    additional force of the chip. ``pressed``: see `pressed_by`; where it is not 0, ``give`` is 0.
+    ``displacement`` is that of the tool drives under the force `held`; ``give`` [m/N] is their compliance under the
+    additional force of the chip, 0 unless ``pressed`` (see `pressed_by`) is 0.
     """
     process, lag_now = cut.process, cut.process.lag_now
-    # The chip of a rigid edge, then its decrease by force and flank in this sample: with contact all of that is linear
-    # in the chip, so that one division solves it. A chip below 0 means that there is no contact.
+    # First the chip of a rigid edge, then its decrease by force and flank in this sample. With contact, everything is
+    # linear in the chip, so one division solves the equation. A negative chip means that there is no contact.
     chip = process.depth + allowance - cross_position - displacement
     if process.overlap > 0.0:
         chip += process.overlap * surface_at(cut.surface.ring, place - process.grid)
     follows = 1.0 + process.mode_now * pressed * compliance
     bend = (process.mode_now * lag_now * stiffness * compliance + lag_now * stiffness * give) / follows
-    if not 1.0 + bend > 0.0:  # the edge would be drawn in by the whole chip, or more
+    if not 1.0 + bend > 0.0:  # the edge would be drawn in by the whole chip or more
         return np.nan
     lagging = held(cut) - pressed * _moved(cut, cross_position + displacement)
     chip -= compliance * (_free(process.mode, cut.mode_state) + process.mode_now * lagging) / follows
@@ -224,9 +224,9 @@ def chip_of(
 def press(
     cut: CutTable, chip: float, stiffness: float, compliance: float, speed: float, base: float, pressed: float
 ) -> tuple[float, float]:
-    """Step force [N], deflection [m] and wear of the tool through a sample with a chip of 0 or more.
+    """Step the force [N], the deflection [m] and the wear of the tool through a sample with a chip of 0 or more.
 
-    ``base``: place of the edge without its deflection [m]; ``pressed``: see `pressed_by`.
+    ``base`` is the position of the edge without its deflection [m]; for ``pressed`` see `pressed_by`.
     """
     process, state = cut.process, cut.state
     free = _free(process.mode, cut.mode_state)
@@ -243,7 +243,7 @@ def press(
 
 @inlined
 def leave(cut: CutTable, place: float, chip: float, edge: float) -> None:
-    """Store the place of the edge [m], and with regeneration the surface behind it."""
+    """Store the position of the edge [m] and, with regeneration, the surface behind it."""
     if cut.process.overlap > 0.0:
         remember(cut.surface.ring, cut.surface.last, place, edge if chip > 0.0 else 0.0)
     cut.state[_EDGE] = edge

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Current loop of a voice coil, sampled with the step of the cell (see `lathe_rc.plants.tool_drive`).
+"""Current loop of a voice coil, computed at each sample of the cell (see `lathe_rc.plants.tool_drive`).
 
     U = ωc·(L·(i* - i) + R·∫(i* - i)dt)
 
-so that i/i* is about 1/(1 + p/ωc). i* may be limited in size and slope, U in size; while U is clipped the integral is
-frozen.
+so that i/i* is about 1/(1 + p/ωc). i* may be limited in magnitude and slope, and U in magnitude; while U is clipped,
+the integral is frozen.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ class Coil:
         inductance: L [H].
         bandwidth: ωc of the current loop [rad/s].
         back_emf: whether the motion induces a voltage.
-        current_limit, voltage_limit: of i* and U [A, V]; inf for none.
-        slew_rate: largest slope of i* [A/s]; inf for none.
+        current_limit, voltage_limit: limits of i* and U [A, V]; inf for no limit.
+        slew_rate: largest slope of i* [A/s]; inf for no limit.
     """
 
     resistance: float
@@ -40,16 +40,16 @@ class Coil:
 
 
 class CoilTable(NamedTuple):
-    """A coil with its state, for kernels (see `Coil`); without a coil the force of the position loop acts at once.
+    """Coil with its state, for kernels (see `Coil`); without a coil, the force of the position loop acts immediately.
 
     Attributes:
         on: whether there is a coil.
         proportional, integral: gains of the current loop [V/A, V/(A·s)].
-        current_limit, voltage_limit: [A, V].
-        slew: largest change of i* in a sample [A].
-        step: [s].
+        current_limit, voltage_limit: limits of i* and U [A, V].
+        slew: largest change of i* per sample [A].
+        step: sampling step [s].
         state: integral of i* - i [A·s], and i* [A].
-        limited: ring of flags, 1 where current or voltage was clipped; sample n is at index n modulo the size.
+        limited: ring buffer of flags, 1 where current or voltage was clipped; sample n is at index n modulo the size.
     """
 
     on: bool
@@ -69,7 +69,7 @@ def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
     Args:
         coil: parameters of the coil; None for no coil.
         step: sampling step [s].
-        kept: length of the history of limited samples, a power of two.
+        kept: number of samples for which the clipped flag is stored, a power of two.
     """
     values = coil or Coil(0.0, 0.0, 0.0)
     return CoilTable(
@@ -87,14 +87,14 @@ def coil_table(coil: Coil | None, step: float, kept: int) -> CoilTable:
 
 @kernel
 def applied(coil: CoilTable, n: int, asked: float, current: float) -> float:
-    """Return the voltage of the loop until sample ``n`` [V], from measured and set current [A] of the sample before."""
+    """Return the loop's voltage until sample ``n`` [V], from measured and set current [A] of the previous sample."""
     demand = min(max(asked, coil.state[1] - coil.slew), coil.state[1] + coil.slew)
     demand = min(max(demand, -coil.current_limit), coil.current_limit)
     error = demand - current
     integral = coil.state[0] + error * coil.step
     given = coil.proportional * error + coil.integral * integral
     voltage = min(max(given, -coil.voltage_limit), coil.voltage_limit)
-    if voltage == given:  # else the integral would wind up against the limit
+    if voltage == given:  # otherwise the integral would wind up
         coil.state[0] = integral
     coil.state[1] = demand
     coil.limited[n & (coil.limited.size - 1)] = demand != asked or voltage != given

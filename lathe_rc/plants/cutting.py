@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cutting process: from tool, feed and part to the force, and from the force back to the tool's edge.
+"""Cutting process: from tool, feed and part to the force, and from the force back to the cutting edge.
 
     ap = depth + d - y + µ·y(φ - 2π)          depth of cut, never negative
     y  = x + z + σ·c·w                        the edge: cross feed, tool drive, deflection
     f  = 2π·v/Ω                               feed per revolution
-    P  = K(f, VB)·ap                          `lathe_rc.plants.cutting_force`; times the factor of a hard spot
+    P  = K(f, VB)·ap                          `lathe_rc.plants.cutting_force`, times the factor of a hard spot
     F  = P/(1 + p·T)                          main cutting force Pz
     w  = F/(1 + b·p + a·p²)                   W3 is c·w
 
-With process damping the flank, worn to a land W, presses on the surface behind the edge, more where the edge moves into
-the part and less where it moves out: F = P/(1 + p·T) - σ·Ksp·B·W²/2·(dy/dt)/v, as long as there is a chip. This is a
-damper; B is the width of the flank, v the cutting speed, W the initial land plus VB.
+With process damping, the flank, worn to a land W, presses on the surface behind the edge, harder while the edge moves
+into the part and less while it moves out: F = P/(1 + p·T) - σ·Ksp·B·W²/2·(dy/dt)/v, as long as there is a chip. The
+flank thus acts as a damper; B is its width, v the cutting speed, and W the initial land plus VB.
 
-Displacements point out of the part: a positive one moves the edge away from it and makes the chip thinner. Paper 004
-uses the opposite sign for the cross feed, F = +W4·x, so its x is -x here; its y = x + W3·F draws the edge into the part
+Displacements point out of the part: a positive one moves the edge away from the part and makes the chip thinner. Paper
+004 uses the opposite sign for the cross feed, F = +W4·x, so its x is -x here; its y = x + W3·F draws the edge into the
+part.
 
 All interactions within a sample are solved together: the force of sample n bends the tool of sample n, whose edge makes
-the chip of sample n. ap is linear in the force as long as there is contact, so that this takes one division. Both lags
-assume inputs that are linear between samples.
+the chip of sample n. As long as there is contact, ap is linear in the force, so the solution takes one division. Both
+lags assume inputs that are linear between samples.
 
-The part's surface is stored as a function of the angle (`lathe_rc.plants.chip`), and the chip uses it a revolution
-later. Without a cut the surface is that of the blank, which depth + d already describes.
+The part's surface is stored as a function of the angle (`lathe_rc.plants.chip`), and the chip uses it one revolution
+later. Without a cut, the surface is that of the blank, which depth + d already describes.
 
-Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; of process damping:
+Source: spec/feed-and-force.md, "Cutting process"; paper 004, W3 and W4; for process damping, see
 `lathe_rc.plants.cutting_force`.
 """
 
@@ -62,7 +63,7 @@ MADE = ("force", "deflection", "depth_of_cut", "feed", "wear")
 
 @kernel
 def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) -> tuple[int, int]:
-    """Step the cut through a block, arrays as in `GIVEN` and `MADE`; return the sample where it stopped and why."""
+    """Step the cut through a block, arrays as in `GIVEN` and `MADE`; return the sample reached and the stop reason."""
     angle, speed, height, cross_position, displacement, feed_velocity, allowance = given
     force, deflection, depth_of_cut, feed, wear = made
     per_radian = cut.process.grid / _TURN
@@ -86,7 +87,7 @@ def cut_along(cut: CutTable, given: tuple[Array, ...], made: tuple[Array, ...]) 
 
 
 def _instant(system: System) -> float:
-    """Return the change of the output for a unit of the input in the same sample."""
+    """Return the change of the output per unit of the input in the same sample."""
     return float(system.through + system.output @ system.now)
 
 
@@ -103,16 +104,16 @@ def _check_edge(material: SpecificForce, wear: Wear, flank: Flank, elasticity: E
 
 
 class CuttingProcess:
-    """Simulated cutting process; it starts at the first sample.
+    """Simulated cutting process, which starts at the first sample.
 
     Args:
-        material: specific force and effect of wear on it.
-        depth: of the cut with cross feed, tool and allowance at 0 [m].
-        lag: T [s]; 0 for none.
+        material: specific force, and the effect of wear on it.
+        depth: depth of cut with cross feed, tool and allowance at 0 [m].
+        lag: T [s]; 0 for no lag.
         elasticity: W3.
-        wear: of the tool.
-        part: keyways, hard spots, compliance along the part.
-        overlap: µ, fraction of the last revolution's surface that the edge meets again, 0 to 1; 0: no regeneration.
+        wear: wear of the tool.
+        part: keyways, hard spots, and compliance along the part.
+        overlap: µ, fraction of the last revolution's surface that the edge meets again, 0 to 1; 0 for no regeneration.
         grid: number of points per revolution at which the surface is stored.
         flank: process damping.
         step: sampling step [s].
@@ -121,7 +122,7 @@ class CuttingProcess:
         table: constants and state for `cut_along`.
 
     Raises:
-        InputError: a value out of range.
+        InputError: a value is out of range.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ class CuttingProcess:
         flank: Flank = _NO_DAMPING,
         step: float,
     ) -> None:
-        least = float(f"{step / 1000.0:g}")  # the rounded number of the message is itself allowed
+        least = float(f"{step / 1000.0:g}")  # the rounded number in the message is itself allowed
         if not (lag == 0.0 or least <= lag < np.inf):
             raise InputError(f"cutting: lag {lag:g} s at a step of {step:g} s; allowed: 0 or at least {least:g} s")
         if not 0.0 <= overlap <= 1.0:
@@ -152,7 +153,7 @@ class CuttingProcess:
         heights, compliances = part.heights, part.compliances
         if heights is None or compliances is None:
             heights, compliances = np.zeros(1), np.array([elasticity.compliance])
-        # Without damage: each call of `damage` starts from it, so that a repair reverts all damage.
+        # Undamaged process: each call of `damage` starts from it, so that a repair reverts all damage.
         self._whole = Process(
             step=step,
             depth=depth,
@@ -181,7 +182,7 @@ class CuttingProcess:
         )
 
     def damage(self, *, shorter: float = 0.0, spots: Sequence[HardSpot] = ()) -> None:
-        """Shorten the edge [m] from its initial length, and add hard spots to those of the part; default: unchanged."""
+        """Shorten the initial length of the edge [m], and add hard spots to those of the part; default: no damage."""
         all_spots = np.concatenate((self._whole.spots, spot_rows(spots)))
         process = self._whole._replace(depth=self._whole.depth - shorter, spots=all_spots)
         self.table = self.table._replace(process=process)
@@ -190,14 +191,14 @@ class CuttingProcess:
         """Step the cut through a block.
 
         Args:
-            **arrays: arrays of shape (n,) by the names of `GIVEN`: true spindle angle [rad], which must not decrease
-                with regeneration, true spindle speed [rad/s], above 0, height of the edge along the part [m], x of the
-                cross feed and z of the tool drive, out of the part [m], velocity of the longitudinal feed [m/s], d [m];
-                and the output arrays of `MADE`: F [N], deflection σ·c·w of the edge out of the part [m], ap [m],
-                f [m/rev], VB [m].
+            **arrays: arrays of shape (n,). Inputs by the names of `GIVEN`: true spindle angle [rad], which must not
+                decrease with regeneration; true spindle speed [rad/s], above 0; height of the edge along the part [m];
+                x of the cross feed and z of the tool drive, out of the part [m]; velocity of the longitudinal feed
+                [m/s]; d [m]. Outputs by the names of `MADE`: F [N]; deflection σ·c·w of the edge out of the part [m];
+                ap [m]; f [m/rev]; VB [m].
 
         Raises:
-            LatheError: the spindle is at rest, or turns back or jumps under regeneration; or the force draws the edge
+            LatheError: the spindle is at rest, or turns back or jumps with regeneration, or the force draws the edge
                 into the part faster than it can cut.
         """
         made = tuple(arrays[name] for name in MADE)

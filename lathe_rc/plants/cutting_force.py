@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cutting force: material, wear of the tool, flank, elasticity of the edge.
+"""Cutting force: material, tool wear, flank, and elasticity of the edge.
 
     Pz = kc1·ap·f0·(f/f0)^{1-mc}·(1 + cw·VB),  f0 = 1 mm                        (Kienzle, with wear)
 
-In SI units the formula must contain the feed f0 for which kc1 holds; in mm and N/mm² it is 1 and does not appear. A
-worn flank presses on the surface, which damps (process damping). The force bends the edge: W3 of paper 004.
+In SI units the formula must contain the feed f0 for which kc1 holds; in mm and N/mm², f0 is 1 and does not appear. A
+worn flank presses on the surface and so damps vibration (process damping). The force bends the edge: W3 of paper 004.
 
-Values are checked in the parameter table of the cutting process; `CuttingProcess` checks them again. They are plain
-tuples here, which kernels accept directly.
+Values are checked in the parameter table of the cutting process; `CuttingProcess` checks them again. Here they
+are plain tuples, which kernels accept directly.
 
-Source: spec/feed-and-force.md, "Cutting process", from the W4 of paper 004: 233.3 N/mm is f = 0.071 mm/rev in steel;
-D. W. Wu, J. Engineering for Industry 111 (1989) 37 (force by the volume that is pressed in); E. Budak, L. T. Tunc, CIRP
-Annals 59 (2010).
+Source: spec/feed-and-force.md, "Cutting process", from W4 of paper 004: 233.3 N/mm is f = 0.071 mm/rev in steel;
+D. W. Wu, J. Engineering for Industry 111 (1989) 37 (force proportional to the displaced volume); E. Budak, L. T. Tunc,
+CIRP Annals 59 (2010).
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class SpecificForce(NamedTuple):
 
     Attributes:
         kc1: specific force at a feed of 1 mm [Pa].
-        mc: exponent of its decrease with the feed [1].
+        mc: exponent of the decrease of the specific force with the feed [1].
         wear_factor: cw, relative increase of the force with the wear VB [1/m].
     """
 
@@ -36,7 +36,7 @@ class SpecificForce(NamedTuple):
     wear_factor: float = 0.0
 
     def stiffness(self, feed: float, wear: float = 0.0) -> float:
-        """Return the cutting stiffness Pz/ap [N/m] at ``feed`` [m/rev] and the wear VB ``wear`` [m]."""
+        """Return the cutting stiffness Pz/ap [N/m] at ``feed`` [m/rev] and a wear VB of ``wear`` [m]."""
         return cutting_stiffness(self, feed, wear)
 
     def feed_for(self, stiffness: float, wear: float = 0.0) -> float:
@@ -60,7 +60,7 @@ class Wear(NamedTuple):
 
     Attributes:
         initial: initial wear [m].
-        per_metre: growth per metre of the cutting path [m/m].
+        per_metre: growth per metre of cutting path [m/m].
         per_second: growth per second in the cut [m/s].
     """
 
@@ -73,9 +73,9 @@ class Flank(NamedTuple):
     """Process damping by the flank, which presses on the surface.
 
     Attributes:
-        pressure: Ksp, force per displaced volume [N/m³]; 0: no process damping.
+        pressure: Ksp, force per displaced volume [N/m³]; 0 for no process damping.
         width: B, width of the flank along the edge that faces the surface [m].
-        land: W of a new edge, to which the wear VB is added [m].
+        land: initial W, to which the wear VB is added [m].
     """
 
     pressure: float = 0.0
@@ -85,7 +85,7 @@ class Flank(NamedTuple):
 
 @inlined
 def flank_damping(flank: Flank, speed: float, wear: float) -> float:
-    """Return the flank force per outward speed of the edge [N·s/m], at a cutting speed [m/s] and a wear VB [m]."""
+    """Return the flank force per unit of outward edge speed [N·s/m], at a cutting speed [m/s] and a wear VB [m]."""
     land = flank.land + wear
     return flank.pressure * flank.width * land * land / (2.0 * speed)
 
@@ -95,7 +95,7 @@ class Elasticity(NamedTuple):
 
     Attributes:
         compliance: c [m/N].
-        inertia: a [s²]; 0 with b = 0 for a spring alone.
+        inertia: a [s²]; a = b = 0 for a spring alone.
         damping: b [s].
         away: whether the force pushes the edge away from the part; False draws it into the part.
     """

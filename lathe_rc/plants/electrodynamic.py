@@ -4,7 +4,7 @@
     Wi(p) = e^{-pτ} / (1 + 2ζp/ωn + p²/ωn²)
 
 Source: papers 000 and 001; parameters identified from the table of 001. The coil current follows from the acceleration
-of the carriage, i = m·x''/k.
+of the carriage, i = m·x''/k. Further resonances are those of `lathe_rc.plants.modes`.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,8 @@ import numpy as np
 
 from lathe_rc.arrays import Array, put
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
+from lathe_rc.plants.modes import NONE, Modes, carriage
 
 
 @inlined
@@ -37,7 +38,8 @@ class CoarseTable(NamedTuple):
         spring, damper: gains of the drive's loops divided by the moving mass [1/s², 1/s].
         force_per_current: moving mass over force constant [A·s²/m].
         stroke: [m].
-        state: position and velocity.
+        edge: index of the position of the edge in the state.
+        state: position and velocity of the sensor, then of the modes, shape (m,).
         line: delayed commands from before the next block, the oldest first.
     """
 
@@ -48,13 +50,19 @@ class CoarseTable(NamedTuple):
     damper: float
     force_per_current: float
     stroke: float
+    edge: int
     state: Array
     line: Array
 
 
 @kernel
-def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array) -> None:
+def advance(
+    drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array, sensed: Array
+) -> None:
     """Step an electrodynamic drive through a block (implements `ElectrodynamicDrive.block`)."""
+    if drive.state.size > 2:
+        _advance_modes(drive, command, position, velocity, current, sensed)
+        return
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
     spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
     # Scalars in locals: the compiler cannot know that the output arrays do not overlap the matrices.
@@ -74,6 +82,30 @@ def advance(drive: CoarseTable, command: Array, position: Array, velocity: Array
         current[k] = (spring * (delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
     put(line, sent[command.size :])
+    put(sensed, position)
+
+
+@kernel
+def _advance_modes(
+    drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array, sensed: Array
+) -> None:
+    """Step a drive with modes through a block (see `advance`)."""
+    state, part, transition, weights = drive.state, drive.part, drive.transition, drive.weights
+    order = state.size
+    moved = np.empty(order)
+    sent = np.concatenate((drive.line, command))
+    for k in range(command.size):
+        u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
+        for i in range(order):
+            moved[i] = weights[i, 0] * u0 + weights[i, 1] * u1 + weights[i, 2] * u2
+            for j in range(order):
+                moved[i] += transition[i, j] * state[j]
+        put(state, moved)
+        state[0], state[1] = between_stops(state[0], state[1], drive.stroke)
+        delayed = (1.0 - part) * u0 + part * u1
+        position[k], velocity[k], sensed[k] = state[drive.edge], state[drive.edge + 1], state[0]
+        current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+    put(drive.line, sent[command.size :])
 
 
 class ElectrodynamicDrive:
@@ -83,14 +115,15 @@ class ElectrodynamicDrive:
         natural_frequency: ωn [rad/s].
         damping: ζ [1].
         delay: τ [s].
-        stroke: end stops at ± this displacement [m].
+        stroke: end stops at ± this displacement of the sensor [m].
         moving_mass: [kg].
         force_constant: [N/A].
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
+        modes: further resonances.
 
     Attributes:
-        plant: the difference equation.
+        plant: the difference equation, with the sensor's position as first state.
         table: constants and state for `advance`.
     """
 
@@ -105,24 +138,27 @@ class ElectrodynamicDrive:
         force_constant: float,
         step: float,
         method: Discretisation,
+        modes: Modes = NONE,
     ) -> None:
-        a, b = second_order(natural_frequency, damping)
+        a, b, _, edge = carriage(natural_frequency, damping, modes)
         self.plant: DiscretePlant = discretise(a, b, delay, step, method)
         self.table = CoarseTable(
             transition=self.plant.transition,
             weights=self.plant.weights,
             part=self.plant.fraction,
-            spring=float(-a[1, 0]),
-            damper=float(-a[1, 1]),
+            spring=natural_frequency**2,
+            damper=2.0 * damping * natural_frequency,
             force_per_current=moving_mass / force_constant,
             stroke=stroke,
-            state=np.zeros(2),
+            edge=edge,
+            state=np.zeros(b.size),
             line=np.zeros(self.plant.delay + 2),
         )
 
     def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
         """Step the drive through a block: fill position [m], velocity [m/s] and current [A] for a command [m].
 
-        All arrays have the shape (n,). The drive is at rest at 0 before the first block.
+        All arrays have the shape (n,); position and velocity are those of the edge. The drive is at rest at 0 before
+        the first block.
         """
-        advance(self.table, command, position, velocity, current)
+        advance(self.table, command, position, velocity, current, np.empty_like(command))

@@ -4,7 +4,7 @@
     command → sampling → ± limit, held → model with a limited speed → screw → backlash → slide
                                            ↑ friction
 
-The limits of the command are in `lathe_rc.control.limits`, friction is in `lathe_rc.plants.friction`, errors of the
+Limits on the command are in `lathe_rc.control.limits`, friction is in `lathe_rc.plants.friction`, and errors of the
 screw are in `lathe_rc.plants.screw`.
 
 The command is in the unit of the model (`lathe_rc.plants.feed_models`): [m] for a position command, [V], or a fraction
@@ -12,18 +12,17 @@ of full scale. It is held between samples, as by a power converter, and the diff
 command. The position of a sample does not depend on the command of the same sample.
 
 The states are the position of the motor and its derivatives, so that a speed limit can be applied to them: a motor
-that would exceed its maximum speed stays at it without acceleration, as if its command were no larger than that speed
-requires. So there is no windup when the command falls.
+that would exceed its maximum speed runs at this speed without acceleration, as if its command were no larger than this
+speed requires. There is thus no windup when the command falls.
 
-The limits of the command are limits of the requested motion, which is the steady state of the model for the command u:
-the speed k·u for a model that integrates, the position k·u for any other, with the gain k of the model.
+Limits on the command apply to the requested motion, which is the steady state of the model for the command u: the speed
+k·u for a model that integrates, the position k·u for any other, where k is the gain of the model.
 
     position  |k·u| ≤ stroke, |k·du/dt| ≤ velocity, |k·d²u/dt²| ≤ acceleration, |k·d³u/dt³| ≤ jerk
     speed     |x∞| ≤ stroke, |k·u| ≤ velocity, |k·du/dt| ≤ acceleration, |k·d²u/dt²| ≤ jerk
 
 x∞ is the position at which the motor would come to rest if the command were 0 from now on: with the denominator
-p·(a1 + a2·p + …) it is x + (a2·dx/dt + a3·d²x/dt² + …)/a1 for the motor's position x, and it moves with k·u. The
-limiter is in `lathe_rc.control.limits`.
+p·(a1 + a2·p + …) and the motor's position x, x∞ = x + (a2·dx/dt + a3·d²x/dt² + …)/a1, and x∞ moves at the speed k·u.
 """
 
 from typing import Literal, NamedTuple
@@ -48,23 +47,23 @@ Complex = npt.NDArray[np.complex128]
 
 @kernel
 def follow(load: float, half: float, motor: float) -> float:
-    """Return the position of the load behind a backlash gap, after the motor has moved straight to ``motor``.
+    """Return the position of the load behind backlash, after the motor has moved straight to ``motor``.
 
-    The load moves only when a flank of the gap pushes it.
+    The load moves only while one side of the backlash pushes it.
 
     Args:
         load: previous position of the load, within ``half`` of the previous position of the motor [m].
-        half: half the width of the gap [m].
-        motor: present position of the motor [m].
+        half: half the backlash [m].
+        motor: current position of the motor [m].
     """
     return min(max(load, motor - half), motor + half)
 
 
 class LimitTable(NamedTuple):
-    """Limits of a drive's command for kernels (see `lathe_rc.control.limits`); all in the command's unit.
+    """Limits on a drive's command for kernels (see `lathe_rc.control.limits`); all in the unit of the command.
 
     Attributes:
-        limits: limits of the position or velocity that the command stands for.
+        limits: limits on the position or velocity that the command represents.
         step: time between two commands [s].
         coming: weights of the states in x∞ for a velocity command, shape (m,); empty for a position command.
     """
@@ -86,7 +85,7 @@ def keep_within(limits: LimitTable, memory: Array, state: Array, command: float)
 
 
 def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: float, step: float) -> LimitTable:
-    """Return the limits of a drive's command that is sampled every ``step`` [s]."""
+    """Return the limits on a drive's command that is sampled every ``step`` [s]."""
     gain, integrates = settles(model)
     if limits.any and not gain:
         raise InputError(
@@ -104,7 +103,7 @@ def limit_table(model: TransferFunction, limits: CommandLimits, command_limit: f
 
 Feedback = Literal["motor", "load"]
 
-# Indices in a drive's state, from its end; before them the motor's position, speed, … and space for their next values.
+# Indices in a drive's state, from the end; before them are the motor's position, speed, … and space for the next ones.
 _WARMTH, _BRISTLE, _DISTURBANCE, _EFFORT, _LOAD = -5, -4, -3, -2, -1
 
 _UNDISTURBED = np.empty(0)
@@ -120,13 +119,13 @@ class DriveTable(NamedTuple):
     Attributes:
         transition, weights: x[n] = Φ·x[n-1] + g·u[n-1], shapes (m, m) and (m,); x is position, speed, ….
         jumps: immediate effect of the command on speed, acceleration, …, shape (m,).
-        command_limit: in both directions, in the unit of the command.
-        speed_limit: in both directions [m/s].
+        command_limit: largest magnitude of the command, in its unit.
+        speed_limit: largest magnitude of the speed [m/s].
         needed: steady command for the speed limit; infinite if there is none.
         furthest: travel per step at the speed limit [m].
         half: half the backlash [m].
         friction: friction of the slide.
-        rubbed: decrease of x by 1 N of friction, held over a step, shape (m,).
+        rubbed: decrease of x due to 1 N of friction held over a step, shape (m,).
         screw: screw between motor and slide.
     """
 
@@ -157,7 +156,7 @@ def load_of(state: Array) -> float:
 
 @inlined
 def _rub(table: DriveTable, state: Array) -> None:
-    """Subtract the effect of friction from the next values, which are stored after the present values."""
+    """Subtract the effect of friction from the next values, which are stored after the current values."""
     order = table.weights.size
     speed, free, gained = state[1], state[order + 1], table.rubbed[1]
     force, rests = 0.0, False
@@ -192,8 +191,8 @@ def move(table: DriveTable, state: Array) -> bool:
     if limited:
         state[0] = before + min(max(travel, -table.furthest), table.furthest)
         state[1] = min(max(speed, -table.speed_limit), table.speed_limit)
-        # A drive that would accelerate further gets derivatives of 0 under the steady command for this speed (the
-        # states lack the immediate effect of the command), so that it slows down as soon as its command falls.
+        # A drive that would accelerate further gets the state with derivatives of 0 under the steady command for this
+        # speed (states exclude the immediate effect of the command), so it slows down as soon as its command falls.
         if order > 2 and (state[2] + table.jumps[1] * effort) * speed > 0.0:
             enough = min(max(effort, -table.needed), table.needed)
             for row in range(2, order):
@@ -214,14 +213,14 @@ def hold(table: DriveTable, state: Array, command: float) -> bool:
 
 
 class FeedTable(NamedTuple):
-    """A feed drive with its limits and memory, for kernels (see `FeedDrive`).
+    """Feed drive with its limits and states, for kernels (see `FeedDrive`).
 
     Attributes:
         drive, state: constants and state of the drive.
-        limits, memory: limits of the command and the limiter's memory, used only if ``kept`` is true; the last entry of
-            the memory is 1 while the held command is clipped.
+        limits, memory: limits on the command and state of the limiter, used only if ``kept`` is true; the last entry of
+            the state is 1 while the held command is clipped.
         divisor: the command is sampled every ``divisor`` samples.
-        resolution: of the position sensor [m].
+        resolution: resolution of the position sensor [m].
         from_load: whether the position sensor is at the load.
         kept: whether the command has limits.
         counts: numbers of clipped commands and of samples at the speed limit so far.
@@ -251,7 +250,7 @@ def advance(
     measured: Array,
     clipped: npt.NDArray[np.uint8],
 ) -> None:
-    """Step a feed drive through a block (implements `FeedDrive.block`); ``clipped`` is a ring: sample n at n % size."""
+    """Step a feed drive through a block (implements `FeedDrive.block`); ``clipped`` is a ring, sample n at n % size."""
     table, state, memory, divisor = feed.drive, feed.state, feed.memory, feed.divisor
     saturated = limited = 0
     mask = clipped.size - 1
@@ -269,7 +268,7 @@ def advance(
         clipped[(first + k) & mask] = memory[-1] > 0.0
         state[_DISTURBANCE] = disturbance[k] if disturbance.size else 0.0
         motor[k], position[k], effort[k] = state[0], state[_LOAD], state[_EFFORT]
-        # While the motor moves within the gap, the slide is at rest.
+        # While the motor moves within the backlash, the slide is at rest.
         speed = state[1]
         if table.screw.real:
             speed = nut_speed(table.screw, state[_WARMTH], state[0], speed)
@@ -281,7 +280,7 @@ def advance(
 
 
 def _rubbed(model: TransferFunction, friction: Friction, step: float) -> Array:
-    """Return the decrease of position, speed, … by 1 N of friction, held over a step, shape (m,).
+    """Return the decrease of position, speed, … due to 1 N of friction held over a step, shape (m,).
 
     Raises:
         InputError: the friction has a pole that the drive does not have.
@@ -303,24 +302,24 @@ class FeedDrive:
         model: position over command, see `lathe_rc.plants.feed_models`.
         step: sampling step [s].
         divisor: the command is sampled at multiples of this number of samples, and held in between.
-        command_limit: the command is clipped to ± this value, in its unit.
+        command_limit: magnitude to which the command is clipped, in its unit.
         speed_limit: maximum speed of the motor in both directions [m/s].
-        backlash: width of the gap between motor and slide [m].
-        resolution: of the position sensor [m]; 0 for none.
+        backlash: backlash between motor and slide [m].
+        resolution: resolution of the position sensor [m]; 0 for no rounding.
         feedback: location of the position sensor.
-        limits: of the motion that the command requests.
-        friction: of the slide; None for none.
+        limits: limits on the motion that the command requests.
+        friction: friction of the slide; None for no friction.
         screw: screw between motor and slide; without errors by default.
 
     Attributes:
         table: constants for `move` and `hold`.
-        state: memory for `move` and `hold`.
-        whole: constants and memory for `advance`.
-        integrates: whether the command stands for a speed.
+        state: state for `move` and `hold`.
+        whole: constants and state for `advance`.
+        integrates: whether the command represents a speed.
 
     Raises:
-        InputError: a model whose speed would jump with the command, a value out of range, limits for a command that
-            stands for neither a position nor a speed, or friction that does not fit the model.
+        InputError: the speed of the model would jump with the command, a value is out of range, there are limits on a
+            command that represents neither a position nor a speed, or the friction does not fit the model.
     """
 
     def __init__(
@@ -350,7 +349,7 @@ class FeedDrive:
                 raise InputError(f"feed drive: {name} = {value:g} m; allowed: 0 for none, or above 0")
         a, b = realise(model)
         linear = discretise(a, b, 0.0, step, "foh")
-        # A discretisation that is exact for a command linear over a step is also exact for a constant one.
+        # A discretisation that is exact for a command that is linear over a step is also exact for a constant one.
         held = linear.weights[:, 0] + linear.weights[:, 1]
         # A model that integrates has one steady command for each speed.
         gain, self.integrates = settles(model)
@@ -398,7 +397,7 @@ class FeedDrive:
         return int(self.whole.counts[1])
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Return the frequency response of the difference equation, motor over command, at ``frequency`` [rad/s].
+        """Return the difference equation's frequency response from command to motor at ``frequency`` [rad/s].
 
         Limits, divisor and friction are ignored.
         """
@@ -420,21 +419,21 @@ class FeedDrive:
         disturbance: Array = _UNDISTURBED,
         clipped: npt.NDArray[np.uint8] = _UNTOLD,
     ) -> None:
-        """Step the drive through a block of samples; the output arrays are filled, all arrays have the shape (n,).
+        """Step the drive through a block of samples; the output arrays are filled, and all arrays have shape (n,).
 
         The drive is at rest at 0 before sample 0.
 
         Args:
             first: index of the first sample.
-            command: in the unit of the model.
-            position: of the slide [m].
-            velocity: of the slide [m/s].
-            effort: input of the motor from this sample on: the sampled and clipped command.
+            command: command, in the unit of the model.
+            position: position of the slide [m].
+            velocity: velocity of the slide [m/s].
+            effort: input of the motor from this sample on, which is the sampled and clipped command.
             motor: position of the motor, converted to slide travel by an ideal screw [m].
             measured: reading of the position sensor, at the slide or the motor [m].
-            disturbance: added to the limited command, in its unit (f of paper 002, eq. 2); none if empty.
-            clipped: filled with 1 where the held command differs from the sampled command; required with limits,
-                else it may be empty.
+            disturbance: added to the limited command, in its unit (f of paper 002, eq. 2); empty for no disturbance.
+            clipped: filled with 1 where the held command differs from the sampled command; may be empty if there are
+                no limits.
         """
         wanted = command.size if self.whole.kept or clipped.size else 0
         assert clipped.size == wanted, "room for what is clipped"

@@ -15,8 +15,8 @@ from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
 
-APPROXIMATE_LAGS = (0.17, 0.22)  #: [s] of W1, 11.79/((0.17p+1)(0.22p+1)) (paper 004)
-FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: [s] of the W1 that meets the step data printed in paper 004
+APPROXIMATE_LAGS = (0.17, 0.22)  #: lags of W1, 11.79/((0.17p+1)(0.22p+1)) [s] (paper 004)
+FULL_LAGS = (0.11304, 0.2679, 0.01659, 0.01659)  #: lags of the W1 that fits the step data in paper 004 [s]
 
 
 def fourth_order(
@@ -24,7 +24,7 @@ def fourth_order(
 ) -> TransferFunction:
     """Return the drive model K/(p⁴ + a4·p³ + a3·p² + a2·p + a1); by default the nominal drive of paper 002.
 
-    In the state matrix of eq. 3 these coefficients have the opposite sign of the printed ones.
+    In the state matrix of eq. 3, these coefficients have the opposite sign to the printed ones.
     """
     return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
 
@@ -32,23 +32,23 @@ def fourth_order(
 def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
     """Return the model of a motor with a screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
 
-    The zero compensates a lag that another part has: with the lag of the cutting process, a drive with the lags of W1
-    has the response W1 from the command to the force.
+    The zero cancels a lag that another part of the model includes: together with the lag of the cutting process, a
+    drive with the lags of W1 has the response W1 from the command to the force.
 
     Args:
         velocity_gain: k [m/s per unit of the command].
-        lags: T_i [s], at least one, and at least two with a zero.
-        zero: Tz [s]; 0 for none.
+        lags: T_i [s], at least one, or at least two with a zero.
+        zero: Tz [s]; 0 for no zero.
 
     Raises:
-        InputError: a lag that is not positive.
+        InputError: a lag is not positive.
     """
     return _dc_screw(velocity_gain, tuple(lags), zero)
 
 
 @lru_cache(maxsize=64)
 def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> TransferFunction:
-    """Return the model of a motor with a screw (implements `dc_screw`), cached for repeated models in a sweep."""
+    """Return the model of a motor with a screw (implements `dc_screw`), cached, since models repeat in a sweep."""
     if not all(lag > 0.0 for lag in lags):
         raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
     bottom = np.array([1.0, 0.0])
@@ -58,20 +58,20 @@ def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> Tra
 
 
 def sampled(gain: float = 6.25, lag: float = 0.08) -> TransferFunction:
-    """Return K/(p·(1 + T1·p)), by default the drive of paper 003; its hold is the ``divisor`` of the `FeedDrive`.
+    """Return the model K/(p·(1 + T1·p)), by default the drive of paper 003; the `FeedDrive`'s ``divisor`` is its hold.
 
     Args:
-        gain: K [1/s], with the command in the unit of the position.
+        gain: K [1/s], for a command in the unit of the position.
         lag: T1 [s].
     """
     return dc_screw(gain, (lag,))
 
 
 def realise(model: TransferFunction) -> tuple[Array, Array]:
-    """Return the matrices a and b of a model, with position and speed as first states.
+    """Return the matrices a and b of a model, with position and speed as the first states.
 
-    The other states are the further derivatives, each minus the immediate effect of the command on it (observability
-    form); a zero that cancels a lag is allowed.
+    The other states are the higher derivatives, each without the immediate effect of the command (observability form);
+    a zero may cancel a lag.
     """
     top, bottom = (np.trim_zeros(np.array(part), "f") for part in (model.numerator, model.denominator))
     order = bottom.size - 1
@@ -82,14 +82,14 @@ def realise(model: TransferFunction) -> tuple[Array, Array]:
         )
     a = np.diag(np.ones(order - 1), 1)
     a[-1] = -bottom[:0:-1] / bottom[0]
-    # Markov parameters: the quotient as a series of 1/p, by long division.
+    # Markov parameters: the quotient as a series in 1/p, by long division.
     padded = np.concatenate((np.zeros(bottom.size - top.size), top, np.zeros(order)))
     markov, _ = np.polydiv(padded / bottom[0], bottom / bottom[0])
     return a, markov[1:]
 
 
 def settles(model: TransferFunction) -> tuple[float, bool]:
-    """Return the steady position or speed for a command of 1, 0 if there is neither, and whether it is a speed."""
+    """Return the steady position or speed for a command of 1, or 0 if there is neither, and whether it is a speed."""
     integrates = model.denominator[-1] == 0.0
     divisor = model.denominator[-2 if integrates else -1]
     return (abs(model.numerator[-1] / divisor) if divisor else 0.0), integrates

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction of a slide, solved together with the speed of the motor within a step.
 
-    g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve, of the dry part
-    stribeck   F = g(v)·sgn v + Fv·v; at rest the holding force, up to Fs
+    g(v) = Fc + (Fs - Fc)·e^{-(v/vs)²}                               Stribeck curve of the dry friction
+    stribeck   F = g(v)·sgn v + Fv·v; at rest, the holding force within ±Fs
     lugre      dz/dt = v - σ0·|v|/g(v)·z,  F = σ0·z + σ1·dz/dt + Fv·v
 
-z is the mean deflection of bristles between the surfaces. At a steady speed LuGre gives the Stribeck curve; below Fs
-the slide rests on a spring of σ0 (presliding).
+z is the mean deflection of the bristles between the surfaces. At a steady speed, LuGre gives the Stribeck curve; below
+Fs, the slide rests on a spring of stiffness σ0 (presliding).
 
-The force of a step is solved together with the speed at its end, which is linear in it: a slide that the force can hold
-is exactly at rest, and no stiffness makes the step unstable. Within a step g is taken at the speed at its start.
+The force of a step is solved together with the speed at the end of the step, which is linear in the force: a slide that
+the force can hold is exactly at rest, and no stiffness makes the step unstable. For g, the speed at the start of the
+step is used.
 
 Sources: B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083 (Stribeck curve); C. Canudas de
 Wit, H. Olsson, K. J. Åström, P. Lischinsky, IEEE Trans. Automatic Control 40 (1995) 419 (LuGre).
@@ -59,12 +60,12 @@ class Friction:
         coulomb: Fc [N].
         static: Fs [N], not below Fc.
         speed: vs [m/s].
-        viscous: Fv [N·s/m], in addition to the friction in the lag of the drive.
-        stiffness: σ0 of the bristles [N/m], ``lugre``.
-        damping: σ1 of the bristles [N·s/m], ``lugre``.
+        viscous: Fv [N·s/m], in addition to the friction included in the lag of the drive.
+        stiffness: σ0 of the bristles [N/m], for ``lugre``.
+        damping: σ1 of the bristles [N·s/m], for ``lugre``.
 
     Raises:
-        InputError: a value out of range.
+        InputError: a value is out of range.
     """
 
     law: Law
@@ -106,7 +107,7 @@ def mobility(velocity_gain: float, lag: float, motor_force: float) -> TransferFu
     Args:
         velocity_gain: k, speed at a command of 1 [m/s].
         lag: T of the mechanics [s].
-        motor_force: F1, force at rest for a command of 1 [N]. The mass moved by the motor is F1·T/k.
+        motor_force: F1, force at rest for a command of 1 [N]; the mass moved by the motor is F1·T/k.
     """
     return TransferFunction((velocity_gain / motor_force,), (lag, 1.0, 0.0))
 
@@ -129,12 +130,12 @@ def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tup
 
     Args:
         table: constants of the friction.
-        gained: speed change by 1 N, held over the step [m/(s·N)].
-        speed: at the beginning of the step [m/s].
+        gained: speed change by a force of 1 N held over the step [m/(s·N)].
+        speed: speed at the start of the step [m/s].
         free: speed at the end of the step without friction [m/s].
     """
     level = _dry(table, speed)
-    # If the force can bring the speed to 0 in this step, it does exactly that: the slide never oscillates about rest.
+    # If the force can bring the speed to 0 in this step, it does exactly that, so the slide never oscillates around 0.
     if abs(free) <= gained * level:
         return free / gained, True
     force = level if free > 0.0 else -level
@@ -143,8 +144,8 @@ def slide(table: FrictionTable, gained: float, speed: float, free: float) -> tup
 
 @inlined
 def bend(table: FrictionTable, gained: float, speed: float, free: float, bristle: float) -> tuple[float, float]:
-    """Return LuGre force [N] of a step and z at its end [m]; ``bristle``: z at its start, the rest as in `slide`."""
-    # Implicit Euler in the bristles, with |v|/g of the start: stable at any stiffness, and F linear in the new speed.
+    """Return the LuGre force [N] of a step and the final z [m]; ``bristle``: initial z, the rest as in `slide`."""
+    # Implicit Euler for the bristles, with the initial |v|/g: stable at any stiffness, F linear in the new speed.
     relaxed = 1.0 / (1.0 + table.step * table.stiffness * abs(speed) / _dry(table, speed))
     hard = table.stiffness + table.damping / table.step
     held = (hard * relaxed - table.damping / table.step) * bristle

@@ -2,24 +2,24 @@
 """Rate-independent hysteresis of piezo ceramics, and the inverse operators that linearise it.
 
 Input and output are relative: 1 is the half-stroke, at full voltage. The operators do not depend on time: the output
-depends on the path of the input alone, and within each monotone section only on its end point.
+depends only on the path of the input, and within each monotone section only on the end point of that section.
 
 Prandtl-Ishlinskii: weighted play operators in parallel with a proportional part,
 
     y = p0·u + Σ p_i·F_i(u),    F_i ← max(u - r_i, min(u + r_i, F_i)).
 
-Its inverse is such an operator as well (Kuhnen 2003, "Modeling, identification and compensation of complex
-hysteretic nonlinearities"); it exists while all partial slopes p0 + p_1 + ... + p_i are positive.
+The inverse is an operator of the same kind (Kuhnen 2003, "Modeling, identification and compensation of complex
+hysteretic nonlinearities"); it exists if all partial slopes p0 + p_1 + ... + p_i are positive.
 
 Bouc-Wen with n = 1, written in u so that the rate cancels:
 
     y = g·(u - h),    dh = A·du - β·h·|du| - γ·|h|·du,
 
 with g chosen so that a steady loop over ±1 ends at ±1. While u moves in one direction, h obeys a linear equation in u
-whose rate changes once, where h passes 0, so a step of any length is computed exactly. The inverse solves that step for
-its length, sample by sample; it exists while dy/du = g·(1 - dh/du) is positive, which is 2Aβ/(β + γ) < 1.
+whose rate changes once, where h passes 0, so a step of any length is computed exactly. The inverse solves for the
+length of this step, sample by sample; it exists if dy/du = g·(1 - dh/du) is positive, that is, if 2Aβ/(β + γ) < 1.
 
-Source: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation has to compensate.
+Sources: spec/learning.md; paper 001 for the loop of 10-15 % that the linearisation must compensate.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.checks import stacked
 
-#: Ten play operators; with them the loop over ±1 is 13 % of its height wide and ends at ±1.
+#: Ten play operators, with which the loop over ±1 has a width of 13 % of its height and ends at ±1.
 THRESHOLDS = np.arange(1, 11) / 11
 WEIGHTS = np.full(10, 0.04767)
 PROPORTIONAL = 0.7617
@@ -41,20 +41,20 @@ _LINEAR, PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3  #: kinds of a `Law`
 
 
 class Law(NamedTuple):
-    """Kind and constants of a hysteresis operator for kernels; its state is a separate array."""
+    """Kind and constants of a hysteresis operator for kernels; the state is a separate array."""
 
     kind: int
     table: Array
 
 
-LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; it has no state
+LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; without state
 
 
 @kernel
 def _relax(rate: float, travel: float) -> float:
     """Compute (1 - e^{-rate·travel})/rate, which is the travel itself for a rate of 0."""
     x = rate * travel
-    # Below this, the next term x/2 is less than rounding, and the quotient of subnormal numbers would be inexact.
+    # Below this, the next term x/2 is less than rounding error, and the quotient of subnormal numbers would be inexact.
     if x < 1e-17:
         return travel
     return float(-np.expm1(-x) / rate)
@@ -62,7 +62,7 @@ def _relax(rate: float, travel: float) -> float:
 
 @kernel
 def _travel(rate: float, relaxed: float) -> float:
-    """Compute the travel from its relaxed value (inverse of `_relax`)."""
+    """Compute the travel from the relaxed travel (inverse of `_relax`)."""
     x = rate * relaxed
     if x < 1e-17:
         return relaxed
@@ -71,9 +71,9 @@ def _travel(rate: float, relaxed: float) -> float:
 
 @kernel
 def _move(h: float, travel: float, shape: Array) -> float:
-    """Return the hysteretic part after ``travel`` >= 0; it and ``h`` are positive in the direction of travel."""
+    """Return the hysteretic part after ``travel`` >= 0; like ``h``, it is positive in the direction of travel."""
     a, beta, gamma = shape[0], shape[1], shape[2]
-    if h < 0.0:  # against the travel: the rate is β - γ until h passes 0, then β + γ
+    if h < 0.0:  # opposite to the travel: the rate is β - γ until h passes 0, then β + γ
         slope = a - (beta - gamma) * h
         to_zero = _travel(beta - gamma, -h / slope)
         if travel < to_zero:
@@ -86,7 +86,8 @@ def _move(h: float, travel: float, shape: Array) -> float:
 def _solve(slope: float, rate: float, target: float) -> float:
     """Solve d - slope·(1 - e^{-rate·d})/rate = target for d, for 0 <= slope < 1.
 
-    The left side is convex and increasing, and the start is not below the root: Newton's steps decrease towards it.
+    The left side is convex and increasing, and the initial value is not below the root, so Newton's method decreases
+    towards the root.
     """
     d = target / (1.0 - slope)
     while True:
@@ -98,7 +99,7 @@ def _solve(slope: float, rate: float, target: float) -> float:
 
 @kernel
 def _needed(h: float, target: float, shape: Array) -> float:
-    """Solve travel - (increase of the hysteretic part) = ``target`` >= 0 for the travel; ``h`` as in `_move`."""
+    """Solve travel - (increase of the hysteretic part) = ``target`` >= 0 for the travel; ``h`` is as in `_move`."""
     a, beta, gamma = shape[0], shape[1], shape[2]
     travel = 0.0
     if h < 0.0:
@@ -136,13 +137,14 @@ def plays(thresholds: Array, start: Array, value: Array) -> Array:
 
 @kernel
 def advance(kind: int, table: Array, state: Array, start: int, value: float) -> float:
-    """Step an operator to the input ``value``: return the output and update ``state``.
+    """Step an operator to the input ``value``; return the output and update ``state``.
 
     Args:
         kind: kind of the operator, see `Law`.
-        table: constants of the operator. Plays: rows thresholds (first 0) and weights (first p0). Bouc-Wen: A, β, γ, g.
-        state: holds the positions of the plays, or u and h, starting at ``start``. (A slice is slower than a step.)
-        start: index of the operator's own state.
+        table: constants of the operator: for plays, rows of thresholds (the first is 0) and weights (the first is p0);
+            for Bouc-Wen, A, β, γ and g.
+        state: array that contains the positions of the plays, or u and h, from ``start`` on.
+        start: index at which the operator's own state begins; passing a slice would take longer than the step.
         value: relative input.
     """
     if kind == PLAYS:
@@ -169,9 +171,9 @@ def advance(kind: int, table: Array, state: Array, start: int, value: float) -> 
 
 @kernel
 def _plays_along(table: Array, state: Array, start: int, value: Array, result: Array) -> None:
-    """Step play operators through a block, one operator after the other, five at a time for speed.
+    """Step play operators through a block, five operators at a time for speed.
 
-    The output of a sample is summed in the order of `advance`, so that the results are bit-identical.
+    The output of a sample is summed in the same order as by `advance`, so that the results are bit-identical.
     """
     r, p = table[0], table[1]
     for k in range(value.size):
@@ -208,11 +210,11 @@ def advance_along(kind: int, table: Array, state: Array, start: int, value: Arra
 
 
 class Hysteresis:
-    """Base of hysteresis operators, which have a state.
+    """Base class of hysteresis operators, which have a state.
 
     Attributes:
-        law: kind and constants, for kernels that step the operator themselves, see `advance`.
-        state: memory of the operator, shape (n,).
+        law: kind and constants, for kernels that step the operator by `advance`.
+        state: state of the operator, shape (n,).
         steepest: largest possible slope dy/du.
     """
 
@@ -236,9 +238,9 @@ def check_thresholds(thresholds: Array) -> None:
 
 
 def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
-    """Return law, state and steepest slope of play operators in a given state."""
+    """Return the law, state and steepest slope of play operators in a given state."""
     table = np.empty((2, thresholds.size + 1))
-    # Contributions of plays beyond their thresholds add up: the steepest slope is the largest partial sum.
+    # The contributions of moving plays add up, so the steepest slope is the largest partial sum.
     table[:, 0], table[0, 1:], table[1, 1:] = (0.0, proportional), thresholds, weights
     return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
@@ -252,7 +254,7 @@ class PrandtlIshlinskii(Hysteresis):
         proportional: p0.
 
     Raises:
-        InputError: thresholds that are not increasing, or slopes without an inverse.
+        InputError: the thresholds do not increase, or there is no inverse.
     """
 
     def __init__(
@@ -270,11 +272,11 @@ class PrandtlIshlinskii(Hysteresis):
         super().__init__(*_weighted(thresholds, weights, proportional, np.zeros(thresholds.size)))
 
     def identified(self, scale: float) -> "PrandtlIshlinskii":
-        """Return a model at rest with the play weights multiplied by ``scale``, as by an inexact identification."""
+        """Return a model at rest with the play weights multiplied by ``scale``, as from an inexact identification."""
         return PrandtlIshlinskii(self.thresholds, self.weights * scale, self.proportional)
 
     def inverse(self) -> "PrandtlIshlinskiiInverse":
-        """Return the inverse operator, starting at the present state."""
+        """Return the inverse operator, starting at the current state."""
         return PrandtlIshlinskiiInverse(self)
 
 
@@ -282,7 +284,7 @@ class PrandtlIshlinskiiInverse(Hysteresis):
     """Inverse of `PrandtlIshlinskii` in closed form; itself a weighted sum of play operators.
 
     Args:
-        forward: operator to invert. Its present state is adopted, so at rest the inverse is at rest too.
+        forward: operator to invert. The inverse adopts its current state, so it is at rest if ``forward`` is at rest.
     """
 
     def __init__(self, forward: PrandtlIshlinskii) -> None:
@@ -297,13 +299,13 @@ class PrandtlIshlinskiiInverse(Hysteresis):
 
 
 class BoucWen(Hysteresis):
-    """Bouc-Wen hysteresis operator with n = 1 in the form y = g·(u - h).
+    """Bouc-Wen hysteresis operator with n = 1, in the form y = g·(u - h).
 
     Args:
-        a: A, initial slope of h; 0.33 with the others makes a loop of 13 %.
+        a: A, initial slope of h; with the other defaults, 0.33 gives a loop of 13 %.
         beta: β.
         gamma: γ.
-        gain: g; None: the gain for which a steady loop over ±1 ends at ±1.
+        gain: g; None for the gain with which a steady loop over ±1 ends at ±1.
 
     Raises:
         InputError: h grows without bound, or there is no inverse.
@@ -336,11 +338,11 @@ class BoucWen(Hysteresis):
         return self.gain * (1.0 - self._fall)
 
     def identified(self, scale: float) -> "BoucWen":
-        """Return a model at rest with A multiplied by ``scale``, as by an inexact identification."""
+        """Return a model at rest with A multiplied by ``scale``, as from an inexact identification."""
         return BoucWen(self.a * scale, self.beta, self.gamma, self.gain)
 
     def inverse(self) -> "BoucWenInverse":
-        """Return the inverse operator, starting at the present state."""
+        """Return the inverse operator, starting at the current state."""
         return BoucWenInverse(self)
 
 
@@ -348,7 +350,7 @@ class BoucWenInverse(Hysteresis):
     """Inverse of `BoucWen`, which solves for the step in u at each sample.
 
     Args:
-        forward: operator to invert; its present state is adopted.
+        forward: operator to invert; the inverse adopts its current state.
     """
 
     def __init__(self, forward: BoucWen) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear drives behind a delay, discretised without rounding the delay to whole samples."""
+"""Linear drives with an input delay, discretised without rounding the delay to whole samples."""
 
 import math
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ Discretisation = Literal["foh", "tustin"]
 
 
 class Constant:
-    """Base of immutable objects without state; caches share one object between equal ones."""
+    """Base class of immutable objects without state; caches share one object for equal parameters."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiscretePlant(Constant):
-    """Difference equation of a delayed plant, with the position as first state.
+    """Difference equation of a delayed plant, with the position as the first state.
 
     x[n] = Φ·x[n-1] + w0·u[n-k] + w1·u[n-k-1] + w2·u[n-k-2]
 
     Attributes:
         transition: Φ, shape (m, m).
-        weights: columns w0, w1, w2, shape (m, 3).
+        weights: columns w0, w1 and w2, shape (m, 3).
         delay: k, whole samples of the delay.
-        fraction: remaining fraction of the delay in samples, 0 to 1; it is included in the weights.
+        fraction: remaining fraction of the delay in samples, 0 to 1, which the weights include.
         step: sampling step [s].
     """
 
@@ -42,7 +42,7 @@ class DiscretePlant(Constant):
     step: float
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Return the frequency response of the difference equation, position over command, at ``frequency`` [rad/s]."""
+        """Return the difference equation's frequency response from command to position at ``frequency`` [rad/s]."""
         wanted = np.asarray(frequency, dtype=np.float64)
         return _response(self, wanted.tobytes()).reshape(wanted.shape)
 
@@ -55,7 +55,7 @@ def _square(number: complex) -> float:
 
 @inlined
 def _quotient(above: complex, below: complex) -> complex:
-    """Return the quotient of complex numbers; not finite where ``below`` is 0."""
+    """Return the quotient of two complex numbers; not finite if ``below`` is 0."""
     square = _square(below)
     real = above.real * below.real + above.imag * below.imag
     return complex(real / square, (above.imag * below.real - above.real * below.imag) / square)
@@ -63,7 +63,7 @@ def _quotient(above: complex, below: complex) -> complex:
 
 @kernel
 def _respond(transition: Array, weights: Array, back: Complex, late: Complex, into: Complex) -> None:
-    """Fill the position in x = (I - Φ/z)⁻¹·(w0 + w1/z + w2/z²)·z⁻ᵏ, shape (n,), by one elimination for each z.
+    """Fill the position in x = (I - Φ/z)⁻¹·(w0 + w1/z + w2/z²)·z⁻ᵏ, shape (n,), by one elimination per z.
 
     Args:
         transition: Φ, shape (m, m).
@@ -80,7 +80,7 @@ def _respond(transition: Array, weights: Array, back: Complex, late: Complex, in
             right[i] = weights[i, 0] + step * (weights[i, 1] + step * weights[i, 2])
             for j in range(order):
                 left[i, j] = (1.0 if i == j else 0.0) - transition[i, j] * step
-        # From the last state up, so that the position remains.
+        # From the last state upwards, so that the position remains.
         for last in range(order - 1, 0, -1):
             pivot = last
             for i in range(last):
@@ -107,7 +107,7 @@ def _response(plant: DiscretePlant, content: bytes) -> Complex:
 
 @lru_cache(maxsize=64)
 def _delayed(content: bytes, time: float) -> Complex:
-    """Return exp(-jω·time) at frequencies given as bytes, cached, since many plants share step and delay."""
+    """Return exp(-jω·time) at frequencies given as bytes, cached because many plants share step and delay."""
     return np.asarray(np.exp(-1j * time * np.frombuffer(content)))
 
 
@@ -115,12 +115,12 @@ def discretise(a: Array, b: Array, delay: float, step: float, method: Discretisa
     """Discretise a linear plant with a delayed input, x' = a·x + b·u(t - delay).
 
     Args:
-        a: shape (m, m) [1/s].
-        b: shape (m,) [1/s].
-        delay: [s]; need not be a whole number of steps.
+        a: state matrix, shape (m, m) [1/s].
+        b: input vector, shape (m,) [1/s].
+        delay: input delay [s]; need not be a whole number of steps.
         step: sampling step [s].
         method: ``foh`` is exact for a command that is linear between its samples, including the fractional part of
-            the delay; ``tustin`` is the bilinear rule with linear interpolation for the fractional part.
+            the delay; ``tustin`` is the bilinear rule, with linear interpolation for the fractional part.
     """
     return _discretised(a.tobytes(), b.tobytes(), delay, step, method)
 
@@ -130,12 +130,12 @@ def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, meth
     """Discretise a plant given as bytes (implements `discretise`), cached so that similar cells share the plant."""
     b = np.frombuffer(b_bytes)
     a, samples = np.frombuffer(a_bytes).reshape(b.size, b.size), delay / step
-    # A remainder below a billionth of a step is rounding, on either side, and its inverse would overflow.
+    # A remainder below a billionth of a step, of either sign, is rounding error, and its inverse would overflow.
     whole = math.floor(samples + 1e-9)
     part = samples - whole if samples - whole > 1e-9 else 0.0
     weights = np.zeros((a.shape[0], 3))
     if method == "foh":
-        # The delayed input has its kink `part` of a step after each sample: integrate up to it, then on.
+        # The delayed input has a kink a fraction `part` of a step after each sample: integrate up to the kink, then on.
         first, held_1, end_1 = hold_response(a, b, part * step)
         second, held_2, end_2 = hold_response(a, b, (1.0 - part) * step)
         start_1, start_2 = held_1 - end_1, held_2 - end_2
@@ -150,6 +150,6 @@ def _discretised(a_bytes: bytes, b_bytes: bytes, delay: float, step: float, meth
 
 
 def second_order(natural_frequency: float, damping: float) -> tuple[Array, Array]:
-    """Return a, b of 1/(1 + 2ζp/ωn + p²/ωn²), states position and velocity; ``natural_frequency`` in rad/s."""
+    """Return a and b of 1/(1 + 2ζp/ωn + p²/ωn²), with states position and velocity; ``natural_frequency`` in rad/s."""
     square = natural_frequency**2
     return np.array([[0.0, 1.0], [-square, -2.0 * damping * natural_frequency]]), np.array([0.0, square])

@@ -4,10 +4,10 @@
     set point -> inverse hysteresis -> amplifier 1/(1 + pT) -> hysteresis -> creep -> resonance -> displacement
 
     resonance: 1/(1 + 2ζp/ωn + p²/ωn²)
-    creep:     1 + c·Σ 1/(1 + pτ_i), τ_i a decade apart: after a step about c·lg(t) more
+    creep:     1 + c·Σ 1/(1 + pτ_i), τ_i a decade apart: after a step, about c·lg(t) more
 
-The hysteresis precedes the resonance and works on displacements relative to the stroke. The set point is limited to
-the stroke and the voltage to its range; clipped samples are counted.
+The hysteresis precedes the resonance and acts on displacements relative to the stroke. The set point is limited to the
+stroke, and the voltage to its range; clipped samples are counted.
 
 Source: paper 001 (Wpk of eqs 6-9); parameters of spec/learning.md.
 """
@@ -27,9 +27,9 @@ from lathe_rc.plants.linear import Constant, DiscretePlant, Discretisation, disc
 
 Complex = npt.NDArray[np.complex128]
 
-_ROUNDING = 1e-9  # of the stroke: an exact inverse may exceed full voltage by rounding
+_ROUNDING = 1e-9  # relative to the stroke: rounding error may bring an exact inverse above full voltage
 
-# Indices in the state of a stack; after them the states of creep, inverse and hysteresis.
+# Indices in the state of a stack; the states of creep, inverse and hysteresis follow.
 VOLTAGE, _DEMAND, _EXTENSION, _MEMORIES = 0, 1, 2, 3
 
 
@@ -40,8 +40,8 @@ class StackTable(NamedTuple):
         stroke: displacement at full voltage [m].
         inverse, forward: linearisation and hysteresis.
         inverse_size: size of the state of the inverse.
-        decay, now, before: lag of the amplifier: weights of its last output, its present and its last input.
-        slew: largest change of the amplifier's output in a sample, relative to full voltage.
+        decay, now, before: weights of the last output, the current input and the last input in the amplifier's lag.
+        slew: largest change of the amplifier's output per sample, relative to full voltage.
         creep: decay and input weights of each creep lag, shape (n, 3).
         creep_gain: gain of each creep lag.
     """
@@ -64,7 +64,7 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
 
     Args:
         stack: constants of the stack.
-        state: memory, updated; ``state[VOLTAGE]`` is the amplifier's output relative to full voltage.
+        state: state, updated in place; ``state[VOLTAGE]`` is the amplifier's output relative to full voltage.
         set_point: desired extension [m].
     """
     wanted = set_point / stack.stroke
@@ -90,8 +90,8 @@ def extend(stack: StackTable, state: Array, set_point: float) -> tuple[float, bo
 def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: Array, voltage: Array) -> int:
     """Step a piezo stack through a block: fill the extension [m] and the voltage relative to full voltage, shape (n,).
 
-    Each element of the stack is stepped through the whole block, which is faster; the order of operations is that of
-    `extend`. Returns the number of samples where set point or voltage was clipped.
+    For speed, each element of the stack is stepped through the whole block, with the order of operations of `extend`.
+    Returns the number of samples at which set point or voltage was clipped.
     """
     inverse = _MEMORIES + stack.creep.shape[0]
     for k in range(set_point.size):
@@ -121,7 +121,7 @@ def _extend_along(stack: StackTable, state: Array, set_point: Array, extension: 
 
 
 def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
-    """Discretise the lag 1/(1 + p·time), times in s."""
+    """Discretise the lag 1/(1 + p·time); times are in s."""
     least = float(f"{step / 1000.0:g}")  # the rounded number in the message is itself allowed
     if time < least:
         raise InputError(f"lag of {time:g} s at a step of {step:g} s; allowed: at least {least:g} s, or none")
@@ -129,7 +129,7 @@ def _lag(time: float, step: float, method: Discretisation) -> DiscretePlant:
 
 
 def _row(lag: DiscretePlant) -> Array:
-    """Return the decay of a lag, and the weights of its present and last input."""
+    """Return the decay of a lag, and the weights of its current and last inputs."""
     return np.array([lag.transition[0, 0], lag.weights[0, 0], lag.weights[0, 1]])
 
 
@@ -138,7 +138,7 @@ class LinearStack:
     """Linear model of amplifier and creep; the hysteresis is assumed to be linearised to a gain of 1.
 
     Attributes:
-        amplifier: lag of the amplifier; None for none.
+        amplifier: lag of the amplifier; None for no lag.
         creep: lags of the creep.
         creep_gain: gain of each creep lag.
     """
@@ -148,7 +148,7 @@ class LinearStack:
     creep_gain: float
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Return the frequency response of the extension to the set point at ``frequency`` [rad/s]."""
+        """Return the frequency response from the set point to the extension at ``frequency`` [rad/s]."""
         frequency = np.asarray(frequency, dtype=np.float64)
         whole = np.ones(frequency.shape, dtype=np.complex128)
         for lag in self.creep:
@@ -157,27 +157,27 @@ class LinearStack:
 
 
 class Stack:
-    """Amplifier and piezo ceramics, from the set point to the extension of a stack without load and mass.
+    """Amplifier and piezo ceramics: from the set point to the extension of a stack without load and mass.
 
     Args:
         stroke: displacement at full voltage, in both directions [m].
-        amplifier_lag: T [s]; 0 for none.
-        slew_rate: largest change of the amplifier's output in a second, relative to full voltage [1/s]; inf for none.
-        hysteresis: of the ceramics; None for none.
-        inverse: operator that linearises the hysteresis; None for none.
-        creep_per_decade: c, relative creep in a decade of time; 0 for none.
+        amplifier_lag: T [s]; 0 for no lag.
+        slew_rate: largest slope of the amplifier's output, relative to full voltage [1/s]; inf for no limit.
+        hysteresis: hysteresis of the ceramics; None for no hysteresis.
+        inverse: operator that linearises the hysteresis; None for no linearisation.
+        creep_per_decade: c, relative creep per decade of time; 0 for no creep.
         creep_times: τ_i [s], a decade apart; only used with creep, shape (n,).
         step: sampling step [s].
         method: discretisation of the lags, see `lathe_rc.plants.linear.discretise`.
 
     Attributes:
         table: constants for `extend`.
-        state: memory for `extend`.
+        state: state for `extend`.
         linear: model without hysteresis and limits.
         steepest: largest change of the extension relative to the change of the set point in the same sample.
 
     Raises:
-        InputError: a lag that is much shorter than the step.
+        InputError: a lag is much shorter than the step.
     """
 
     def __init__(
@@ -220,15 +220,15 @@ class Stack:
 
 
 class FineTable(NamedTuple):
-    """A fine piezo drive with its state, for kernels (see `PiezoDrive`).
+    """Fine piezo drive with its state, for kernels (see `PiezoDrive`).
 
     Attributes:
         transition, weights: difference equation of the resonance.
         stack: constants of amplifier and ceramics.
         memory: state of amplifier and ceramics.
-        full_voltage: [V].
-        state: position, velocity, and the last extension [m, m/s, m].
-        saturated: number of samples so far in which set point or voltage was clipped, shape (1,).
+        full_voltage: voltage at the full stroke [V].
+        state: position, velocity, and last extension [m, m/s, m].
+        saturated: number of samples so far at which set point or voltage was clipped, shape (1,).
     """
 
     transition: Array
@@ -272,7 +272,7 @@ class LinearPiezo(Constant):
     plant: DiscretePlant
 
     def response(self, frequency: npt.ArrayLike) -> Complex:
-        """Return the frequency response of the position to the set point at ``frequency`` [rad/s]."""
+        """Return the frequency response from the set point to the position at ``frequency`` [rad/s]."""
         return np.asarray(self.stack.response(frequency) * self.plant.response(frequency))
 
 
@@ -319,12 +319,12 @@ class PiezoDrive:
 
     @property
     def saturated(self) -> int:
-        """Number of samples so far in which set point or voltage was clipped."""
+        """Number of samples so far at which set point or voltage was clipped."""
         return int(self.table.saturated[0])
 
     def block(self, set_point: Array, position: Array, velocity: Array, voltage: Array) -> None:
         """Step the drive through a block: fill position [m], velocity [m/s] and voltage [V] for a set point [m].
 
-        All arrays have the shape (n,). The drive is at rest at 0 before the first block.
+        All arrays have shape (n,). The drive is at rest at 0 before the first block.
         """
         advance_fine(self.table, set_point, position, velocity, voltage)

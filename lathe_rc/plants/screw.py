@@ -4,11 +4,11 @@
     nut = x + s·x + a·(sin(2π·x/P + ψ) - sin ψ) + α·ΔT·(x - x0)
     T·dΔT/dt = R·|v| + A - ΔT
 
-The pitch has a constant relative error s, and a periodic error with the lead P as its period. The screw is heated by
-the friction of the moving nut and by its surroundings, and grows from its fixed bearing x0. At sample 0 its temperature
-is that at the zeroing of the axis, so the nut is at the position of the motor.
+The pitch has a constant relative error s, and a periodic error whose period is the lead P. The screw is heated by the
+friction of the moving nut and by the surroundings, and grows from its fixed bearing at x0. At sample 0 it has the
+temperature at which the axis was zeroed, so the nut is at the position of the motor.
 
-Within a step ΔT is exact for a constant speed. Source: ISO 230-2 (periodic and cumulative positioning error) and ISO
+Within a step, ΔT is exact for a constant speed. Sources: ISO 230-2 (periodic and cumulative positioning error) and ISO
 230-3 (thermal effects) name the errors; the heating law is that of a body of uniform temperature.
 """
 
@@ -28,8 +28,8 @@ class Screw(NamedTuple):
     Attributes:
         slope: s, relative pitch error [m/m].
         lead: P [m].
-        amplitude: a, of the periodic error [m].
-        phase: ψ [rad].
+        amplitude: a, amplitude of the periodic error [m].
+        phase: ψ, phase of the periodic error [rad].
         expansion: α [1/K].
         heating: R [K·s/m].
         surroundings: A, final temperature rise at rest [K].
@@ -51,7 +51,7 @@ class Screw(NamedTuple):
         """Check that the values describe a possible screw.
 
         Raises:
-            InputError: a value out of range, or a periodic error so steep that the nut would move backwards.
+            InputError: a value is out of range, or the periodic error is so steep that the nut would move backwards.
         """
         for name, value in (("lead", self.lead), ("time", self.time)):
             if not 0.0 < value < np.inf:
@@ -83,7 +83,7 @@ class ScrewTable(NamedTuple):
         real: whether there is any error.
         wave: 2π/P [rad/m].
         offset: sin ψ.
-        nears: fraction of its remaining difference by which ΔT changes in a step.
+        nears: fraction of the remaining temperature difference by which ΔT changes per step.
     """
 
     errors: Screw

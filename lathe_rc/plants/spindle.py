@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spindle under the load of the cut: motor, belt and spindle, a speed loop, and the torque of the cutting force.
 
-The speed law is the motion of the spindle without a load; the model describes the deviations from it. With the
-deviations δ of the spindle's angle and ϑ of the motor's, all referred to the spindle,
+The speed law is the motion of the spindle without a load; the model describes the deviations from this motion. With the
+deviations δ of the spindle angle and ϑ of the motor angle, and all quantities referred to the spindle,
 
     J·δ''  = B - r·F,       B = k·(ϑ - δ) + c·(ϑ' - δ')
     Jm·ϑ'' = T - B,         T = Kp·(-ϑ') + Ki·∫(-ϑ')dt
 
 or, with a rigid belt, (J + Jm)·δ'' = T - r·F. The speed loop is sampled: the torque of a sample is held until the next
-one. The motor also accelerates both masses according to the law; its limit applies to the sum. While the sum is
-clipped, the integral is frozen. The load is linear between samples.
+one. The motor also accelerates both masses according to the law, and its torque limit applies to the sum. While the sum
+is clipped, the integral is frozen. The load is linear between samples.
 
 With a load of 0, or an inertia that no load can move, the results are bit-identical to the law.
 """
@@ -26,12 +26,12 @@ from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise
 
 _DONE, _OVERLOADED, _OUT_OF_SPEED = 0, 1, 2
-_INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # indices in the memory of the loop
+_INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # indices in the state of the loop
 
 
 @dataclass(frozen=True)
 class Belt:
-    """Belt between motor and spindle; values referred to the spindle.
+    """Belt between motor and spindle; values are referred to the spindle.
 
     Attributes:
         stiffness: k [N·m/rad].
@@ -49,7 +49,7 @@ class SpeedLoop:
     Attributes:
         bandwidth: Kp divided by the sum of both inertias [rad/s].
         integral_time: Kp/Ki [s].
-        torque_limit: of the motor, referred to the spindle [N·m]; inf for none.
+        torque_limit: limit of the motor torque, referred to the spindle [N·m]; inf for no limit.
     """
 
     bandwidth: float
@@ -63,22 +63,22 @@ class SpeedLoop:
 
 
 class SpindleTable(NamedTuple):
-    """A spindle under load with its state, for kernels (see `LoadedSpindle`).
+    """Spindle under load with its state, for kernels (see `LoadedSpindle`).
 
     Attributes:
-        step: [s].
-        transition: of δ, δ' and, with a belt, ϑ, ϑ', shape (m, m).
-        motor: weight of the motor's torque, shape (m,).
-        load: weights of the load of a sample and of the one before, shape (m, 2).
-        measured: index of the motor speed.
+        step: sampling step [s].
+        transition: transition matrix of δ, δ' and, with a belt, ϑ, ϑ', shape (m, m).
+        motor: weights of the motor's torque, shape (m,).
+        load: weights of the loads of a sample and of the previous one, shape (m, 2).
+        measured: index of the motor speed in the state.
         proportional, integral: Kp, Ki.
-        inertia: of both masses [kg·m²].
-        torque_limit: [N·m].
+        inertia: inertia of both masses [kg·m²].
+        torque_limit: limit of the motor torque [N·m].
         radius: r [m].
         largest_load, largest_deviation: limits beyond which a run ends [N·m, rad/s].
         state: shape (m,).
-        loop: integral of the loop, load and law's speed of the last sample.
-        limited: ring of flags, 1 where the torque was clipped; sample n is at index n modulo the size.
+        loop: integral of the speed loop, and load and speed of the law at the last sample.
+        limited: ring buffer of flags, 1 where the torque was clipped; sample n is at index n modulo the size.
     """
 
     step: float
@@ -118,7 +118,7 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
             loop[_INTEGRAL] = integral
         spindle.limited[n & (spindle.limited.size - 1)] = limited
         load = spindle.radius * force[k]
-        for i in range(order):  # into another array, since each row needs the whole old state
+        for i in range(order):  # into another array, since each row needs the complete old state
             new[i] = spindle.motor[i] * torque[k] + spindle.load[i, 0] * load + spindle.load[i, 1] * loop[_LOAD]
             for j in range(order):
                 new[i] += transition[i, j] * state[j]
@@ -134,18 +134,18 @@ def turn(spindle: SpindleTable, first: int, force: Array, angle: Array, speed: A
 
 
 class LoadedSpindle:
-    """Simulated spindle under the load of the cut; without deviation from its speed law before sample 0.
+    """Simulated spindle under the load of the cut; before sample 0 it does not deviate from its speed law.
 
     Args:
         inertia: J of spindle, chuck and part [kg·m²].
         motor_inertia: Jm, referred to the spindle [kg·m²].
-        belt: None for a rigid belt.
+        belt: belt between motor and spindle; None for a rigid belt.
         loop: speed control loop.
         radius: r at which the main cutting force acts [m].
         largest_load: torque of the cut beyond which the run ends [N·m].
-        largest_deviation: speed deviation by the load beyond which the run ends [rad/s].
+        largest_deviation: speed deviation caused by the load beyond which the run ends [rad/s].
         step: sampling step [s].
-        kept: length of the history of limited samples, a power of two.
+        kept: number of samples for which the clipped flag is stored, a power of two.
 
     Attributes:
         table: constants and state for `turn`.
@@ -180,7 +180,7 @@ class LoadedSpindle:
         self.table = SpindleTable(
             step=step,
             transition=motor.transition,
-            motor=motor.weights.sum(axis=1),  # the torque is held through a step
+            motor=motor.weights.sum(axis=1),  # the torque is held over a step
             load=np.ascontiguousarray(load.weights[:, :2]),
             measured=measured,
             proportional=proportional,
@@ -202,7 +202,7 @@ class LoadedSpindle:
             )
 
     def _largest_pole(self) -> float:
-        """Return the largest pole of the speed loop without its limit; δ is excluded, since it is uncontrolled."""
+        """Return the largest pole magnitude of the unlimited speed loop, excluding the uncontrolled δ."""
         table = self.table
         order = table.state.size
         row = np.zeros(order + 1)
@@ -211,7 +211,7 @@ class LoadedSpindle:
         closed[:order, :order] = table.transition
         closed[:order] += np.outer(table.motor, row)
         closed[order, table.measured], closed[order, order] = -table.step, 1.0
-        # With δ the integral of δ' would appear twice: the twist of the belt takes the place of δ and ϑ.
+        # With δ, the integral of δ' would appear twice, so the twist of the belt takes the place of δ and ϑ.
         if order > 2:
             change = np.eye(order + 1)
             change[2, 0] = -1.0
@@ -224,8 +224,8 @@ class LoadedSpindle:
         Args:
             first: index of the first sample.
             force: main cutting force [N], shape (n,).
-            angle: of the law [rad]; replaced by the true angle.
-            speed: of the law [rad/s]; replaced by the true speed.
+            angle: angle of the law [rad]; replaced by the true angle.
+            speed: speed of the law [rad/s]; replaced by the true speed.
 
         Returns:
             Torque that the speed loop adds to the motor torque at each sample [N·m], shape (n,).
@@ -241,7 +241,7 @@ class LoadedSpindle:
 
 
 def failure(reason: int, spindle: SpindleTable, angle: float, force: float) -> LatheError:
-    """Return the error for an overloaded spindle, at an angle [rad] and with a cutting force [N]."""
+    """Return the error for an overloaded spindle at an angle [rad] and with a cutting force [N]."""
     if reason == _OVERLOADED:
         return LatheError(
             f"the cut loads the spindle with {spindle.radius * force:.4g} N·m at {angle:.6g} rad; allowed: up to "

@@ -10,7 +10,8 @@ at x1, without the tool), r = mt/M, and e is the extension that the piezo would 
     M·x1''  = k·i - mt·q
 
 The stack's stiffness is mt·ω2²; ω2, ζ2 are those of the tool on a blocked carriage. The full force of the piezo acts on
-the carriage. The coil's current i is set by the drive's position loop
+the carriage. With the further resonances of `lathe_rc.plants.modes`, x1 is the carriage's edge, where the piezo sits;
+the position loop acts on its sensor. The coil's current i is set by the drive's position loop
 
     i* = (m/k)·(ω1²·(u(t - τ) - x1) - 2ζ1ω1·x1')
 
@@ -44,11 +45,13 @@ from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import MADE, CuttingProcess
-from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise, second_order
+from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
+from lathe_rc.plants.modes import NONE, Modes, carriage
 from lathe_rc.plants.piezo import Stack, StackTable
 from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
 
 Complex = npt.NDArray[np.complex128]
+Integers = npt.NDArray[np.int64]
 
 _CARRIAGE, _TOOL = 0, 2  # indices of the positions in the state: x1, x1', x2, x2'
 
@@ -87,6 +90,29 @@ def _seen_at(plant: DiscretePlant, place: int) -> DiscretePlant:
     )
 
 
+def _joined(carriage: Array, force: Array, place: Integers, piezo: Piezo | None, base: int) -> Array:
+    """Return the equations x' = a·x of a carriage, with the tool on its piezo if there is one.
+
+    Args:
+        carriage: equations of the carriage alone, shape (n, n).
+        force: its acceleration by a force at the edge over its mass, shape (n,).
+        place: place of its states, shape (n,).
+        piezo: piezo that reacts on the carriage.
+        base: place of the position of the piezo's base.
+    """
+    if piezo is None:
+        return carriage
+    a = np.zeros((place.size + 2, place.size + 2))
+    a[np.ix_(place, place)] = carriage
+    stiff, loss = piezo.natural_frequency**2, 2.0 * piezo.damping * piezo.natural_frequency
+    q = np.zeros(place.size + 2)
+    q[base : base + 2], q[_TOOL : _TOOL + 2] = (stiff, loss), (-stiff, -loss)
+    a[place] += np.outer(force, -piezo.mass_ratio * q)
+    a[_TOOL, _TOOL + 1] = 1.0
+    a[_TOOL + 1] = q
+    return a
+
+
 def _check_feedback(fine: DiscretePlant, piezo: Piezo) -> None:
     """Check that direct compensation is stable, with both masses as the extension moves them."""
     within = abs(fine.weights[_CARRIAGE, 0]) * piezo.stack.steepest
@@ -105,12 +131,13 @@ def _check_feedback(fine: DiscretePlant, piezo: Piezo) -> None:
 
 def _feedback_radius(fine: DiscretePlant, stack: StackTable) -> float:
     """Return the largest magnitude of the poles under direct compensation, linearised, without creep."""
-    # The state is x1, x1', x2, x2', e and the amplifier's input -x1; left·state[n] = right·state[n-1].
-    left, right = np.eye(6), np.zeros((6, 6))
-    left[:4, 4] = -fine.weights[:, 0]
-    left[4, 5], left[5, _CARRIAGE] = -stack.now, 1.0
-    right[:4, :4], right[:4, 4] = fine.transition, fine.weights[:, 1]
-    right[4, 4:] = stack.decay, stack.before
+    # The state is that of the masses, e and the amplifier's input -x1; left·state[n] = right·state[n-1].
+    masses = fine.transition.shape[0]
+    left, right = np.eye(masses + 2), np.zeros((masses + 2, masses + 2))
+    left[:masses, -2] = -fine.weights[:, 0]
+    left[-2, -1], left[-1, _CARRIAGE] = -stack.now, 1.0
+    right[:masses, :masses], right[:masses, -2] = fine.transition, fine.weights[:, 1]
+    right[-2, -2:] = stack.decay, stack.before
     return float(np.abs(np.linalg.eigvals(np.linalg.solve(left, right))).max())
 
 
@@ -127,6 +154,7 @@ class ToolDrive:
         coil: current loop; None: the force of the position loop acts at once.
         piezo: piezo drive on the carriage; None: the carriage alone carries the tool.
         resolution: of the carriage's position sensor [m]; 0 for none.
+        modes: further resonances of the carriage, at whose edge the tool or the piezo sits.
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
         kept: length of the history of limited samples of the current loop, a power of two.
@@ -135,8 +163,8 @@ class ToolDrive:
         table: constants and state for `advance` and `advance_loaded` of `lathe_rc.plants.tool_motion`.
 
     Raises:
-        InputError: the current loop is too fast for the step, or it oscillates; direct compensation would oscillate, or
-            the step is too coarse for it.
+        InputError: the current loop is too fast for the step, it oscillates, or there are modes beside it; direct
+            compensation would oscillate, or the step is too coarse for it.
     """
 
     def __init__(
@@ -152,35 +180,39 @@ class ToolDrive:
         coil: Coil | None = None,
         piezo: Piezo | None = None,
         resolution: float = 0.0,
+        modes: Modes = NONE,
         step: float,
         method: Discretisation,
         kept: int = 1,
     ) -> None:
-        alone, _ = second_order(natural_frequency, damping)
-        spring, damper = float(-alone[1, 0]), float(-alone[1, 1])
-        masses = 2 if piezo else 1
-        order = 2 * masses + (coil is not None)
-        free, drives, extends, loads = np.zeros((2 * masses, 2 * masses)), *np.zeros((3, order))
-        for mass in range(masses):
-            free[2 * mass, 2 * mass + 1] = 1.0
+        if coil and modes.frequency:
+            raise InputError("modes belong to a closed position loop; allowed: without a current loop")
+        mass = carriage(natural_frequency, damping, modes)
+        spring, damper = natural_frequency**2, 2.0 * damping * natural_frequency
+        base, tool, mass_of_tool = mass.edge, mass.edge, moving_mass
+        count = mass.command.size
+        place = np.arange(
+            count, dtype=np.int64
+        )  # of the carriage in the state; the tool on a piezo comes behind its sensor
         stiff = loss = 0.0
-        tool, mass_of_tool = _CARRIAGE, moving_mass
         if piezo:
-            tool, mass_of_tool = _TOOL, piezo.mass_ratio * moving_mass
+            place[2:] += 2
+            base, tool, mass_of_tool = int(place[mass.edge]), _TOOL, piezo.mass_ratio * moving_mass
             stiff, loss = piezo.natural_frequency**2, 2.0 * piezo.damping * piezo.natural_frequency
-            q = np.array([stiff, loss, -stiff, -loss])
-            free[1], free[3] = -piezo.mass_ratio * q, q
-            extends[1], extends[3] = -piezo.mass_ratio * stiff, stiff
-        if radial:
-            loads[tool + 1] = 1.0 / mass_of_tool
-        # Without a coil the servo's force acts at once, and `a` stays the same array as `servo`.
-        a = servo = free.copy()
-        servo[1, 0] -= spring
-        servo[1, 1] -= damper
-        drives[1] = spring
-        if coil:
+            count += 2
+        servo, order = _joined(mass.a, mass.force, place, piezo, base), count + (coil is not None)
+        a, drives, extends, loads = servo, *np.zeros((3, order))
+        drives[place] = mass.command
+        if piezo:
+            extends[place] = -piezo.mass_ratio * stiff * mass.force
+            extends[_TOOL + 1] = stiff
+        if radial and piezo:
+            loads[_TOOL + 1] = 1.0 / mass_of_tool
+        elif radial:
+            loads[place] = mass.force / moving_mass
+        if coil:  # the coil moves the carriage, in place of the servo
             a = np.zeros((order, order))
-            a[:-1, :-1] = free
+            a[:-1, :-1] = _joined(np.array([[0.0, 1.0], [0.0, 0.0]]), mass.force, place, piezo, base)
             a[1, -1] = force_constant / moving_mass
             a[-1, -1] = -coil.resistance / coil.inductance
             a[-1, 1] = -force_constant / coil.inductance if coil.back_emf else 0.0
@@ -198,6 +230,7 @@ class ToolDrive:
             series=piezo is not None,
             weights=Weights(self._coarse.transition, weights, self._fine.weights, load.weights),
             tool=tool,
+            base=base,
             delay=self._coarse.delay,
             part=self._coarse.fraction,
             spring=spring,
@@ -222,7 +255,7 @@ class ToolDrive:
         if coil:
             self._check(coil)
         if piezo and piezo.feedback:  # checked without the current loop
-            _check_feedback(discretise(servo, extends[: 2 * masses], 0.0, step, method), piezo)
+            _check_feedback(discretise(servo, extends[:count], 0.0, step, method), piezo)
 
     def block(self, cut: CuttingProcess, first: int, given: Mapping[str, Array]) -> dict[str, Array]:
         """Step tool drives and cut through a block, starting at sample ``first``; at rest at 0 before sample 0.

@@ -57,6 +57,7 @@ class MotionTable(NamedTuple):
         series: whether a piezo rides on the carriage.
         weights: see `Weights`.
         tool: index of the tool's position in the state.
+        base: index of the carriage's position where the tool or the piezo sits; its sensor is at index 0.
         delay, part: delay of the command: whole samples and fraction [sample].
         spring, damper, force_per_current: constants of the position loop.
         carriage_stroke: [m].
@@ -76,6 +77,7 @@ class MotionTable(NamedTuple):
     series: bool
     weights: Weights
     tool: int
+    base: int
     delay: int
     part: float
     spring: float
@@ -221,10 +223,11 @@ def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, fl
     current = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
     if drive.coil.on:
         current = state[state.size - 1]
+    base = drive.base
     if drive.series:
-        extension, rate = state[2] - state[0], state[3] - state[1]
+        extension, rate = state[2] - state[base], state[3] - state[base + 1]
         voltage = drive.memory[VOLTAGE] * drive.full_voltage
-    return state[0], state[1], current, drive.reading[0], extension, rate, voltage
+    return state[base], state[base + 1], current, drive.reading[0], extension, rate, voltage
 
 
 @kernel
@@ -239,10 +242,9 @@ def advance(
         command: set point of the carriage [m], shape (n,), as of all following arrays.
         set_point: of the piezo, before direct compensation [m].
         noise: of the carriage's position sensor [m].
-        motion: output arrays: true position [m] and velocity [m/s] of the carriage, current of the coil [A], position
-            reading of the carriage's sensor [m]; extension of the piezo (tool relative to carriage) [m], its velocity
-            carriage's sensor reads it [m]; extension of the piezo, the tool against the carriage [m], its velocity
-            [m/s], voltage at the piezo [V].
+        motion: output arrays: true position [m] and velocity [m/s] of the carriage where the tool sits, current of the
+            coil [A], position reading of the carriage's sensor [m]; extension of the piezo (tool relative to carriage)
+            [m], its velocity [m/s], voltage at the piezo [V].
     """
     position, velocity, current, measured, extension, rate, voltage = motion
     free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Properties of the part that affect the cut: keyways, hard spots, compliance along the part."""
+"""Properties of the part that affect the cut: keyways, hard spots, and compliance along the part."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
@@ -44,7 +44,7 @@ def spot_rows(spots: Sequence[HardSpot]) -> Array:
 
 
 def _check_window(what: str, start: float, width: float) -> None:
-    """Check that an angular window has a width above 0 and below a revolution."""
+    """Check that the width of an angular window is above 0 and below a revolution."""
     if not (np.isfinite(start) and 0.0 < width < _TURN):
         raise InputError(
             f"{what}: window at {start:g} rad of {width:g} rad; allowed: a width above 0 and below a revolution"
@@ -56,14 +56,14 @@ class Part:
     """Properties of the part that affect the cut.
 
     Attributes:
-        radius: of the part, for the length of the cutting path [m].
-        gaps: angular windows without material (keyways): start and width of each [rad].
-        hard_spots: the factors of overlapping spots multiply.
-        heights, compliances: c along the part [m, m/N], instead of that of the elasticity; linear between heights and
-            constant beyond the ends; ``None`` if it does not change. See `lathe_rc.analysis.shaft`.
+        radius: radius of the part, for the length of the cutting path [m].
+        gaps: angular windows without material (keyways), as start and width of each [rad].
+        hard_spots: hard spots; where spots overlap, their factors are multiplied.
+        heights, compliances: c along the part [m, m/N], in place of that of the elasticity; linear between heights and
+            constant beyond the ends; ``None`` if c is constant. See `lathe_rc.analysis.shaft`.
 
     Raises:
-        InputError: an invalid window or table.
+        InputError: a window or table is invalid.
     """
 
     radius: float = 0.05
@@ -89,14 +89,14 @@ class Part:
 
 @inlined
 def _within(angle: float, start: float, width: float) -> bool:
-    """Check whether an angle is in a window [rad]; windows may extend across 0."""
+    """Return whether an angle is in a window [rad]; windows may extend across 0."""
     since = (angle - start) / _TURN
     return bool((since - np.floor(since)) * _TURN < width)
 
 
 @inlined
 def missing(gaps: Array, angle: float) -> bool:
-    """Check whether there is no material at an angle [rad]."""
+    """Return whether there is no material at an angle [rad]."""
     found = False
     for i in range(gaps.shape[0]):
         found |= _within(angle, gaps[i, 0], gaps[i, 1])
@@ -105,7 +105,7 @@ def missing(gaps: Array, angle: float) -> bool:
 
 @inlined
 def hardness(spots: Array, angle: float, height: float) -> float:
-    """Return the force factor of the hard spots at an angle [rad] and a height [m], see `spot_rows`."""
+    """Return the force factor of hard spots at an angle [rad] and a height [m], with rows from `spot_rows`."""
     factor = 1.0
     for i in range(spots.shape[0]):
         if spots[i, 2] <= height <= spots[i, 3] and _within(angle, spots[i, 0], spots[i, 1]):

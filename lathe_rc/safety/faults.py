@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinds of faults, and their effect on signals: broken devices and bad lines.
+"""Kinds of faults of devices and lines, and their effects on signals.
 
 A fault is written ``TARGET KIND NAME=VALUE ...``, like ``coarse/state.measured_position wrong scale=1.1``. The target
 is ``TOPIC.FIELD`` of a port, ``TOPIC`` if the fault concerns several fields, or the broken device itself.
 
-A fault changes its samples one by one, starting at its first sample, and depends only on the samples since then and
-the seed: results are bit-identical for all block lengths. Times are in s, all other values in the unit of the signal.
+A fault changes samples one by one, starting at its first sample, and depends only on the samples since then and the
+seed, so results are bit-identical for all block lengths. Times are in s, all other values in the unit of the signal.
 """
 
 import math
@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _LARGEST = 1e100  # far larger than any physical value, with finite products
-_LONGEST = 200  # characters of a fault, to fit into an event
+_LONGEST = 200  # largest number of characters of a fault, to fit into an event
 _VALUE = re.compile(r"(\w+)=(\S+)")
 
 
@@ -35,7 +35,7 @@ class Value:
 
     Attributes:
         doc: description of the parameter.
-        unit: unit; "" for the unit of the signal.
+        unit: unit of the parameter; "" for the unit of the signal.
         default: default value; None for a required parameter.
         low: lower limit.
         above: whether ``low`` itself is excluded.
@@ -63,7 +63,7 @@ class Kind:
         values: parameters by name.
         what: kind of target: ``field``: any field of a port; ``encoder``: angle, speed and index pulse together;
             ``cut``: the cutting process itself.
-        whole: whether integer fields can have the fault too.
+        whole: whether integer fields can have the fault as well.
     """
 
     doc: str
@@ -72,44 +72,44 @@ class Kind:
     whole: bool = False
 
 
-_LATEST = 10.0  # [s] limit of a delay, since the delayed samples are stored
+_LATEST = 10.0  # upper limit of a delay [s], since the delayed samples are stored
 KINDS: Mapping[str, Kind] = {
-    "off": Kind("0, as from a device without power", {}, whole=True),
-    "stuck": Kind("the first sample stays", {}, whole=True),
+    "off": Kind("0, as from an unpowered device", {}, whole=True),
+    "stuck": Kind("the first sample is held", {}, whole=True),
     "garbage": Kind(
-        "random numbers, uniform up to the amplitude to both sides", {"amplitude": Value("largest", low=0.0)}
+        "random numbers, uniform between ± the amplitude", {"amplitude": Value("largest magnitude", low=0.0)}
     ),
     "wrong": Kind(
         "scale · signal + offset",
-        {"scale": Value("factor", "1", 1.0), "offset": Value("added", "", 0.0)},
+        {"scale": Value("factor", "1", 1.0), "offset": Value("added constant", "", 0.0)},
     ),
-    "slow": Kind("behind a first-order lag", {"time": Value("its time constant", "s", low=0.0, above=True)}),
+    "slow": Kind("passes a first-order lag", {"time": Value("time constant", "s", low=0.0, above=True)}),
     "delayed": Kind(
-        "late; the first sample stays until then",
-        {"time": Value("how long", "s", low=0.0, above=True, below=_LATEST)},
+        "delayed; the first sample is held until then",
+        {"time": Value("delay", "s", low=0.0, above=True, below=_LATEST)},
     ),
     "intermittent": Kind(
-        "0 now and then, at random times, as from a loose contact; good at first",
+        "0 in intervals of random length, as with a loose contact; begins with an interval with signal",
         {
-            "good": Value("mean time of a good spell", "s", low=0.0, above=True),
-            "off": Value("mean time of a spell without signal", "s", low=0.0, above=True),
+            "good": Value("mean length of the intervals with signal", "s", low=0.0, above=True),
+            "off": Value("mean length of the intervals without signal", "s", low=0.0, above=True),
         },
     ),
-    "noisy": Kind("with white noise added", {"rms": Value("its root mean square", low=0.0)}),
-    "missed_index": Kind("no index pulse", {}, what="encoder"),
+    "noisy": Kind("white noise is added", {"rms": Value("RMS of the noise", low=0.0)}),
+    "missed_index": Kind("no index pulses", {}, what="encoder"),
     "lost_counts": Kind(
-        "at once, and after every whole revolution since then, the measured angle falls back by some counts",
-        {"angle": Value("how much of a turn is lost each time", "rad", low=0.0, above=True)},
+        "the measured angle loses counts, immediately and after every whole revolution from then on",
+        {"angle": Value("angle lost each time", "rad", low=0.0, above=True)},
         what="encoder",
     ),
-    "reversed": Kind("the measured angle runs backwards, as with tracks A and B exchanged", {}, what="encoder"),
-    "tool_broken": Kind("the edge is shorter", {"length": Value("what has broken off", "m", low=0.0)}, what="cut"),
+    "reversed": Kind("the measured angle runs backwards, as with tracks A and B swapped", {}, what="encoder"),
+    "tool_broken": Kind("the edge is shorter", {"length": Value("length broken off", "m", low=0.0)}, what="cut"),
     "hard_spot": Kind(
         "harder material in a part of each revolution",
         {
-            "factor": Value("of the specific force", "1", low=0.0),
-            "start": Value("where it begins", "rad", 0.0),
-            "width": Value("of it", "rad", math.pi, low=0.0, above=True, below=_TURN),
+            "factor": Value("multiplier of the specific force", "1", low=0.0),
+            "start": Value("start angle", "rad", 0.0),
+            "width": Value("angular width", "rad", math.pi, low=0.0, above=True, below=_TURN),
         },
         what="cut",
     ),
@@ -146,7 +146,7 @@ def parse(text: str, whose: str, *, what: str = "fault") -> Fault:
         what: name of the request for error messages.
 
     Raises:
-        InputError: unknown kind or parameter, or a parameter that is missing, duplicate or out of range.
+        InputError: the kind or a parameter is unknown, or a parameter is missing, duplicate or out of range.
     """
     if len(text) > _LONGEST:
         raise InputError(f"{whose}: a {what} of {len(text)} characters; allowed: up to {_LONGEST}")
@@ -210,7 +210,7 @@ class Disturbance:
         self._random = np.random.default_rng(np.random.SeedSequence(entropy))
 
     def during(self, signals: Signals) -> None:
-        """Change the samples during the fault in place; called in order, arrays of shape (n,), n above 0."""
+        """Change samples in place during the fault; called in sample order with arrays of shape (n,), n above 0."""
         self.change(signals[self._field])
 
     def change(self, signal: Array) -> None:
@@ -218,7 +218,7 @@ class Disturbance:
         raise NotImplementedError
 
     def after(self, signals: Signals) -> None:
-        """Change the samples after the end of the fault in place; no change by default."""
+        """Change samples in place after the end of the fault; no change by default."""
 
 
 class _Off(Disturbance):
@@ -252,7 +252,7 @@ class _Slow(Disturbance):
 
     def change(self, signal: Array) -> None:
         pole = math.exp(-self._step / self._values["time"])
-        if self._state is None:  # at rest at the first sample, without a jump
+        if self._state is None:  # at rest at the first sample, so that there is no jump
             self._state = np.array([pole * signal[0]])
         signal[:], self._state = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], signal, zi=self._state)
 
@@ -268,7 +268,7 @@ class _Delayed(Disturbance):
 
 
 class _Intermittent(Disturbance):
-    _dead, _left = True, 0  # state of the contact, and samples until it changes
+    _dead, _left = True, 0  # whether the contact is open, and number of samples until it changes
 
     def change(self, signal: Array) -> None:
         place = 0
@@ -276,7 +276,7 @@ class _Intermittent(Disturbance):
             if not self._left:
                 self._dead = not self._dead
                 mean = self._values["off" if self._dead else "good"] / self._step
-                # Rounded up: a spell has a sample at least, or the loop would not end.
+                # Rounded up: an interval without samples could make the loop endless.
                 self._left = math.ceil(self._random.exponential(mean))
             stop = min(place + self._left, signal.size)
             if self._dead:
@@ -327,7 +327,7 @@ class _Reversed(Disturbance):
         signals["angle"] -= 2.0 * self._turned
 
 
-#: effects of the faults at ports, by kind; faults of the cut are implemented by the cutting process
+#: effects of the faults at ports, by kind; the cutting process implements the faults of the cut
 DISTURBANCES: Mapping[str, type[Disturbance]] = {
     "off": _Off,
     "stuck": _Stuck,
@@ -344,5 +344,5 @@ DISTURBANCES: Mapping[str, type[Disturbance]] = {
 
 
 def prepare() -> None:
-    """Import the SciPy module used by faults in advance: importing it at the first fault would stall a run."""
+    """Import the SciPy module used by faults in advance, since an import at the first fault would stall a run."""
     scipy.signal.lfilter([1.0], [1.0], np.zeros(1))

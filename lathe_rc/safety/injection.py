@@ -20,7 +20,7 @@ class Port:
     Attributes:
         topic: name of the topic in the cell.
         type: message type.
-        fields: fields of the message in use.
+        fields: used fields of the message.
         delay: delay of the samples [sample].
         out: whether the stage publishes the topic.
     """
@@ -57,7 +57,7 @@ class _Injected:
     end: float = math.inf
 
     def apply(self, first: int, signals: Signals) -> None:
-        """Apply the fault in place to samples starting at ``first``, counted in the node's time."""
+        """Apply the fault in place to samples starting at ``first``, an index in the node's time."""
         first -= self.port.delay  # the fault refers to the topic's samples, which a delayed reader receives later
         samples = next(iter(signals.values())).size
         begin = min(max(self.start - first, 0), samples)
@@ -138,7 +138,7 @@ class Injection:
             self._injected.append(_Injected(fault, port, made, index))
 
     def end(self, target: str, index: int, fault: Fault | None = None) -> bool:
-        """End the oldest instance of ``fault``, or without it all faults of a target, before sample ``index``.
+        """End the oldest instance of ``fault``, or by default all faults of a target, before sample ``index``.
 
         Returns:
             Whether there was such a fault.
@@ -153,7 +153,7 @@ class Injection:
 
     @property
     def any(self) -> bool:
-        """Whether there is or was any fault; ended faults matter since lost counts stay lost after a repair."""
+        """Whether there is or was any fault; ended faults matter, since lost counts stay lost after a repair."""
         return bool(self._injected)
 
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:

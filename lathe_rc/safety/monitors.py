@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors that check signals by a rule of `lathe_rc.safety.rules` or in plain Python."""
+"""Monitors that check signals, either by a rule of `lathe_rc.safety.rules` or in plain Python."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -15,13 +15,13 @@ from lathe_rc.safety.state_machine import Reaction
 
 Place = tuple[int, str]  # index of an input, and name of its field
 
-_LONGEST_NAME = 64  # length of a monitor's name [B], limit of SafetyStatus.msg
+_LONGEST_NAME = 64  # largest length of a monitor's name [B], set by SafetyStatus.msg
 _NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """Alarm raised by a monitor, with its sample and value.
+    """Alarm raised by a monitor, with the sample and the value that caused it.
 
     Attributes:
         place: index of the sample in the block.
@@ -57,7 +57,7 @@ class Rule(NamedTuple):
 
     Attributes:
         number: number of the rule in `lathe_rc.safety.rules`.
-        start: initial memory of the rule, including its limits.
+        start: initial state of the rule, including its limits.
         unit: divisor of the rule's value; the quotient has the unit of the limit.
         restarts: False if the rule also uses samples from before a reset.
     """
@@ -75,7 +75,7 @@ def threshold(limit: float, *, offset: float = 0.0, samples: int = 1, after: flo
         limit: limit of the magnitude.
         offset: offset subtracted from the signal.
         samples: number of consecutive samples; 1 for an immediate alarm.
-        after: revolutions of the encoder, the first input, until monitoring begins.
+        after: revolutions of the encoder (the first input) before monitoring begins.
     """
     return Rule(THRESHOLD, (offset, -limit, limit, samples, 0.0, after * TURN, np.nan))
 
@@ -99,7 +99,7 @@ def rate(limit: float, *, window: int, step: float, before: float) -> Rule:
 
 
 def index_pulses(limit: float) -> Rule:
-    """Create a rule for an angle that reverses, or does not turn by one revolution between two index pulses."""
+    """Create a rule for an angle that reverses, or does not advance by one revolution between two index pulses."""
     return Rule(INDEX, (limit, np.nan, np.nan, 0.0))
 
 
@@ -122,7 +122,7 @@ class Monitor(Watcher):
         rule: rule with its limits.
         signal: input and field of the signal.
         other: input and field of a second signal; None for none.
-        memory: current memory of the rule.
+        memory: current state of the rule.
     """
 
     rule: Rule
@@ -130,11 +130,11 @@ class Monitor(Watcher):
     other: Place | None = None
 
     def __post_init__(self) -> None:
-        # The `Lookout` replaces it by a view: the kernel has one array for the memories of all rules.
+        # The `Lookout` replaces this array by a view of the kernel's array, which contains the states of all rules.
         self.memory: Array = np.array(self.rule.start, np.float64)
 
     def reset(self) -> None:
-        """Reset the memory of the rule, unless the rule also uses samples from before a reset."""
+        """Reset the state of the rule, unless the rule also uses samples from before a reset."""
         if self.rule.restarts:
             self.memory[:] = self.rule.start
 
@@ -142,8 +142,8 @@ class Monitor(Watcher):
 class PlainMonitor(ABC):
     """Base class of monitors in plain Python, which check signals chunk by chunk.
 
-    A new instance is created at a reset. The result must not depend on the boundaries of the chunks; the monitor has to
-    store past samples that it needs.
+    A new instance is created at each reset. The result must not depend on the boundaries of the chunks, so the monitor
+    must store any past samples that it needs.
 
     Args:
         limit: threshold, published with the alarm.
@@ -236,14 +236,14 @@ def _read_only(signal: Array) -> Array:
 
 
 class Clearance:
-    """Detector of a tool that has left the part.
+    """Detector for a tool that has left the part.
 
     Args:
-        beyond: least measured position of the drive at which the tool is out [m].
+        beyond: smallest measured position of the drive at which the tool is out of the part [m].
         samples: number of consecutive samples required.
 
     Attributes:
-        memory: both arguments and the current number of consecutive samples, for `lathe_rc.safety.rules.clear`.
+        memory: state for `lathe_rc.safety.rules.clear`: both arguments, and the current number of consecutive samples.
     """
 
     def __init__(self, beyond: float, samples: int) -> None:
@@ -260,10 +260,10 @@ class Clearance:
 
 
 class Lookout:
-    """Set of all monitors of a cell that check by rules; the first input is the encoder.
+    """Set of all rule-based monitors of a cell; the first input is the encoder.
 
     Args:
-        monitors: monitors in the order of alarms at the same sample; their memory is moved into the lookout's.
+        monitors: monitors in the order of their alarms at the same sample; their states move into one shared array.
         numbers: signal numbers for the kernel, by input and field.
 
     Attributes:
@@ -282,7 +282,7 @@ class Lookout:
         self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
 
     def found(self) -> list[tuple[Monitor, Alarm]]:
-        """Return the alarms of the last call of `lathe_rc.safety.rules.walk`, in order of the samples."""
+        """Return the alarms of the last call of `lathe_rc.safety.rules.walk`, in sample order."""
         found = []
         places, values = self.watch.places.tolist(), self.watch.values.tolist()
         for number, (monitor, place, value) in enumerate(zip(self._monitors, places, values, strict=True)):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules of the monitors, with results that do not depend on the block length.
 
-One kernel processes the samples for all monitors of a cell: each row of a table gives a rule, its signals and the
-location of its memory. A rule first checks a stretch of samples in a vectorised loop, and processes the samples one by
-one only if the check finds any violation.
+One kernel processes the samples for all monitors of a cell; each row of a table gives a rule, its signals and the
+location of its state, the array ``memory``. A rule first checks a stretch of samples in a vectorised loop, and
+processes the samples one by one only if the check finds a violation.
 """
 
 from typing import NamedTuple
@@ -18,9 +18,9 @@ Array = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
 Pulses = npt.NDArray[np.uint8]
 
-THRESHOLD, RATE, INDEX, GROWTH = range(4)  #: rules of the table
+THRESHOLD, RATE, INDEX, GROWTH = range(4)  #: numbers of the rules in the table
 TURN = 2.0 * np.pi  #: a revolution [rad]
-_STRETCH = 256  # samples
+_STRETCH = 256  # number of samples checked at a time
 
 
 @inlined
@@ -32,9 +32,9 @@ def _beyond(value: float, offset: float, low: float, high: float) -> bool:
 
 @kernel
 def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
-    """Return 0 if enough consecutive samples may be beyond the limits, or may begin at the last one; otherwise -1.
+    """Return 0 if enough consecutive samples may be beyond the limits or may begin to be at the last one; otherwise -1.
 
-    The memory is that of `_lasting_beyond`. If n consecutive samples are needed, checking every n-th sample and the
+    ``memory`` is as in `_lasting_beyond`. If n consecutive samples are needed, checking every n-th sample and the
     last one suffices, provided that the sample before the first was not beyond the limits.
     """
     offset, low, high, needed = memory[0], memory[1], memory[2], int(memory[3])
@@ -55,13 +55,13 @@ def _any_beyond(signal: Array, other: Array, memory: Array) -> int:
 
 @inlined
 def _over(memory: Array) -> bool:
-    """Return whether the initial alarm-free angle has been passed (memory as in `_lasting_beyond`)."""
+    """Return whether the initial alarm-free angle has been passed (``memory`` as in `_lasting_beyond`)."""
     return bool(memory[5] == 0.0 or memory[6] == -np.inf)
 
 
 @kernel
 def _forgiven(angle: Array, memory: Array) -> int:
-    """Count the samples of the block within the initial alarm-free angle (memory as in `_lasting_beyond`)."""
+    """Count the samples of the block within the initial alarm-free angle (``memory`` as in `_lasting_beyond`)."""
     if _over(memory) or not angle.size:
         return 0
     if np.isnan(memory[6]):
@@ -75,9 +75,9 @@ def _forgiven(angle: Array, memory: Array) -> int:
 
 @kernel
 def _lasting_beyond(signal: Array, other: Array, angle: Array, memory: Array) -> int:
-    """Find the first sample at which enough consecutive samples were beyond the limits; -1 if there is none.
+    """Return the first sample at which enough consecutive samples were beyond the limits; -1 if there is none.
 
-    The memory: offset, lower and upper limit, number of consecutive samples required, current number of consecutive
+    ``memory``: offset, lower and upper limit, number of consecutive samples required, current number of consecutive
     samples; alarm-free spindle angle after the first sample or a reset, and the angle at which it ends, NaN before it
     begins.
     """
@@ -95,11 +95,11 @@ def _lasting_beyond(signal: Array, other: Array, angle: Array, memory: Array) ->
 def clear(position: Array, memory: Array) -> tuple[int, float]:
     """Find the first sample at which enough consecutive samples were at or beyond a position.
 
-    The memory: the position, the number of consecutive samples required, and their number before the block; it is not
-    changed.
+    ``memory``, which remains unchanged: the position, the number of consecutive samples required, and the number
+    reached before the block.
 
     Returns:
-        The sample, -1 if there is none; and the number of consecutive samples up to it or to the last one.
+        The sample, or -1 if there is none, and the number of consecutive samples up to it or to the end of the block.
     """
     run = memory[2]
     for k in range(position.size):
@@ -124,9 +124,9 @@ def _how_many_differ(after: Array, before: Array, limit: float) -> int:
 
 @kernel
 def _changing(signal: Array, memory: Array) -> int:
-    """Find the first sample that differs by more than the limit from the one a window earlier; -1 if there is none.
+    """Return the first sample that differs by more than the limit from the one a window earlier; -1 if there is none.
 
-    The memory: limit, difference at that sample, and the samples of the last window.
+    ``memory``: limit, difference at that sample, and the samples of the last window.
     """
     limit, past, size = memory[0], memory[2:], signal.size
     window = past.size
@@ -147,7 +147,7 @@ def _changing(signal: Array, memory: Array) -> int:
 
 @inlined
 def _next(pulse: Pulses, begin: int) -> int:
-    """Find the first index pulse starting at a sample; the size of the block if there is none."""
+    """Return the first index pulse at or after a sample; the size of the block if there is none."""
     for start in range(begin, pulse.size, _STRETCH):
         piece, some = pulse[start : start + _STRETCH], np.uint8(0)
         for k in range(piece.size):
@@ -166,7 +166,7 @@ def _off(since: float, limit: float) -> bool:
 
 @kernel
 def _first_off(angle: Array, last: float, limit: float) -> int:
-    """Find the first sample with an impossible angle since the index pulse; -1 if there is none."""
+    """Return the first sample with an impossible angle since the index pulse; -1 if there is none."""
     count = 0
     for k in range(angle.size):
         count += _off(angle[k] - last, limit)
@@ -178,10 +178,10 @@ def _first_off(angle: Array, last: float, limit: float) -> int:
 
 @kernel
 def _index(angle: Array, pulse: Pulses, at: int, memory: Array) -> int:
-    """Find the first sample whose angle is inconsistent with the index pulses, the first of which is at ``at``.
+    """Return the first sample whose angle is inconsistent with the index pulses, -1 if none; ``at``: the first pulse.
 
-    The memory: limit, angle of the last pulse, deviation found, whether there was a pulse. Before the first pulse, the
-    first angle is used in its place, and that pulse may come early. The result is -1 if there is no such sample.
+    ``memory``: limit, angle of the last pulse, deviation found, whether there was a pulse. Until the first pulse, the
+    first angle takes the place of the last pulse's angle, and the first pulse may come early.
     """
     limit, begin = memory[0], 0
     if angle.size and np.isnan(memory[1]):
@@ -202,12 +202,12 @@ def _index(angle: Array, pulse: Pulses, at: int, memory: Array) -> int:
     return -1
 
 
-SUMS = 128  # interleaved sums of squares, so that the loop vectorises; one sum would be a serial dependency
+SUMS = 128  # interleaved sums of squares, so that the loop vectorises; a single sum would be a serial dependency
 
 
 @inlined
 def _add(error: Array, memory: Array) -> None:
-    """Add the squares of further errors of the current revolution (memory as in `_growing`)."""
+    """Add the squares of further errors of the current revolution (``memory`` as in `_growing`)."""
     # Sum k takes every 128th error since the pulse, independent of block boundaries: the order of summation is fixed.
     sums = memory[7:]
     start = int(memory[3]) % sums.size
@@ -223,7 +223,7 @@ def _add(error: Array, memory: Array) -> None:
 
 @inlined
 def _grown(memory: Array) -> bool:
-    """End a revolution, begin the next; return whether the error has grown often enough (memory as in `_growing`)."""
+    """End a revolution and begin the next; return whether the error has grown often enough (``memory``: `_growing`)."""
     limit, floor, needed, state, sums = memory[0], memory[1], memory[2], memory[3:7], memory[7:]
     rms = np.sqrt(np.sum(sums) / state[0])
     before = state[1]
@@ -238,9 +238,9 @@ def _grown(memory: Array) -> bool:
 
 @kernel
 def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
-    """Find the sample at which the RMS error has grown often enough, -1 if there is none; ``at``: the first pulse.
+    """Return the sample at which the RMS error has grown often enough, -1 if there is none; ``at``: the first pulse.
 
-    The memory: limit, floor, revolutions required; samples of the current revolution, below 0 before the first index
+    ``memory``: limit, floor, revolutions required; samples of the current revolution, negative before the first index
     pulse; RMS error of the previous revolution, number of consecutive growths, last growth factor; sums of squares.
     """
     begin = 0
@@ -260,9 +260,9 @@ class Watch(NamedTuple):
     """Table of the monitors of a cell for `walk`.
 
     Attributes:
-        plan: rule, first signal, second signal or -1, begin and end of the memory of each monitor, shape (rules, 5).
-        memory: concatenated memories of the monitors.
-        raised: flags of the monitors that have raised their alarm and are inactive, shape (rules,).
+        plan: rule, first signal, second signal or -1, start and end of the state of each monitor, shape (rules, 5).
+        memory: concatenated states of the monitors.
+        raised: flags of the monitors that have raised their alarm and are now inactive, shape (rules,).
         places: sample of each monitor's finding, or -1, shape (rules,).
         values: value at that sample, shape (rules,).
     """
@@ -276,7 +276,7 @@ class Watch(NamedTuple):
 
 @kernel
 def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
-    """Run all monitors over a block, fill in the sample and value of each finding, and return their number.
+    """Run all monitors over a block, fill in the sample and value of each finding, and return the number of findings.
 
     Args:
         watch: table of the monitors, updated in place.

@@ -15,7 +15,7 @@ class State(IntEnum):
 
 
 class Reaction(IntEnum):
-    """Reaction to an alarm; of several, the one with the highest number prevails."""
+    """Reaction to an alarm; of several reactions, the one with the highest number prevails."""
 
     NONE = 0
     WARN = 1
@@ -27,16 +27,16 @@ class Reaction(IntEnum):
 
 
 MEANING = {
-    Reaction.NONE: "nothing",
+    Reaction.NONE: "no effect",
     Reaction.WARN: "the alarm is published and recorded",
-    Reaction.FREEZE: "the controllers stop learning, and go on with what they have learned",
-    Reaction.FALL_BACK: "the controllers stop learning; if so asked, they lead by the nominal speed",
-    Reaction.HOLD: "the commands of the tool stay as they are; the feeds stop",
+    Reaction.FREEZE: "the controllers stop learning and continue with what they have learned",
+    Reaction.FALL_BACK: "the controllers stop learning; if so configured, their lead is that of the nominal speed",
+    Reaction.HOLD: "the tool commands are held; the feeds stop",
     Reaction.RETRACT: "the tool moves out of the part along a bounded profile; the feeds stop",
-    Reaction.STOP: "as retract; only a new run ends it",
+    Reaction.STOP: "like retract, but only a new run ends it",
 }
 
-RETRACTED, RESET = "retracted", "reset"  #: further causes of transitions: end of the retraction, reset by the operator
+RETRACTED, RESET = "retracted", "reset"  #: other causes of transitions: end of the retraction, reset by the operator
 
 
 def after(state: State, cause: Reaction | str) -> State | None:
@@ -47,7 +47,7 @@ def after(state: State, cause: Reaction | str) -> State | None:
         cause: reaction requested by a monitor, `RETRACTED` or `RESET`.
 
     Returns:
-        The next state; None if the cause is not valid in the current state.
+        The next state, or None if the cause is not valid in the current state.
     """
     if cause == RETRACTED:
         return State.SAFE if state is State.RETRACTING else None
@@ -61,7 +61,7 @@ def after(state: State, cause: Reaction | str) -> State | None:
 
 
 def table() -> Iterator[tuple[str, ...]]:
-    """Yield the rows of the transition table for the documentation: cause, then next state per state, "" for none."""
+    """Yield the rows of the documented transition table: cause, then the next state for each state, "" for none."""
     for cause in (*Reaction, RETRACTED, RESET):
         if cause is not Reaction.NONE:
             found = [after(state, cause) for state in State]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Allowance: distance of the blank's surface beyond its nominal position.
+"""Allowance: distance by which the blank's surface exceeds its nominal position.
 
     d(t) = w(t) + Σ a_i·sin(n_i·φ(t) + ψ_i)
 
-w is a slow random walk, the sum is the run-out of the blank, which turns with the spindle: order 1 is eccentricity, the
-higher orders are its form. Sources: paper 004, whose disturbance of the force is 4.83 N RMS; spec/feed-and-force.md,
-by which that is an allowance of 20.7 µm RMS at 233.3 N/mm.
+w is a slow random walk. The sum is the run-out of the blank, which turns with the spindle: order 1 is eccentricity, and
+higher orders describe the form of the blank. Sources: paper 004, whose disturbance of the force is 4.83 N RMS;
+spec/feed-and-force.md, which equates this to an allowance of 20.7 µm RMS at 233.3 N/mm.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.signals.checks import stacked
 from lathe_rc.signals.noise import Drawn, NormalStream
 
-PAPER_RMS = 20.7e-6  #: [m]
+PAPER_RMS = 20.7e-6  #: RMS of the allowance in paper 004 [m]
 
 
 class Walk(NamedTuple):
@@ -38,15 +38,15 @@ class Walk(NamedTuple):
 def mean_reverting(rms: float, correlation_time: float, step: float) -> Walk:
     """Return a mean-reverting walk, stationary from its first sample (Ornstein-Uhlenbeck).
 
-    Its autocorrelation is rms²·e^{-|t|/correlation_time}, at any sampling step.
+    Its autocorrelation is rms²·e^{-|t|/correlation_time} at any sampling step.
 
     Args:
         rms: RMS of the walk [m].
-        correlation_time: [s].
+        correlation_time: correlation time [s].
         step: sampling step [s].
 
     Raises:
-        InputError: a negative RMS, or a time that is not above 0.
+        InputError: the RMS is negative, or the correlation time is not above 0.
     """
     if not 0.0 <= rms < np.inf:
         raise InputError(f"allowance: RMS {rms:g} m; allowed: 0 or more")
@@ -61,10 +61,10 @@ def mean_reverting(rms: float, correlation_time: float, step: float) -> Walk:
 
 
 def unbounded(rate: float, step: float) -> Walk:
-    """Return a walk that starts at 0 with an RMS of rate·√t after t seconds; ``rate`` in m/√s, ``step`` in s.
+    """Return a walk that starts at 0 and has an RMS of rate·√t after t seconds; ``rate`` in m/√s, ``step`` in s.
 
     Raises:
-        InputError: a negative rate.
+        InputError: the rate is negative.
     """
     if not 0.0 <= rate < np.inf:
         raise InputError(f"allowance: rate {rate:g} m/√s of the walk; allowed: 0 or more")
@@ -77,8 +77,8 @@ class AllowanceTable(NamedTuple):
     Attributes:
         walk: constants of the random walk.
         run_out: rows n_i, a_i, ψ_i, shape (3, m).
-        normal: normal numbers for the walk.
-        state: w, and whether there was a sample.
+        normal: normally distributed random numbers for the walk.
+        state: w, and whether there has been a sample.
     """
 
     walk: Walk
@@ -89,7 +89,7 @@ class AllowanceTable(NamedTuple):
 
 @kernel
 def allow(made: AllowanceTable, angle: Array, allowance: Array) -> None:
-    """Fill ``allowance`` [m] at the true spindle ``angle`` [rad], both of shape (n,); uses n drawn numbers."""
+    """Fill ``allowance`` [m] at the true spindle ``angle`` [rad], both of shape (n,), using n of the drawn numbers."""
     walk, run_out, state, place = made.walk, made.run_out, made.state, made.normal.used[0]
     made.normal.used[0] += angle.size
     w, begun = state[0], state[1]
@@ -109,10 +109,10 @@ class Allowance:
     """Allowance of the blank: random walk and run-out.
 
     Args:
-        walk: see `mean_reverting` and `unbounded`.
-        order: n_i of the run-out, integers from 1, shape (m,).
-        amplitude: a_i [m], shape (m,).
-        phase: ψ_i [rad], shape (m,).
+        walk: random walk from `mean_reverting` or `unbounded`.
+        order: orders n_i of the run-out, integers of at least 1, shape (m,).
+        amplitude: amplitudes a_i [m], shape (m,).
+        phase: phases ψ_i [rad], shape (m,).
         seed: the scenario's seed.
         name: name of the node; selects an independent random stream.
 
@@ -120,7 +120,7 @@ class Allowance:
         table: constants and state for `allow`.
 
     Raises:
-        InputError: arrays of different lengths, or an order that is not an integer from 1.
+        InputError: the arrays differ in length, or an order is not an integer of at least 1.
     """
 
     def __init__(

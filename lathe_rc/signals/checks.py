@@ -13,11 +13,11 @@ def stacked(what: str, **arrays: Array) -> Array:
     """Stack arrays of equal length, shape (m, n).
 
     Args:
-        what: the subject of the message.
-        **arrays: arrays by their names in the message; shape (n,).
+        what: subject of the error message.
+        **arrays: arrays of shape (n,), by their names in the message.
 
     Raises:
-        InputError: arrays of different lengths.
+        InputError: the arrays differ in length.
     """
     if len({array.size for array in arrays.values()}) > 1:
         *sizes, last = (f"{array.size} {name}" for name, array in arrays.items())
@@ -26,16 +26,16 @@ def stacked(what: str, **arrays: Array) -> Array:
 
 
 def real_numbers(call: str, result: object, argument: str, like: Array) -> Array:
-    """Check that a formula in plain Python returns a real number for each argument, and return these numbers.
+    """Check that a formula in plain Python returned a real number for each argument, and return these numbers.
 
     Args:
-        call: call of the formula, for the message.
+        call: call of the formula, for the error message.
         result: return value of the formula, shape (n,).
-        argument: plural name of the argument, for the message.
+        argument: plural name of the argument, for the error message.
         like: the arguments, shape (n,).
 
     Raises:
-        InputError: the result has another shape or type. Numbers that are not finite are accepted.
+        InputError: the result has a different shape or type. Numbers that are not finite are accepted.
     """
     numbers = np.asarray(result)
     if numbers.shape != like.shape or numbers.dtype.kind not in "fiu":

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sources of encoder counts, and the spindle angle at any time between two readings.
 
-A reading is a time [ns] and the counter value at that time. Between two readings the angle is linear.
+A reading is a time [ns], the counter value at that time and, from some encoders, the time of its last edge (see
+`lathe_rc.signals.edge_time`). Between two readings the angle is linear.
 """
 
 import os
@@ -18,13 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.signals.edge_time import COUNT, STAMP, edge_table, pass_edge, passed
 from lathe_rc.signals.table import read_text
 
 Array = npt.NDArray[np.float64]
-Reading = tuple[int, int | float]  #: time [ns] and counter; an integer counter as int, since a double has 53 bits
+#: time [ns], counter and, with edge times, that of the last edge [ns]; an integer counter as int, for all its digits
+Reading = tuple[int, int | float] | tuple[int, int | float, int]
 
-_READING = re.compile(r"\s*([-+]?[0-9.eE+-]+)\s*(?:[,;]|\s)\s*([-+]?[0-9.eE+-]+)\s*")
-_HEADERS = {"time_ns,counts": 1, "time_s,counts": 10**9}  # header, and nanoseconds per unit of the first column
+_NUMBER = r"\s*([-+]?[0-9.eE+-]+)\s*"
+_READING = re.compile(rf"{_NUMBER}(?:[,;]|\s){_NUMBER}(?:(?:[,;]|\s){_NUMBER})?")
+_PLAIN = {"time_ns,counts": 1, "time_s,counts": 10**9}  # header, and nanoseconds per unit of the times
+_TIMED = {"time_ns,counts,edge_ns": 1, "time_s,counts,edge_s": 10**9}  # with the time of the counter's last edge
+_HEADERS = _PLAIN | _TIMED
 _MOST_TIME = 2**63  # [ns], exclusive
 _MOST_COUNT = 2.0**64  # largest magnitude of a counter
 _LONGEST_LINE = 256
@@ -57,25 +63,37 @@ def _count(text: str) -> int | float:
     return int(text) if text.lstrip("+-").isdigit() and len(text) < _LONGEST_LINE else float(text)
 
 
-def _reading(text: str, unit: int, where: str) -> Reading:
-    """Parse a time, in units of ``unit`` nanoseconds, and a counter; ``where`` locates the text in error messages."""
+def _time_ns(text: str, unit: int) -> int:
+    """Parse a time in units of ``unit`` nanoseconds; raises ValueError or ArithmeticError."""
+    time = Decimal(text)
+    if not abs(time) * unit < _MOST_TIME:  # before 1e999999999 becomes an int
+        raise ValueError
+    return int(text) if unit == 1 else round(time * unit)
+
+
+def _reading(text: str, unit: int, where: str, *, timed: bool) -> Reading:
+    """Parse a reading with times in units of ``unit`` nanoseconds; ``where`` locates the text in error messages."""
     found = _READING.fullmatch(text)
     try:
-        if found:
-            seconds = Decimal(found[1])
-            if abs(seconds) * unit < _MOST_TIME:  # before 1e999999999 becomes an int
-                time_ns = int(found[1]) if unit == 1 else round(seconds * unit)
-                return time_ns, _count(found[2])
+        if found and bool(found[3]) == timed:
+            time_ns, count = _time_ns(found[1], unit), _count(found[2])
+            return (time_ns, count, _time_ns(found[3], unit)) if timed else (time_ns, count)
     except (ValueError, ArithmeticError):
         pass
-    raise InputError(f"{where}: {shown(text)!r}; allowed: a time and a counter, as {next(iter(_HEADERS))}")
+    what = "a time, a counter and the time of its last edge" if timed else "a time and a counter"
+    raise InputError(f"{where}: {shown(text)!r}; allowed: {what}, as {next(iter(_TIMED if timed else _PLAIN))}")
 
 
 class CsvReader(Reader):
     """Reader of a CSV file with the header ``time_ns,counts`` or ``time_s,counts``; ignores lines starting with #.
 
+    With a third column, ``edge_ns`` or ``edge_s``, it has the times of the last edges.
+
     Args:
         path: path of the file.
+
+    Attributes:
+        timed: whether the file has the times of the last edges.
 
     Raises:
         InputError: the file cannot be read, or has another header; `read` raises it for malformed lines.
@@ -87,13 +105,16 @@ class CsvReader(Reader):
         self._lines = [(n, line) for n, line in lines if line.strip() and line.lstrip()[0] != "#"]
         header = self._lines[0][1].replace(" ", "") if self._lines else ""
         if header not in _HEADERS:
-            raise InputError(f"{path}: header {shown(header)!r}; allowed: {' or '.join(_HEADERS)}")
-        self._unit = _HEADERS[header]
+            edges = " and ".join(name.rpartition(",")[2] for name in _TIMED)
+            raise InputError(
+                f"{path}: header {shown(header)!r}; allowed: {' or '.join(_PLAIN)}, and {edges} for the times of edges"
+            )
+        self._unit, self.timed = _HEADERS[header], header in _TIMED
 
     def read(self) -> Iterator[Reading]:
         """Yield all readings of the file, once."""
         for number, line in [] if self.ended else self._lines[1:]:
-            yield _reading(line, self._unit, f"{self._path}:{number}")
+            yield _reading(line, self._unit, f"{self._path}:{number}", timed=self.timed)
         self.ended = True
 
 
@@ -107,15 +128,18 @@ class LineReader(Reader):
         name: name of the stream, for messages.
         joins: whether the first line may be incomplete, and is ignored.
         waits: whether an empty read before the first data does not end the stream, as in a pipe without a writer.
+        timed: whether a line ends with the time of the counter's last edge [ns].
     """
 
-    def __init__(self, stream: IO[bytes], name: str, *, joins: bool = False, waits: bool = False) -> None:
-        self._stream, self._name, self._skips, self._waits = stream, name, joins, waits
+    def __init__(
+        self, stream: IO[bytes], name: str, *, joins: bool = False, waits: bool = False, timed: bool = False
+    ) -> None:
+        self._stream, self._name, self._skips, self._waits, self._timed = stream, name, joins, waits, timed
         self._rest = b""
 
     @classmethod
-    def open(cls, path: Path, baud: int) -> "LineReader":
-        """Open a terminal, whose speed is set to ``baud``, a pipe or a file.
+    def open(cls, path: Path, baud: int, *, timed: bool = False) -> "LineReader":
+        """Open a terminal, whose speed is set to ``baud``, a pipe or a file; ``timed``: with the times of edges.
 
         Raises:
             InputError: it cannot be opened, or does not support the speed.
@@ -128,7 +152,7 @@ class LineReader(Reader):
         terminal = os.isatty(number)
         if terminal:
             _make_raw(number, path, baud)
-        return cls(stream, str(path), joins=terminal, waits=stat.S_ISFIFO(os.fstat(number).st_mode))
+        return cls(stream, str(path), joins=terminal, waits=stat.S_ISFIFO(os.fstat(number).st_mode), timed=timed)
 
     def close(self) -> None:
         """Close the stream of readings."""
@@ -151,7 +175,7 @@ class LineReader(Reader):
                 if self._skips:
                     self._skips = False
                 elif (text := line.decode("utf-8", "replace").strip()) and text[0] != "#" and text not in _HEADERS:
-                    yield _reading(text, 1, self._name)
+                    yield _reading(text, 1, self._name, timed=self._timed)
             if len(self._rest) > _LONGEST_LINE:
                 raise InputError(
                     f"{self._name}: {len(self._rest)} bytes without an end of line; allowed: lines of text"
@@ -182,19 +206,31 @@ class CountedAngle:
         inverted: whether the counter counts down while the spindle turns forward.
         max_reverse: largest backward motion [counts]; the angle is constant during it.
         max_gap: longest time between readings [s].
+        edge_clock: resolution of the times of edges [s].
+        nominal_speed: speed assumed from the first reading to the next edge [rad/s], with times of edges.
 
     Attributes:
         late: number of ignored readings, which arrived after a more recent one.
     """
 
     def __init__(
-        self, *, counts: int, step_ns: int, wraps: int, inverted: bool, max_reverse: float, max_gap: float
+        self,
+        *,
+        counts: int,
+        step_ns: int,
+        wraps: int,
+        inverted: bool,
+        max_reverse: float,
+        max_gap: float,
+        edge_clock: float = 0.0,
+        nominal_speed: float = 0.0,
     ) -> None:
         self._counts, self._step_ns, self._wraps = counts, step_ns, wraps
         self._sign, self._max_reverse, self._max_gap_ns = -1 if inverted else 1, max_reverse, round(max_gap * 1e9)
         self._start_ns = 0
-        self._newest: Reading | None = None
-        self._turned = self._highest = 0.0  # [count]
+        self._newest: tuple[int, int | float] | None = None
+        self._turned = self._highest = self._reached = 0.0  # [count], the last with the part of a count since its edge
+        self._edges = edge_table(edge_clock, 0.0, 0.0, nominal_speed * counts / (2.0 * np.pi))
         self._times: list[float] = []  # [ns] after sample 0, of readings added since the last `_gather`
         self._angles: list[float] = []
         self._time, self._angle = np.empty(0), np.empty(0)  # readings before them
@@ -208,25 +244,29 @@ class CountedAngle:
     @property
     def angle(self) -> float:
         """Angle at the most recent reading [rad]."""
-        return self._highest * 2.0 * np.pi / self._counts
+        return self._reached * 2.0 * np.pi / self._counts
 
     @property
     def available(self) -> int:
         """Number of samples for which the readings determine the angle."""
         return 0 if self._newest is None else (self._newest[0] - self._start_ns) // self._step_ns + 1
 
-    def add(self, time_ns: int, count: float) -> None:
-        """Add a reading of the encoder.
+    def add(self, time_ns: int, count: float, edge_ns: int | None = None) -> None:
+        """Add a reading of the encoder: its time [ns], the counter and, if known, the time of its last edge [ns].
 
         Raises:
-            LatheError: the last reading was too long ago, the counter has moved back too far, or the value is invalid.
+            LatheError: the last reading was too long ago, the counter has moved back too far, or a value is invalid.
         """
         if not abs(count) <= _MOST_COUNT:
             raise LatheError(f"counter of {count:.6g} at {time_ns} ns; allowed: finite numbers up to 2^64")
+        if edge_ns is not None and edge_ns > time_ns:
+            raise LatheError(f"last edge at {edge_ns} ns in a reading at {time_ns} ns; allowed: not after the reading")
         if self._newest is None:
             self._start_ns, self._newest = time_ns, (time_ns, count)
             self._turned = self._highest = float((count * self._sign) % self._counts)
-            self._keep()
+            if edge_ns is not None:
+                self._edges.last[[STAMP, COUNT]] = (edge_ns - time_ns) * 1e-9, self._turned
+            self._keep(edge_ns)
             return
         if time_ns <= self._newest[0]:
             self.late += 1
@@ -248,18 +288,23 @@ class CountedAngle:
                 f"{self._max_reverse:g}, a spindle that turns one way (inverted turns the sign)"
             )
         self._highest = max(self._highest, self._turned)
-        self._keep()
+        self._keep(edge_ns)
 
     def go_on(self, speed: float) -> None:
         """Extrapolate the most recent reading by an hour at ``speed`` [rad/s]."""
         assert self._newest is not None, "a reading has come"
         self._newest = self._newest[0] + _GOES_ON * 10**9, self._newest[1]
         self._highest += speed * _GOES_ON * self._counts / (2.0 * np.pi)
-        self._keep()
+        self._keep(None)
 
-    def _keep(self) -> None:
+    def _keep(self, edge_ns: int | None) -> None:
         """Append the most recent reading to lists, which is faster than appending to arrays (see `_gather`)."""
         assert self._newest is not None, "a reading has come"
+        self._reached = self._highest
+        if edge_ns is not None:
+            if self._highest > self._edges.last[COUNT]:  # a counter that trembles passes its edge again, later
+                pass_edge(self._edges, (edge_ns - self._start_ns) * 1e-9, self._highest)
+            self._reached += passed(self._edges, self.time)
         self._times.append(float(self._newest[0] - self._start_ns))
         self._angles.append(self.angle)
 

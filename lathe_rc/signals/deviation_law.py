@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the spindle's speed deviation in plain Python: formulas of time, run as a tachogram."""
+"""Laws of the spindle's speed deviation in plain Python: formulas of time, applied as a tachogram."""
 
 from abc import ABC, abstractmethod
 
@@ -11,11 +11,11 @@ from lathe_rc.signals import speed
 from lathe_rc.signals.checks import real_numbers
 from lathe_rc.signals.speed import SpeedLaw
 
-_MOST = 2**22  # points of a tachogram
+_MOST = 2**22  # largest number of points of a tachogram
 
 
 class DeviationLaw(ABC):
-    """Base of laws of the spindle's speed deviation; the constructor takes the numbers given in the scenario."""
+    """Base class of laws for the spindle's speed deviation; the constructor takes the numbers given in the scenario."""
 
     @abstractmethod
     def deviation(self, time: Array) -> Array:
@@ -23,7 +23,7 @@ class DeviationLaw(ABC):
 
 
 def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> SpeedLaw:
-    """Tabulate a deviation law as a piecewise-linear tachogram, held after its end.
+    """Tabulate a deviation law as a piecewise-linear tachogram whose last value is held.
 
     Args:
         nominal: nominal speed [rad/s].
@@ -32,7 +32,7 @@ def tabulated(nominal: float, law: DeviationLaw, step: float, end: float) -> Spe
         end: end of the tachogram [s], rounded up to a whole number of steps.
 
     Raises:
-        InputError: more points than allowed, or the law returns a value that is not a finite number.
+        InputError: there would be too many points, or the law returns a value that is not a finite number.
     """
     points = int(np.ceil(end / step)) + 1
     if points > _MOST:

@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import Array
-from lathe_rc.jit import kernel
-from lathe_rc.signals.encoder_errors import EncoderErrors, ErrorsTable, rate, seen, seen_along
+from lathe_rc.jit import inlined, kernel
+from lathe_rc.signals.edge_time import COUNT, EdgeTable, edge_table, pass_edge, passed
+from lathe_rc.signals.encoder_errors import EncoderErrors, ErrorsTable, place_of, rate, seen, seen_along
 from lathe_rc.signals.speed import SpeedLaw, evaluate_along
 
 Fields = tuple[npt.NDArray[Any], ...]
@@ -27,6 +28,8 @@ class EncoderTable(NamedTuple):
         errors: errors of disc and signals.
         history: the last angles, shape (speed_window,); sample n is at index n modulo its length.
         revolution: revolution of the last sample, shape (1,).
+        edges: time stamps of the edges, if there are any.
+        before: true angle [rad] and speed [rad/s] of the last sample, shape (2,).
     """
 
     step: float
@@ -37,6 +40,8 @@ class EncoderTable(NamedTuple):
     errors: ErrorsTable
     history: Array
     revolution: Array
+    edges: EdgeTable
+    before: Array
 
 
 @kernel
@@ -77,7 +82,10 @@ def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
             # Whole revolutions separately, so that they are exact for any number of counts.
             count = np.floor(angle[k] * counts / _TURN)
             whole = np.floor(count / counts)
-            angle[k] = whole * _TURN + (count - whole * counts) * _TURN / counts
+            part = count - whole * counts
+            if encoder.edges.clock > 0.0:
+                part += _since_edge(encoder, (first + k) * step, count, angle_true[k], speed_true[k])
+            angle[k] = whole * _TURN + part * _TURN / counts
             # The oldest angle of the ring is at the index of the new one.
             speed[k] = (angle[k] - history[place]) / (window * step)
             history[place] = angle[k]
@@ -85,6 +93,23 @@ def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
             index_pulse[k] = whole > before
             before = whole
     revolution[0] = before
+
+
+@inlined
+def _since_edge(encoder: EncoderTable, time: float, count: float, angle: float, speed: float) -> float:
+    """Return the part of a count known to be passed since the last edge, from the true motion up to a sample."""
+    edges, before = encoder.edges, encoder.before
+    if count > edges.last[COUNT]:
+        place = count * _TURN / encoder.counts
+        if encoder.errors.real:
+            place = place_of(encoder.errors, place, before[0], angle)
+        # The speed is linear between two samples; the root without cancellation.
+        acceleration, turned = (speed - before[1]) / encoder.step, angle - place
+        root = np.sqrt(max(speed * speed - 2.0 * acceleration * turned, 0.0))
+        since = min(max(2.0 * turned / (speed + root), 0.0), encoder.step)
+        pass_edge(edges, np.floor((time - since) / edges.clock) * edges.clock, count)
+    before[0], before[1] = angle, speed
+    return passed(edges, time)
 
 
 class Encoder:
@@ -98,13 +123,21 @@ class Encoder:
         speed_window: number of samples over which the measured speed is a difference of the measured angle; it lags
             by half of them. Before sample 0 the spindle is assumed to have turned at its nominal speed.
         errors: errors of disc and signals; none by default.
+        edge_clock: resolution of the time stamps of the edges [s]; 0: there are none (see
+            `lathe_rc.signals.edge_time`).
 
     Attributes:
         table: constants and state for `encode`.
     """
 
     def __init__(
-        self, law: SpeedLaw, step: float, counts: int, speed_window: int, errors: EncoderErrors = _PERFECT
+        self,
+        law: SpeedLaw,
+        step: float,
+        counts: int,
+        speed_window: int,
+        errors: EncoderErrors = _PERFECT,
+        edge_clock: float = 0.0,
     ) -> None:
         before = np.arange(-speed_window, 0, dtype=np.float64)
         # history[n % window] holds the angle of sample n; these are the samples before the first.
@@ -112,7 +145,20 @@ class Encoder:
         table = errors.table
         if table.real:
             seen_along(table, history, history)
-        self.table = EncoderTable(step, law.nominal, law.lines, law.tachogram, counts, table, history, np.array([-1.0]))
+        quantum = _TURN / max(counts, 1)
+        self.table = EncoderTable(
+            step=step,
+            nominal=law.nominal,
+            lines=law.lines,
+            tachogram=law.tachogram,
+            counts=counts,
+            errors=table,
+            history=history,
+            revolution=np.array([-1.0]),
+            # The edge of count 0 is passed at sample 0.
+            edges=edge_table(edge_clock, -quantum / law.nominal, -1.0, law.nominal / quantum),
+            before=np.array([-law.nominal * step, law.nominal]),
+        )
 
     def block(self, first: int, *samples: npt.NDArray[Any]) -> None:
         """Fill the encoder signals of a block, starting at sample ``first``.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Example of paper 002: reference and disturbance of its drive.
+"""Example from paper 002: reference and disturbance of the drive.
 
     r(t) = 1.1 - 0.1·e^{-t} - |cos 0.04πt|³      (17)
     f(t) = 0.5·(sin 0.04πt)²                     (18)
@@ -12,8 +12,8 @@ import numpy as np
 from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
 
-PERIOD = 25.0  #: [s]
-OMEGA = 0.04 * np.pi  #: [rad/s]
+PERIOD = 25.0  #: period of reference and disturbance [s]
+OMEGA = 0.04 * np.pi  #: angular frequency in eqs 17 and 18 [rad/s]
 
 
 @kernel

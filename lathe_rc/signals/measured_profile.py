@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Part profile from measured points, read from a CSV file."""
+"""Part profile through measured points, read from a CSV file."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,20 +16,20 @@ Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
-_FLATTEST = 0.01  # [µm] smallest height from peak to valley, except 0: no lathe turns a flatter form
-_MILLIMETRES = 2.0  # [µm] a smaller form may be in mm: few forms have 2 mm
+_FLATTEST = 0.01  # [µm] smallest peak-to-valley height other than 0: no lathe turns a flatter form
+_MILLIMETRES = 2.0  # [µm] a form with a smaller height may be in mm: few forms have 2 mm
 _METRES = 0.1  # [mm] a smaller range of heights may be in m
-_WIDE, _WIDER = 3.0, 15.0  # times the median step, and [°]: a gap is wider than both
+_WIDE, _WIDER = 3.0, 15.0  # [median steps] and [°]: a gap is wider than both
 _WIDEST = 120.0  # [°] widest gap of a valid form
-_SAME = 1e-3  # [µm] tolerance between the radius at 360° and at 0°
-_FARTHEST = 10_000.0  # [µm] largest offset of a whole form from the mean radius
+_SAME = 1e-3  # [µm] tolerance between the radii at 360° and at 0°
+_FARTHEST = 10_000.0  # [µm] largest offset of a complete form from the mean radius
 _TURN_OF_RADIANS = 6.3  # [°] a column with a smaller range is in another unit
-_CLOSEST = 1e-6  # [°, mm] smallest distance of two points: closer ones are errors, and their slope overflows
+_CLOSEST = 1e-6  # [°, mm] smallest distance between two points: closer ones are errors, and their slope would overflow
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Profile through measured points: a periodic cubic spline through each row, linear between rows.
+    """Profile through measured points: a periodic cubic spline through each row, and linear between rows.
 
     Args:
         angle: increasing angles [rad] in [0, 2π), shape (n,).
@@ -60,7 +60,7 @@ def _check_distances(path: Path, what: str, unit: str, places: Array) -> None:
 
 
 def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
-    """Check that the columns are not in another unit than their names state."""
+    """Check that the columns are not in units other than their names state."""
     low, high = angle_deg[0], angle_deg[-1]
     if high - low <= _TURN_OF_RADIANS:
         unit = "radians" if high > 1.0 else "revolutions"
@@ -83,7 +83,7 @@ def _check_units(path: Path, angle_deg: Array, radius_um: Array) -> None:
 
 
 def _gap(angle_deg: Array) -> tuple[float, float, float]:
-    """Return start and width of the widest step between two angles of a revolution, and the median step [°]."""
+    """Return the start and width of the widest step between two angles of a revolution, and the median step [°]."""
     steps = np.diff(np.append(angle_deg, angle_deg[0] + 360.0))
     place = int(np.argmax(steps))
     return float(angle_deg[place]), float(steps[place]), float(np.median(steps))
@@ -111,7 +111,7 @@ def _closed(path: Path, rows: Array) -> Array:
 
 
 def doubts(form: Measured) -> list[str]:
-    """List suspicious properties of a form, one line each: a gap in its angles, values as if in another unit."""
+    """List suspicious properties of a form, one line each: a gap in its angles, or values that suggest another unit."""
     said = []
     start, width, median = _gap(np.rad2deg(form.angle))
     if width > max(_WIDE * median, _WIDER):
@@ -134,11 +134,11 @@ def doubts(form: Measured) -> list[str]:
 def read_csv(path: Path) -> Measured:
     """Read a part profile from a CSV file.
 
-    Columns ``angle_deg`` [°], optionally ``height_mm`` [mm], ``radius_um`` (radius deviation) [µm], with rows in any
-    order. Every height must have the same angles. A row at 360° may repeat the row at 0°.
+    The columns are ``angle_deg`` [°], optionally ``height_mm`` [mm], and ``radius_um`` (radius deviation) [µm], with
+    rows in any order. Every height must have the same angles. A row at 360° may repeat the row at 0°.
 
     Raises:
-        InputError: the file is missing, malformed, in other units, contains a number that is not finite, repeats an
+        InputError: the file is missing, is malformed, has other units, contains a number that is not finite, repeats an
             angle, or covers only part of a revolution.
     """
     return _measured(read_text(path, "profile"), path)
@@ -146,7 +146,7 @@ def read_csv(path: Path) -> Measured:
 
 @lru_cache(maxsize=8)
 def _measured(text: str, path: Path) -> Measured:
-    """Parse a profile from CSV text; cached, since parsing takes longer than some cells run and is deterministic."""
+    """Parse a profile from CSV text; cached, since parsing takes longer than some cells run."""
     header, rows = parse_table(text, path, _HEADERS)
     if not rows.size:
         raise InputError(f"{path}: no points; give at least three angles")

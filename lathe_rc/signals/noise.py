@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers of a run: sensor noise, quantisation, and the lines of random disturbances."""
+"""Sensor noise, quantisation, and spectral lines of random disturbances."""
 
 import zlib
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from lathe_rc.jit import inlined, kernel
 
 Integers = npt.NDArray[np.int64]
 
-DRAWN = 8192  #: maximum count of numbers that a stream draws at once
+DRAWN = 8192  #: largest number of random numbers that a stream draws at once
 
 
 @inlined
@@ -29,7 +29,7 @@ class Drawn(NamedTuple):
 
     Attributes:
         values: numbers drawn in advance.
-        used: how many of them have been used, shape (1,).
+        used: number of values already used, shape (1,).
     """
 
     values: Array
@@ -37,12 +37,12 @@ class Drawn(NamedTuple):
 
 
 class NormalStream:
-    """Stream of normal random numbers; the values do not depend on how many are drawn at a time.
+    """Stream of normal random numbers that do not depend on how many are drawn at a time.
 
     Args:
         seed: the scenario's seed.
         name: name of the owner; selects an independent stream.
-        on: whether numbers are drawn at all.
+        on: whether any numbers are drawn.
 
     Attributes:
         drawn: numbers drawn in advance, for kernels.
@@ -58,7 +58,7 @@ class NormalStream:
         """Ensure that ``numbers`` random numbers are drawn in advance, up to 8192."""
         values, used = self.drawn
         if values.size and used[0] + numbers > values.size:
-            # Unused numbers move to the front, so that the order of use is the order of drawing for any block length.
+            # Unused numbers move to the front, so that numbers are used in the order drawn for any block length.
             left = values.size - used[0]
             values[:left] = values[used[0] :].copy()
             self._random.standard_normal(out=values[left:])
@@ -73,11 +73,11 @@ class NormalStream:
 
 
 def random_lines(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
-    """Return amplitude, frequency [rad/s] and phase [rad] of random sines of a given RMS, shape (3, lines).
+    """Return amplitude, frequency [rad/s] and phase [rad] of random sines with a given total RMS, shape (3, lines).
 
-    All lines have the same amplitude. The band from ``low`` to ``high`` is divided into as many equal sections, with
-    one line in each, whose frequency and phase are drawn from ``random``: the sum repeats only after many periods and
-    is nearly normally distributed.
+    All lines have the same amplitude. The band from ``low`` to ``high`` is divided into equal sections, one for
+    each line, whose frequency and phase are drawn from ``random``. The sum repeats only after many periods and is
+    nearly normally distributed.
     """
     frequency = low + (high - low) * (np.arange(lines) + random.random(lines)) / lines
     phase = random.uniform(0.0, 2.0 * np.pi, lines)
@@ -89,7 +89,7 @@ class SensorTable(NamedTuple):
 
     Attributes:
         noise: random numbers for the noise.
-        rms: of the noise, in the unit of the signal.
+        rms: RMS of the noise, in the unit of the signal.
         resolution: quantisation step, in the unit of the signal.
     """
 
@@ -100,7 +100,7 @@ class SensorTable(NamedTuple):
 
 @kernel
 def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
-    """Fill ``measured`` from ``true``, both of shape (n,), with noise and rounding; noise uses n drawn numbers."""
+    """Fill ``measured`` from ``true`` with noise and rounding, both of shape (n,), using n of the drawn numbers."""
     if sensor.rms > 0.0:
         noise, place = sensor.noise.values, sensor.noise.used[0]
         for k in range(true.size):
@@ -114,13 +114,13 @@ def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
 
 
 class Sensor:
-    """Sensor that adds white noise and rounds to a resolution; both are disabled by 0.
+    """Sensor that adds white noise and rounds to a resolution; 0 disables either.
 
     Args:
-        noise_rms: root mean square of the noise, in the unit of the signal.
+        noise_rms: RMS of the noise, in the unit of the signal.
         resolution: quantisation step, in the unit of the signal.
         seed: the scenario's seed.
-        name: name of the sensor; selects an independent noise.
+        name: name of the sensor; selects an independent noise stream.
 
     Attributes:
         table: constants and random numbers for `measure`.
@@ -135,6 +135,6 @@ class Sensor:
         self._stream.draw(samples)
 
     def measure(self, true: Array, measured: Array) -> None:
-        """Fill ``measured`` from ``true``, both of shape (n,), with noise and rounding."""
+        """Fill ``measured`` from ``true`` with noise and rounding, both of shape (n,)."""
         for piece in self._stream.draw_along(true.size):
             measure(self.table, true[piece], measured[piece])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Part profiles in plain Python: formulas of angle and height, run as a table like all profiles."""
+"""Part profiles in plain Python: formulas of angle and height, tabulated like all profiles."""
 
 from abc import ABC, abstractmethod
 
@@ -15,9 +15,10 @@ _CLOSED = 1e-9  # largest jump from 2π to 0, relative to the largest deviation
 
 
 class PartProfile(ABC):
-    """Base of part forms in plain Python; the constructor takes the numbers given in the scenario.
+    """Base class of part forms in plain Python; the constructor takes the numbers given in the scenario.
 
-    It implements `lathe_rc.signals.profile.Profile`; without heights of its own the form is constant along the part.
+    The class implements `lathe_rc.signals.profile.Profile`; unless `heights` is overridden, the form is constant along
+    the part.
     """
 
     @property
@@ -34,7 +35,7 @@ def checked(profile: PartProfile) -> ProfileTable:
     """Check a part profile and return its table.
 
     Raises:
-        InputError: heights out of order, or a deviation that is not finite, of another shape, or not periodic.
+        InputError: the heights are out of order, or the deviation is not finite, has another shape or is not periodic.
     """
     heights = np.asarray(profile.heights)
     if heights.ndim != 1 or not heights.size or not np.all(np.isfinite(heights)) or np.any(np.diff(heights) <= 0.0):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Part profiles as formulas: radius deviation against spindle angle and position along the part."""
+"""Part profiles as formulas: radius deviation as a function of spindle angle and position along the part."""
 
 import math
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Piston:
         ovality_middle: difference of the two diameters at the widest place [m].
         barrel: decrease of the radius from the widest place to the farther end of the skirt [m].
         length: length of the skirt [m].
-        widest: position of the widest place, from the start of the skirt [m].
+        widest: distance of the widest place from the start of the skirt [m].
     """
 
     ovality: float
@@ -67,7 +67,7 @@ class Piston:
 
     @property
     def heights(self) -> Array:
-        """65 heights along the skirt [m]; linear interpolation between them has an error of less than 3e-4 barrel."""
+        """65 heights along the skirt [m]; linear interpolation between them has an error below 3e-4·``barrel``."""
         return np.linspace(0.0, self.length, 65)
 
     def deviation(self, angle: Array, height: float) -> Array:
@@ -79,7 +79,7 @@ class Piston:
 
 @dataclass(frozen=True)
 class Polygon:
-    """Regular polygon with rounded corners, as the deviation from the mean of its smallest and largest radius.
+    """Regular polygon with rounded corners, as the deviation from the mean of its smallest and largest radii.
 
     Args:
         sides: number of sides, 3 or more.
@@ -106,7 +106,7 @@ class Polygon:
         return np.zeros(1)
 
     def deviation(self, angle: Array, height: float) -> Array:
-        """Return the radius of the outline less the mean of its extremes [m]; angle 0 is the middle of a side."""
+        """Return the radius of the outline minus the mean of its extremes [m]; angle 0 is the middle of a side."""
         half = math.pi / self.sides
         from_side = np.abs(np.mod(angle + half, 2 * half) - half)
         # The corner's circle touches the side at the foot of the normal through its centre.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Part profiles tabulated for the control cell, and their demand on a drive.
+"""Part profiles tabulated for the control cell, and the demands they place on a drive.
 
 The table is a periodic cubic spline in the angle with linear interpolation along the part, which also gives the
-derivatives for the feasibility check. The table of a profile file is cached on disk beside the compiled code: loading
-SciPy's interpolation takes a sixth of the time that `lathe run` needs until its first block, and is only required to
-compute the table, which is always the same.
+derivatives for the feasibility check. The table of a profile file is always the same, so it is cached on disk beside
+the compiled code: loading SciPy's interpolation, needed only to compute the table, takes a sixth of the time that
+`lathe run` needs until its first block.
 """
 
 import hashlib
@@ -31,8 +31,9 @@ _MOST = 32  # maximum number of cached tables
 def kept(content: bytes, make: Callable[[], Array]) -> Array:
     """Return the array that ``make`` computes from ``content``, or a copy cached on disk by the same libraries.
 
-    Results are valid for this type of processor only: the libraries select their instructions by it, which affects the
-    last bits. A damaged file is reported and computed again; if the disk cannot be written, nothing is cached.
+    Results are valid only for this type of processor, since the instructions that the libraries select for it affect
+    the last bits. A damaged file is reported and its content computed again; if the disk cannot be written,
+    nothing is cached.
     """
     made_by = f"{np.__version__} {scipy.__version__} {llvmlite.binding.get_host_cpu_name()}".encode()
     path = cache_folder() / "tables" / f"{hashlib.sha256(made_by + content).hexdigest()}.npy"
@@ -55,7 +56,7 @@ _TURN = 2.0 * np.pi
 
 @inlined
 def _height(feed: float, start: float, part: int, angle: float) -> float:
-    """Return the position along the part [m] at a spindle angle [rad], see `height_along`."""
+    """Return the position along the part [m] at a spindle angle [rad] (see `height_along`)."""
     turns = angle / _TURN
     if part > 0:
         turns -= part * np.floor(turns / part)
@@ -67,7 +68,7 @@ def height_along(feed: float, start: float, part: int, angle: Array, height: Arr
     """Fill the position along the part [m] at spindle angles [rad], shape (n,).
 
     Args:
-        feed: [m/rev].
+        feed: feed along the part [m/rev].
         start: position where the part begins [m].
         part: revolutions after which the next part begins; 0 for one endless part.
         angle: spindle angles [rad].
@@ -79,9 +80,9 @@ def height_along(feed: float, start: float, part: int, angle: Array, height: Arr
 
 @inlined
 def _cubic(row: Array, place: float) -> float:
-    """Evaluate a row of a table, shape (n, 4), at ``place`` [interval]; n is a power of two."""
+    """Evaluate a row of a table, shape (n, 4), at ``place`` [intervals]; n is a power of two."""
     whole = np.floor(place)
-    # Unsigned, since Numba checks signed indices for negative ones.
+    # Unsigned, since Numba checks signed indices for negative values.
     j = np.uint64(np.int64(whole)) & np.uint64(row.shape[0] - 1)
     u = place - whole
     return float(((row[j, 0] * u + row[j, 1]) * u + row[j, 2]) * u + row[j, 3])
@@ -101,7 +102,7 @@ def _cubic_derivatives(c: Array, u: float) -> tuple[float, float, float]:
 def deviation_along(heights: Array, table: Array, angle: Array, height: Array, deviation: Array) -> None:
     """Fill the radius deviation [m] at angles [rad] and heights [m], shape (n,), from the arrays of a `ProfileTable`.
 
-    Cubic in the angle, linear in the height, and beyond the ends of the part as at its ends.
+    The deviation is cubic in the angle and linear in the height; beyond the ends of the part it is that at the ends.
     """
     per_radian = table.shape[1] / _TURN
     last = heights.size - 1
@@ -145,7 +146,7 @@ def derivatives_at(
         feed: see `height_along`.
         start: see `height_along`.
         part: see `height_along`.
-        angle: [rad].
+        angle: spindle angle [rad].
 
     Returns:
         r [m], dr/dφ [m/rad], d²r/dφ² [m/rad²]. The first derivative includes the slope along the part.
@@ -173,18 +174,18 @@ def derivatives_at(
 
 @dataclass(frozen=True)
 class Demand:
-    """Demand of a profile on a drive, as the maximum over the part."""
+    """Demands of a profile on a drive, as maxima over the part."""
 
     stroke: float  #: largest displacement from the middle [m]
-    velocity: float  #: [m/s]
-    acceleration: float  #: [m/s²]
+    velocity: float  #: largest velocity [m/s]
+    acceleration: float  #: largest acceleration [m/s²]
 
 
 class _ByContent:
-    """Cache key of a profile, equal for profiles of equal content.
+    """Cache key of a profile, equal for profiles with equal content.
 
     Args:
-        profile: the profile.
+        profile: profile to look up.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -201,13 +202,13 @@ class _ByContent:
 @lru_cache(maxsize=8)
 def _table(given: _ByContent) -> "ProfileTable":
     """Return the table of a profile; the table of a file is also cached on disk."""
-    if isinstance(given.profile, Measured):  # a file: others vary with parameters, and a sweep would keep thousands
+    if isinstance(given.profile, Measured):  # others vary with parameters, and a sweep would cache thousands
         return ProfileTable(given.profile, made=partial(kept, given.content))
     return ProfileTable(given.profile)
 
 
 def tabulated(profile: Profile) -> "ProfileTable":
-    """Return the table of a profile, which equal profiles share; it is read-only and takes 20 ms or more to make."""
+    """Return the read-only table of a profile, shared by equal profiles, since computing it takes 20 ms or more."""
     return _table(_ByContent(profile))
 
 
@@ -217,7 +218,7 @@ class ProfileTable:
     Args:
         profile: desired form.
         points: intervals of the periodic cubic spline per revolution, a power of two.
-        made: returns the array of a given function, possibly from a cache; None: the function is called.
+        made: function that returns the array of a given function, possibly from a cache; None to call that function.
 
     Attributes:
         heights: positions along the part [m], shape (m,).
@@ -233,7 +234,7 @@ class ProfileTable:
         self.table.flags.writeable = False
 
     def demand(self, speed: float, acceleration: float, feed: float) -> Demand:
-        """Return the demand at spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], with ``feed`` in m/rev."""
+        """Return the demands at a spindle ``speed`` [rad/s] and ``acceleration`` [rad/s²], with ``feed`` in m/rev."""
         return _demand(self, speed, acceleration, feed)
 
 
@@ -251,7 +252,7 @@ def _splines(profile: Profile, points: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _demand(form: ProfileTable, speed: float, acceleration: float, feed: float) -> Demand:
-    """Return the demand of a table (implements `ProfileTable.demand`), cached for the checks of similar cells."""
+    """Return the demands of a table (implements `ProfileTable.demand`), cached for the checks of similar cells."""
     per_radian = form.table.shape[1] / _TURN
     value, slope = form.table[..., 3], form.table[..., 2] * per_radian
     curvature = 2.0 * form.table[..., 1] * per_radian**2

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spindle speed laws as closed forms of time.
+"""Spindle speed laws as closed-form functions of time.
 
-A closed form depends on time alone, so angle, speed and acceleration at sample n do not depend on the
-samples before it:
+The laws depend on time alone, so angle, speed and acceleration at sample n do not depend on the samples before it:
 
     Ω(t) = Ω0·(1 + Σ a_i·sin(ω_i·(t − t_i) + ψ_i) + d(t)),   line i starting at t_i,
 
-where d(t) is a piecewise-linear tachogram. A band-limited random deviation is a sum of such lines with
-seeded phases. Source: paper 000, eq. (11) and the deviation of its Fig. 6.
+where d(t) is a piecewise-linear tachogram. A band-limited random deviation is a sum of such lines with seeded
+phases. Source: paper 000, eq. (11) and the deviation of its Fig. 6.
 """
 
 from dataclasses import dataclass, field
@@ -29,8 +28,8 @@ _PACKED_LINES = 4  # rows of SpeedLaw.lines: amplitude [1], frequency [rad/s], p
 def evaluate(t: float, nominal: float, lines: Array, tachogram: Array) -> tuple[float, float, float]:
     """Return angle [rad], speed [rad/s] and acceleration [rad/s²] at time ``t`` [s].
 
-    ``lines`` is (4, n): relative amplitude, frequency, phase, start. ``tachogram`` is (3, m): time,
-    relative deviation, its integral up to that time.
+    ``lines`` has shape (4, n): relative amplitude, frequency, phase and start. ``tachogram`` has shape (3, m): time,
+    relative deviation, and the integral of the deviation up to that time.
     """
     angle, speed, acceleration = t, 1.0, 0.0
     for i in range(lines.shape[1]):
@@ -88,8 +87,8 @@ class SpeedLaw:
 
     Args:
         nominal: nominal speed Ω0 [rad/s].
-        lines: rows relative amplitude [1], frequency [rad/s], phase [rad], start [s], shape (4, n).
-        tachogram: rows time [s], relative deviation [1], its integral from time 0 [s], shape (3, m).
+        lines: rows relative amplitude [1], frequency [rad/s], phase [rad] and start [s], shape (4, n).
+        tachogram: rows time [s], relative deviation [1] and its integral from time 0 [s], shape (3, m).
     """
 
     nominal: float
@@ -106,52 +105,52 @@ class SpeedLaw:
         return SpeedLaw(self.nominal, lines, self.tachogram if self.tachogram.size else other.tachogram)
 
     def at(self, t: npt.ArrayLike) -> Array:
-        """Return the rows angle [rad], speed [rad/s], acceleration [rad/s²] at times ``t`` [s], shape (3, n)."""
+        """Return the rows angle [rad], speed [rad/s] and acceleration [rad/s²] at times ``t`` [s], shape (3, n)."""
         times = np.atleast_1d(np.asarray(t, dtype=np.float64))
         return _evaluate_many(times, self.nominal, self.lines, self.tachogram)
 
     def speed_range(self, duration: float = np.inf) -> tuple[float, float]:
-        """Return the lowest and highest speed [rad/s] within ``duration`` [s]; for an endless run a safe bound."""
+        """Return the lowest and highest speed [rad/s] within ``duration`` [s], or safe bounds for an endless run."""
         lines, tachogram = self.lines, self.tachogram
         amplitude = float(np.abs(lines[0]).sum())
         below, above = (tachogram[1].min(), tachogram[1].max()) if tachogram.size else (0.0, 0.0)
         bound = self.nominal * (1 + below - amplitude), self.nominal * (1 + above + amplitude)
         fastest = float(lines[1].max(initial=0.0))
-        points = duration * fastest * 8  # about 50 points a period of the fastest line
+        points = duration * fastest * 8  # about 50 points per period of the fastest line
         if not lines.size or not points < 1e7:
             return bound
         times = np.linspace(0.0, duration, int(points) + 2)
-        # A line that starts at a phase makes the speed jump: evaluate it on both sides.
+        # A line that does not start from 0 makes the speed jump, so both sides are evaluated.
         kinks = np.concatenate((tachogram[0], lines[3], np.nextafter(lines[3], 0.0)))
         speed = self.at(np.union1d(times, kinks[kinks < duration]))[1]
-        # Between two points a sum of lines differs from their chord by at most h²/8 of its second derivative.
+        # Between two points, a sum of lines differs from its chord by at most h²/8 times its second derivative.
         sag = self.nominal * float(np.abs(lines[0] * lines[1] ** 2).sum()) * (times[1] - times[0]) ** 2 / 8
         return max(bound[0], speed.min() - sag), min(bound[1], speed.max() + sag)
 
     def largest_acceleration(self) -> float:
-        """Return an upper bound of the magnitude of dΩ/dt [rad/s²]."""
+        """Return an upper bound on the magnitude of dΩ/dt [rad/s²]."""
         bound = float(np.abs(self.lines[0] * self.lines[1]).sum())
         if self.tachogram.shape[1] > 1:
             bound += float(np.abs(np.diff(self.tachogram[1]) / np.diff(self.tachogram[0])).max())
         return self.nominal * bound
 
     def samples_until(self, angle: float, step: float) -> int:
-        """Return the first sample index at which the true angle reaches ``angle`` [rad]; ``step`` in s.
+        """Return the first sample index at which the true angle reaches ``angle`` [rad]; ``step`` is in s.
 
         Raises:
-            InputError: the spindle may stop or turn back, so the angle may never be reached; or the number of
+            InputError: the spindle may stop or turn back, so the angle might never be reached, or the number of
                 samples is too large to be counted.
         """
         lowest = self.speed_range()[0]
         horizon = angle / lowest if lowest > 0.0 else 2.0 * angle / self.nominal
         if lowest <= 0.0 and self.at(horizon)[0, 0] >= angle:
-            # Only the time until the angle is reached matters: the spindle may turn back later.
+            # Only the time until the angle is reached matters; the spindle may turn back later.
             lowest = self.speed_range(horizon)[0]
         if lowest <= 0.0:
             raise InputError(f"spindle speed falls to {lowest:.4g} rad/s; allowed: above 0 (reduce the deviations)")
         if not horizon / step < _MOST_SAMPLES:
             raise InputError(f"that takes up to {horizon / step:.3g} samples; allowed: below {_MOST_SAMPLES}")
-        # The angle is increasing up to the horizon, so that bisection is possible.
+        # The angle increases up to the horizon, so bisection is possible.
         low, high = 0, int(horizon / step) + 2
         while low < high:
             middle = (low + high) // 2
@@ -163,7 +162,7 @@ class SpeedLaw:
 
 
 def constant(nominal: float) -> SpeedLaw:
-    """Return a speed law of constant speed ``nominal`` [rad/s]."""
+    """Return a law with the constant speed ``nominal`` [rad/s]."""
     return SpeedLaw(nominal)
 
 
@@ -180,9 +179,9 @@ def harmonic(nominal: float, amplitude: Array, frequency: Array, phase: Array, s
 
 
 def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
-    """Return a law with a piecewise-linear relative ``deviation`` [1] at increasing ``time`` [s].
+    """Return a law with a relative ``deviation`` [1], linear between increasing times ``time`` [s], both of shape (n,).
 
-    The arrays have the shape (n,). The deviation is held before the first and after the last time.
+    The deviation is constant before the first and after the last time.
     """
     stacked("tachogram", times=time, deviations=deviation)
     if time.size and (time[0] < 0.0 or np.any(np.diff(time) <= 0.0)):
@@ -197,7 +196,7 @@ def tachogram(nominal: float, time: Array, deviation: Array) -> SpeedLaw:
 def band_limited_random(nominal: float, rms: float, low: float, high: float, lines: int, seed: int) -> SpeedLaw:
     """Return a speed law with a random relative deviation of ``rms`` [1] between ``low`` and ``high`` [rad/s].
 
-    Frequencies and phases of the ``lines`` are drawn from ``seed``, see `lathe_rc.signals.noise.random_lines`.
+    Frequencies and phases of the ``lines`` sines are drawn from ``seed``, see `lathe_rc.signals.noise.random_lines`.
     """
     if rms == 0.0:
         return SpeedLaw(nominal)

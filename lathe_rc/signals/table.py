@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers in CSV files, with the same error messages for all readers."""
+"""Tables of numbers in CSV files, with uniform error messages for all readers."""
 
 import csv
 import errno
@@ -66,10 +66,10 @@ def parse_table(
 
     Args:
         text: content of the file.
-        path: path of the file, for messages.
+        path: path of the file, for error messages.
         headers: allowed headers.
         since_first: whether the first value of the first column is subtracted from the column before rounding to a
-            double: for seconds since 1970 a double has a resolution of 0.2 µs.
+            double, whose resolution for seconds since 1970 is only 0.2 µs.
 
     Returns:
         Header and rows, shape (n, columns).
@@ -110,7 +110,7 @@ def write_table(path: Path, header: str, rows: Array, comment: str = "", *, digi
         header: names of the columns, separated by commas.
         rows: shape (n, columns).
         comment: first line of the file; empty for none.
-        digits: significant digits of a number.
+        digits: number of significant digits.
 
     Raises:
         InputError: the path is not writable.

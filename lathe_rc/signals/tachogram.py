@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tachogram files: spindle speed over time in CSV with the columns time_s and rpm, linear between the rows.
+"""Tachogram files: spindle speed over time as CSV with the columns time_s and rpm, linear between rows.
 
-Time 0 is at the first row, as that of counts is at the first reading: the absolute time of the file is ignored.
+Time 0 is at the first row, as it is at the first reading of encoder counts; the file's absolute time is ignored.
 """
 
 from pathlib import Path
@@ -16,16 +16,16 @@ Array = npt.NDArray[np.float64]
 
 _COLUMNS = ("time_s", "rpm")
 _UNITS = {"revolutions per second (Hz)": 60.0, "rad/s": 30.0 / np.pi, "degrees per second": 1.0 / 6.0}  # in rpm
-_NEAR = 1.2  # largest ratio of the typical speed in another unit to the nominal speed at which that unit is suspected
-_ROOM = 1e-6  # share of the tolerance reserved for the rounding of the file
-_FIRST_LOOK = 256  # points that are checked together; doubled after each check without an end of the line
+_NEAR = 1.2  # a unit is suspected if it brings the typical speed within this ratio of the nominal speed
+_ROOM = 1e-6  # fraction of the tolerance reserved for rounding in the file
+_FIRST_LOOK = 256  # number of points checked together; doubled after each check in which the line does not end
 
 
 def read(path: Path) -> tuple[Array, Array]:
     """Read times after the first row [s] and speeds [1/min] from a tachogram file, shape (n,) each.
 
     Raises:
-        InputError: the file is missing or malformed, times do not increase, or a speed is not above 0.
+        InputError: the file is missing or malformed, the times do not increase, or a speed is not above 0.
     """
     _, rows = read_table(path, [_COLUMNS], "tachogram", since_first=True)
     time, rpm = rows[:, 0].copy(), rows[:, 1].copy()
@@ -49,10 +49,10 @@ def read(path: Path) -> tuple[Array, Array]:
 
 
 def check_unit(path: Path, rpm: Array, nominal_rpm: float) -> None:
-    """Check that speeds are not in another unit than 1/min.
+    """Check that speeds are not in a unit other than 1/min.
 
     Args:
-        path: path of the file, for the message.
+        path: path of the file, for the error message.
         rpm: speeds of the file, shape (n,).
         nominal_rpm: nominal speed [1/min].
 
@@ -86,18 +86,18 @@ def write(path: Path, time: Array, rpm: Array, comment: str) -> None:
 class Thinner:
     """Downsample a long record, chunk by chunk, so that straight lines between the points stay within a tolerance.
 
-    Each line, starting at the last selected point, is as long as possible: the next selected point is the last one that
-    a line can reach while it passes all points in between within the tolerance.
+    Each line starts at the last selected point and is as long as possible: the next selected point is the last one that
+    a line can reach while staying within the tolerance of all points in between.
 
     Args:
-        tolerance: greatest distance of the lines from any point, in the unit of the values; above 0.
+        tolerance: largest distance of the lines from any point, in the unit of the values; above 0.
     """
 
     def __init__(self, tolerance: float) -> None:
         self._tolerance = tolerance * (1.0 - _ROOM)
         self._picked: list[tuple[float, float]] = []
         self._reached: tuple[float, float] | None = None  # the last point that a line from the selected point can reach
-        self._time, self._value = np.empty(0), np.empty(0)  # points after that, or after the selected point
+        self._time, self._value = np.empty(0), np.empty(0)  # points after it, or else after the selected point
         self._open()
 
     def add(self, time: Array, value: Array) -> None:
@@ -121,7 +121,7 @@ class Thinner:
         self._seen, self._low, self._high = 0, -np.inf, np.inf
 
     def _drop(self, count: int) -> None:
-        """Drop the given number of points after the selected or the reachable one."""
+        """Drop the given number of points after the selected or reachable point."""
         self._time, self._value = self._time[count:], self._value[count:]
 
     def _pick(self) -> None:
@@ -132,7 +132,7 @@ class Thinner:
         self._open()
 
     def _look(self) -> None:
-        """Check the remaining points, and select one wherever no line passes all of them."""
+        """Check the remaining points, and select one wherever no line passes within the tolerance of all of them."""
         count = _FIRST_LOOK
         while self._seen < self._time.size:
             time, value = self._time[self._seen :][:count], self._value[self._seen :][:count]
@@ -141,7 +141,7 @@ class Thinner:
             high = np.minimum(np.minimum.accumulate((rise + self._tolerance) / since), self._high)
             closed = np.flatnonzero(low > high)
             end = int(closed[0]) if closed.size else since.size
-            # A line to a point passes the earlier points if its slope is between ``low`` and ``high`` of that point.
+            # A line to a point passes the earlier points if its slope is between ``low`` and ``high`` at that point.
             slope = rise[:end] / since[:end]
             fits = np.flatnonzero((low[:end] <= slope) & (slope <= high[:end]))
             self._seen += end

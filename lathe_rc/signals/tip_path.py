@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Path of a tool with a tip that is round across the spindle axis, and the slope at which its flank would rub.
+"""Path of a tool whose tip is round across the spindle axis, and the slope at which the tool's flank would rub.
 
-A form of radius r = R + deviation falls or rises by the angle β, tan β = r'/r. A round tip of radius ρ touches it
-beside its foremost point, where both have the same normal. So its centre follows the parallel curve of the form,
+A form of radius r = R + deviation falls or rises at the angle β, tan β = r'/r. A round tip of radius ρ touches the form
+beside the tip's foremost point, where both have the same normal. The centre of the tip thus follows a parallel curve,
 
     centre at the polar angle  φ + atan2(-ρ·sin β, r + ρ·cos β),  radius  √((r + ρ·cos β)² + (ρ·sin β)²)
 
-and the path is that radius less R + ρ. A tip that follows the form itself cuts too deep by ρ·(1/cos β - 1), if ρ is
-small against the radius of curvature.
+and the path is that radius minus R + ρ. A tip that follows the form itself cuts too deep by ρ·(1/cos β - 1), if ρ is
+small compared with the radius of curvature.
 
-The clearance angle is between the flank behind the edge and the cut surface. The fresh surface is behind the edge
-too, and is higher where the form falls towards the edge: the flank rubs where tan β < -tan(clearance).
+The clearance angle is the angle between the flank behind the edge and the cut surface. The fresh surface, also behind
+the edge, is higher where the form falls towards the edge: the flank rubs where tan β < -tan(clearance).
 """
 
 import math
@@ -25,12 +25,12 @@ from lathe_rc.signals.profile import Profile
 from lathe_rc.signals.profile_table import ProfileTable
 
 _TURN = 2.0 * np.pi
-_POINTS = 8192  # points of the form, between which its path is interpolated
+_POINTS = 8192  # points of the form between which the path is interpolated
 
 
 @dataclass(frozen=True)
 class TipPath:
-    """Path of a round tip that turns a form (implements `Profile`).
+    """Path of a round tip that turns a given form (implements `Profile`).
 
     Attributes:
         form: form of the part.
@@ -38,7 +38,7 @@ class TipPath:
         tip: ρ, radius of the tip [m].
 
     Raises:
-        InputError: a radius that is not positive; in `deviation`: the form has a concavity too narrow for the tip.
+        InputError: a radius is not positive, or, in `deviation`, the form has a concavity too narrow for the tip.
     """
 
     form: Profile
@@ -100,7 +100,7 @@ class Fall:
 
 
 def steepest_fall(form: ProfileTable, radius: float, feed: float) -> Fall:
-    """Find the steepest fall towards the edge on a part of ``radius`` [m], along a path of ``feed`` [m/rev]."""
+    """Find the steepest fall towards the edge on a part of ``radius`` [m], along a path with ``feed`` [m/rev]."""
     points = form.table.shape[1]
     value, slope = form.table[..., 3], form.table[..., 2] * points / _TURN
     along = np.zeros_like(value)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vibration between tool and part.
 
-A closed form of time, so that sample n does not depend on the samples before it:
+The vibration is a closed-form function of time, so sample n does not depend on the samples before it:
 
     Δx(t) = Σ a_i·sin(ω_i·t + ψ_i)
 
@@ -22,7 +22,7 @@ from lathe_rc.signals.noise import random_lines
 def evaluate(first: int, step: float, lines: Array, position: Array, velocity: Array) -> None:
     """Fill displacement [m] and velocity [m/s] of a vibration, starting at sample ``first``, shape (n,); ``step`` in s.
 
-    ``lines`` is (3, m): amplitude [m], frequency [rad/s], phase [rad].
+    ``lines`` has shape (3, m): amplitude [m], frequency [rad/s] and phase [rad].
     """
     for k in range(position.size):
         t = (first + k) * step
@@ -36,21 +36,21 @@ def evaluate(first: int, step: float, lines: Array, position: Array, velocity: A
 
 
 def harmonic(amplitude: Array, frequency: Array, phase: Array) -> Array:
-    """Return vibration lines of given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], shape (3, n).
+    """Return vibration lines with given ``amplitude`` [m], ``frequency`` [rad/s] and ``phase`` [rad], shape (3, n).
 
     Raises:
-        InputError: arrays of different lengths.
+        InputError: the arrays differ in length.
     """
     return stacked("vibration", amplitudes=amplitude, frequencies=frequency, phases=phase)
 
 
 def band_limited_random(rms: float, low: float, high: float, lines: int, random: np.random.Generator) -> Array:
-    """Return lines of a random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s], see `random_lines`.
+    """Return lines of a random vibration of ``rms`` [m] between ``low`` and ``high`` [rad/s] (see `random_lines`).
 
-    For an RMS of 0 there are no lines.
+    There are no lines for an RMS of 0.
 
     Raises:
-        InputError: an invalid band.
+        InputError: the band is invalid.
     """
     if rms == 0.0:
         return np.empty((3, 0))

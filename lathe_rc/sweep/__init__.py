@@ -15,7 +15,9 @@ NUMBERS = (
     "tool.first_rms_error",
     "tool.in_tolerance_from",
     "margin",
+    "drive_margin",
 )  #: columns of a row that can be a goal of a tuning or a page
+OF_LEARNING = ("margin", "drive_margin")  #: those of a cell that learns; the others need a tool
 STATISTICS = ("max", "rms", "mean", "peak_to_valley")  #: of a signal in the last revolution
 SAMPLERS = ("tpe", "cmaes", "nsga2")  #: of a tuning
 BATCH = 8  #: trials that are asked for at a time

@@ -22,7 +22,7 @@ def _names(formula: str) -> set[str]:
         tree = ast.parse(formula.strip(), mode="eval")
     except SyntaxError:
         raise InputError(f"formula {shown(formula)!r}; allowed: targets and numbers with + - * / ** ( )") from None
-    # NODE.PARAM parses as an attribute of a name: only the full attribute is a target, neither NODE nor a function.
+    # NODE.PARAM parses as an attribute of a name. Only the full attribute is a target; NODE or a function is not.
     inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
     named = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)]
@@ -30,7 +30,7 @@ def _names(formula: str) -> set[str]:
 
 
 def ordered(ties: Mapping[str, str]) -> list[str]:
-    """Return the derived parameters in the order of evaluation, each after the ones that it depends on.
+    """Return the derived parameters in the order of evaluation, each after those that it depends on.
 
     Raises:
         InputError: the formulas depend on one another in a cycle.
@@ -52,12 +52,12 @@ class Formulas:
         self._named = {target: _names(formula) for target, formula in ties.items()}
         for names in self._named.values():
             for name in names:
-                scenario.parameter(name)  # refuses an unknown one
+                scenario.parameter(name)  # rejects an unknown parameter
         self._evaluator = simpleeval.SimpleEval(functions=_FUNCTIONS)
         self._parsed = {target: self._evaluator.parse(formula) for target, formula in ties.items()}
 
     def add_to(self, values: dict[str, Value]) -> dict[str, Value]:
-        """Add the derived values to the values of a cell, in place, and return them.
+        """Add the derived values to the values of a cell in place; return the cell's values.
 
         Raises:
             InputError: a formula cannot be evaluated.
@@ -66,7 +66,7 @@ class Formulas:
             known: dict[str, Any] = {"pi": math.pi}
             for name in self._named[target]:
                 node, dot, of = name.partition(".")
-                # The cell's values take precedence: they contain the derived targets that this one depends on.
+                # The cell's values take precedence: they contain the derived targets that this target depends on.
                 found = values.get(name, self._scenario.value(name))
                 if isinstance(found, list):
                     found = cast("Value", [values.get(f"{name}[{k}]", each) for k, each in enumerate(found)])

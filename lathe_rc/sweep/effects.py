@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects of parameters on a goal, computed from the rows of a sweep, and the yield: the share of cells within a limit.
 
-With y the goal of the n cells that have one and the parameter's values in m bins b of n_b cells each,
+Let y be the goal of the n cells that have one, with the parameter's values in m bins b of n_b cells each:
 
     between = Σ n_b·(mean_b(y) - mean(y))²      within = Σ_b Σ (y - mean_b(y))²      total = between + within
     share   = (between - (m - 1)·within/(n - m)) / total
 
-is the share of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935). The share that m
-random bins would explain is subtracted, so that the result may be slightly negative. A complete grid has no random
-part, and share = between/total with one bin per value is exact: the main effect. SALib's measures for given samples
-support neither strings nor grids, and are no more accurate: for Ishigami's function with 64, 256 and 1024 points
-(Sobol) the RMS error of the shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 with RBD-FAST and 0.20, 0.13, 0.08 with
-DELTA.
+The share is the fraction of the variance of y that the parameter explains by itself (first order; ε², Kelley 1935). The
+fraction that m random bins would explain is subtracted, so that the result may be slightly negative. A complete grid
+has no random part: with one bin per value, share = between/total is exact and equals the main effect. SALib's measures
+for given samples support neither strings nor grids, and are no more accurate: for Ishigami's function with 64, 256 and
+1024 points (Sobol) the RMS error of the shares is 0.28, 0.06, 0.02 here, 0.16, 0.07, 0.02 with RBD-FAST and 0.20, 0.13,
+0.08 with DELTA.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 Samples = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_MOST_BINS = 32  # of a variance share
+_MOST_BINS = 32  # largest number of bins for a variance share
 LEAST = 8  #: fewest cells from which effects are computed
 _WIDE = 30.0  # ratio of the largest to the smallest value above which an axis is logarithmic
 
@@ -101,7 +101,7 @@ def bins(axis: Axis, exact: int, most: int) -> Bins:
         edges = np.linspace(scaled[0], scaled[-1], most + 1)
         with np.errstate(invalid="ignore"):
             place = np.searchsorted(edges, np.log(axis.values) if axis.log else axis.values, side="right") - 1
-        index = np.where(np.isfinite(axis.values), np.minimum(place, most - 1), -1)  # the last bin has both its ends
+        index = np.where(np.isfinite(axis.values), np.minimum(place, most - 1), -1)  # the last bin includes both ends
         low, high = edges[:-1], edges[1:]
         middle = (low + high) / 2
     if axis.log:
@@ -117,7 +117,7 @@ def is_grid(axes: Sequence[Axis], goal: Samples) -> bool:
     free = [axis for axis in axes if not axis.tied]
     if not free or not np.isfinite(goal).all() or not all(np.isfinite(axis.values).all() for axis in free):
         return False
-    # Most samples end here, before their rows are sorted. In floating point the product cannot overflow.
+    # Most samples return here, before their rows are sorted. The product is in floating point, so it cannot overflow.
     if float(np.prod([float(axis.distinct.size) for axis in free])) > goal.size:
         return False
     combinations, counts = np.unique(np.stack([axis.values for axis in free]), axis=1, return_counts=True)
@@ -136,8 +136,8 @@ class Effect:
     """Effect of a parameter on a goal.
 
     Attributes:
-        share: share of the goal's variance explained by the parameter alone; None: too few cells, or a constant goal.
-        rank: Spearman's rank correlation, -1 to 1; None also for strings without an order.
+        share: share of the goal's variance explained by the parameter alone; None for too few cells or a constant goal.
+        rank: Spearman's rank correlation, -1 to 1; None likewise, and for strings without an order.
     """
 
     share: float | None
@@ -166,7 +166,7 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
     total = float(((y - y.mean()) ** 2).sum())
     between = float((counts * (means - y.mean()) ** 2).sum())
     if not exact:
-        if counts.size >= y.size:  # one cell in each bin: no variance within them to estimate chance from
+        if counts.size >= y.size:  # one cell in each bin: no variance within bins from which to estimate chance
             return Effect(None, None)
         between -= (counts.size - 1) * max(total - between, 0.0) / (y.size - counts.size)
     ordered = not axis.texts or set(axis.texts) == {"false", "true"}
@@ -176,7 +176,7 @@ def effect(axis: Axis, goal: Samples, *, exact: bool = False) -> Effect:
 
 @dataclass(frozen=True, eq=False)
 class Yield:
-    """Yield of a sweep: share of the cells that are within a limit of the goal.
+    """Yield of a sweep: share of the cells whose goal is within a limit.
 
     Attributes:
         goal: goal values of all cells that have one, ascending.
@@ -203,8 +203,8 @@ class Yield:
         return int(np.searchsorted(self.goal, limit, side="right"))
 
     def point(self, share: float) -> float | None:
-        """Return the tightest limit met by a given share of all cells; None: too few cells have a goal value."""
-        needed = int(np.ceil(share * self.cells - 1e-9))  # rounding must not ask for one cell more
+        """Return the tightest limit met by a given share of all cells; None if too few cells have a goal value."""
+        needed = int(np.ceil(share * self.cells - 1e-9))  # rounding must not require an additional cell
         if not 0 < needed <= self.goal.size:
             return None
         return float(self.goal[self.goal.size - needed] if self.above else self.goal[needed - 1])

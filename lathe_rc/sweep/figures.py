@@ -3,7 +3,8 @@
 
 Data sets: ``pair-I-J`` (I < J) has one row per pair of bins of two axes, ``one-I`` one row per bin of one axis, and
 ``bins-I`` the positions of the bins. In the rows, a and b are bin indices; n is the number of cells, and d the number
-of cells with a goal value; m, s and l are the median, the smallest and the largest goal, p and q its 5 and 95 % points.
+of cells with a goal value; m, s and l are the median, the smallest and the largest goal, and p and q its 5 and 95 %
+quantiles.
 """
 
 import math
@@ -17,14 +18,14 @@ from numpy.typing import NDArray
 from lathe_rc.sweep.effects import Axis, Bins, Effect, Index, Samples, Yield, is_wide
 from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 
-GOOD_TO_BAD = ("#2f7fd0", "#9460b4", "#cf5a3c", "#d99a1b")  #: seen on white and on black
+GOOD_TO_BAD = ("#2f7fd0", "#9460b4", "#cf5a3c", "#d99a1b")  #: visible on white and on black
 _LINE = "#2f8fae"
 _MARKS = ("#2f7fd0", "#9460b4", "#cf5a3c")
 _TALL, _FLAT = 360, 300  # [px]
-_BAR = 46  # [px] a parameter
-_POINTS = 400  # of a yield curve
+_BAR = 46  # [px] per parameter
+_POINTS = 400  # points of a yield curve
 _SHARES = (0.95, 0.99)
-_AXIS = {"tickCount": 5, "grid": False, "format": "~r"}  # of a parameter
+_AXIS = {"tickCount": 5, "grid": False, "format": "~r"}  # axis of a parameter
 _LEGEND: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 220, "titleLimit": 320}
 _STATISTICS = {"m": "median", "s": "smallest", "l": "largest"}
 
@@ -59,7 +60,7 @@ class Goal:
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """Indices of the cells with a goal value, best first; equal ones in the order of the cells."""
+        """Indices of the cells with a goal value, best first; ties in cell order."""
         known = np.flatnonzero(np.isfinite(self.values))
         return known[np.argsort(-self.values[known] if self.above else self.values[known], kind="stable")]
 
@@ -84,7 +85,7 @@ def effect_said(effect: Effect) -> tuple[str, str]:
 
 
 def _grouped(group: Index, count: int, goal: Samples, quantiles: str, **bins: Index) -> Rows:
-    """Return statistics of the goal in each group of cells; empty groups are left out."""
+    """Return statistics of the goal in each group of cells; empty groups are omitted."""
     known = (group >= 0) & np.isfinite(goal)
     cells, done = (np.bincount(group[some], minlength=count) for some in (group >= 0, known))
     # One sort by group and goal gives all quantiles: group k has the places first[k] to first[k] + done[k] - 1.
@@ -131,8 +132,8 @@ def places(axis: Axis, found: Bins) -> Rows:
 def _looked_up(place: int, axis: Axis, prefix: str, others: Sequence[int] = ()) -> Spec:
     """Return the Vega-Lite transform that looks up the bin positions of an axis.
 
-    A data set of two axes has its bins in the order of the axes: the bin is ``a``, or ``b`` if one of the others
-    precedes.
+    A data set of two axes lists their bins in the order of the axes: this axis's bin is ``a``, or ``b`` if one of the
+    ``others`` precedes the axis.
     """
     fields = ["t"] if axis.texts else ["t", "x", "x0", "x1"]
     source = {"data": {"name": f"bins-{place}"}, "key": "i", "fields": fields}
@@ -192,7 +193,7 @@ def heat_map(axes: Sequence[tuple[Axis, Bins]], across: int, up: int, goal: Goal
 def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goal: Goal) -> Spec:
     """Return the line plot of the goal over one parameter.
 
-    It has one line per value of a second parameter, or without one the median with a band.
+    The plot has one line per value of a second parameter; without a second parameter, it shows the median with a band.
     """
     x, x_bins = axes[across]
     place = _named(x, "x") if x.texts else _along(x, x_bins, "xx")
@@ -240,7 +241,7 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
 
 
 def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
-    """Return the bar chart of the goal's variance shares explained by each parameter."""
+    """Return the bar chart of the share of the goal's variance that each parameter explains."""
     texts = []
     for name, effect in zip(names, effects, strict=True):
         share, rank = effect_said(effect)
@@ -261,7 +262,7 @@ def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
 
 
 def cumulative(found: Yield, goal: Goal, tolerance: float | None) -> Spec:
-    """Return the cumulative curve of cells within a limit, with the limits of 95 and 99 % of the cells."""
+    """Return the cumulative curve of the cells within a limit, and the limits that 95 and 99 % of the cells meet."""
     limits, shares = found.curve(_POINTS)
     points = [(found.point(share), f"{share:.0%}", level) for share, level in zip(_SHARES, (0.32, 0.2), strict=True)]
     marks = [(limit, level, f"{name}: {goal.told(limit)}") for limit, name, level in points if limit is not None]

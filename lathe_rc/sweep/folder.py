@@ -34,7 +34,7 @@ from lathe_rc.sweep.space import Space
 
 _FORMAT = 1
 _WRITING = "write.lock"  # held while one of the files is written
-_MOST = 2**30  # longest file of rows [B]
+_MOST = 2**30  # largest size of a file of rows [B]
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ class Folder:
         path: folder of the sweep.
 
     Attributes:
-        path: see above.
+        path: see the argument.
         scenario: the varied cell.
         measures: further columns of the rows.
         spaces: requested spaces, in order.
         tuning: request of a tuning; None for a plain sweep.
 
     Raises:
-        InputError: the folder is no folder of a sweep.
+        InputError: the folder is not a sweep folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +111,7 @@ class Folder:
             InputError: the folder has other contents.
             LatheError: the folder cannot be written.
         """
-        if not (path / _WRITING).exists():  # else another process has begun it just now
+        if not (path / _WRITING).exists():  # otherwise another process has just created it
             _refuse_others(path)
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ class Folder:
         """
         found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
         for target in self.targets:
-            # Cells computed before a target was first varied have the scenario's value of it.
+            # Cells computed before a target was first varied have the scenario's value of that target.
             if target in found.column_names and found.column(target).null_count:
                 field = found.schema.field(target)
                 filled = pyarrow.compute.coalesce(
@@ -242,7 +242,7 @@ class Folder:
             LatheError: the file cannot be written; existing rows are preserved.
         """
         place = self.path / "rows"
-        # Several processes may compute a tuning: without the lock two files could get the same number.
+        # Several processes may compute a tuning, so without the lock two files could get the same number.
         with locked(self.path / _WRITING), writing(self.path):
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
@@ -252,7 +252,7 @@ class Folder:
 def _parquet(rows: pa.Table) -> bytes:
     """Return a Parquet file with a checksum of the complete file in its metadata.
 
-    Its pages also have the standard checksums for other programs, which do not cover the rest of the file.
+    For other programs, the file's pages also have the standard checksums, which do not cover the rest of the file.
     """
     content = io.BytesIO()
     with pyarrow.parquet.ParquetWriter(content, rows.schema, compression="zstd", write_page_checksum=True) as writer:
@@ -288,7 +288,7 @@ def _read(path: Path) -> bytes:
 
 
 def _refuse_others(path: Path) -> None:
-    """Reject an existing path that is no folder of a sweep."""
+    """Reject an existing path that is not a sweep folder."""
     if not os.path.lexists(path):
         return
     with _reading(path):
@@ -302,7 +302,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
     """Hold the lock of a file within the block.
 
     Raises:
-        InputError: the file cannot be created; without ``wait``: another process holds the lock.
+        InputError: the file cannot be created, or, without ``wait``, another process holds the lock.
     """
     lock = filelock.FileLock(path)
     with _reading(path):
@@ -318,7 +318,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Convert an error of reading into one line."""
+    """Convert a read error into a one-line error."""
     try:
         yield
     except OSError as error:
@@ -327,7 +327,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert an error of writing to a folder into one line.
+    """Convert an error in writing to a folder into a one-line error.
 
     Raises:
         LatheError: an operation in the block failed.

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a cell by closed-form rules, as a reference for a search.
+"""Parameters of a cell from closed-form rules, as a reference for a search.
 
 For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as implemented:
 
 - ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
-- ``q_time``: the shortest time with sup|Q - γZ| <= 1 - margin, since the remaining error grows with it:
-  (1 - Q)/(γZ + 1 - Q);
+- ``q_time``: the shortest time with sup|Q - γZ| <= 1 - margin, since the remaining error (1 - Q)/(γZ + 1 - Q) grows
+  with ``q_time``;
 - ``q_pass``, ``q_stop``, ``q_ripple`` of a flat Q (fir): the widest band with this margin;
 - ``lead_time``: the lag of the drive at low frequencies, so that slow changes of the form are not delayed; if no Q has
-  the margin with it, the lead that allows the shortest ``q_time``; if Q is not free, the lead with the smallest
+  the margin with this lead, the lead that allows the shortest ``q_time``; if Q is not free, the lead with the smallest
   sup|Q - γZ|.
 
 For a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that has margins of 60° and
 6 dB. Its plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), where
-v0 is the velocity that causes F0. It includes the feedback delay, but neither limits nor elasticity nor keyways.
+v0 is the velocity that causes F0. The plant includes the feedback delay, but neither limits nor elasticity nor keyways.
 """
 
 import math
@@ -41,13 +41,13 @@ from lathe_rc.transfer import TransferFunction
 _PID = ("proportional", "integral", "derivative", "derivative_filter")
 _LEARNING = {"lead_time", "q_time", "q_pass", "q_stop", "q_ripple", "learning_gain"}
 _PHASE_MARGIN, _GAIN_MARGIN = 60.0, 2.0  # [°], factor
-_BAND = (0.1, 1e3)  # [rad/s] of the crossover
+_BAND = (0.1, 1e3)  # range of the crossover [rad/s]
 MARGIN = 0.05  #: default stability margin
-_SHORTEST, _LONGEST = 1e-6, 1e-3  # [s] of q_time
+_SHORTEST, _LONGEST = 1e-6, 1e-3  # range of q_time [s]
 _GAIN = "γ = 1 (paper 001, eqs 1-5)"
-_NONE = 1.0  # [s] in place of a q_time that does not exist: longer than all others, but finite for the search
+_NONE = 1.0  # [s] used where no q_time exists: longer than all others, but finite for the search
 _HALVINGS = 16
-_LEADS = 20  # leads on the grid whose best one is refined
+_LEADS = 20  # number of leads on the grid, the best of which is refined
 _FAR = 2.0  # longest lead of the grid, in lags of the drive
 
 
@@ -121,7 +121,7 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
 def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict[str, Found]:
     """Return the values for a flat Q.
 
-    The lead is the lag of the drive if such a Q exists with it, else the scenario's value.
+    The lead is the lag of the drive if a flat Q with the margin exists for it, else the scenario's value.
     """
     given = loop.stage.parameters
     assert isinstance(given, LearningControllerParameters), "it has a Q"
@@ -154,12 +154,12 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
     material = SpecificForce(cut.kc1, cut.mc, cut.wear_factor)
     velocity = material.feed_for(force / cut.depth, cut.wear) * table.nominal_speed / (2.0 * math.pi)
     way = slide.transfer()
-    plant = TransferFunction(way.numerator, way.denominator[:-1])  # velocity in place of the way
+    plant = TransferFunction(way.numerator, way.denominator[:-1])  # velocity instead of position
     plant *= TransferFunction(((1.0 - cut.mc) * force / velocity,), (cut.lag, 1.0) if cut.lag else (1.0,))
     margins = {"phase_margin": math.radians(_PHASE_MARGIN), "gain_margin": _GAIN_MARGIN}
     try:
         gains = fastest(plant, band=_BAND, **margins, wait=table.feedback_delay * table.step)
-    except InputError:  # no PID keeps these margins: no formula for this plant
+    except InputError:  # no PID meets these margins, so there is no formula for this plant
         return {}
     values = (gains.proportional, gains.integral, gains.derivative, gains.filter)
     return {name: Found(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
@@ -167,7 +167,7 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
 
 def _least(cost: Callable[[float], float], longest: float) -> float:
     """Return the lead with the lowest cost."""
-    # The cost may have several minima: a coarse grid finds the deepest one, and the bounded search refines it.
+    # The cost may have several minima, so a coarse grid finds the deepest one, which the bounded search refines.
     leads = np.linspace(0.0, longest, _LEADS + 1)[1:]
     best = int(np.argmin([cost(float(lead)) for lead in leads]))
     ends = float(leads[max(best - 1, 0)]), float(leads[min(best + 1, _LEADS - 1)])

@@ -24,7 +24,8 @@ def _title(tuning: Tuning, column: str) -> str:
 def chart(tuning: Tuning) -> alt.LayerChart:
     """Return the chart of a tuning.
 
-    For one goal it shows the goal and the best value so far over the trials, for several goals the last over the first.
+    For one goal it shows the goal and the best value so far against the trial number; for several goals, the last goal
+    against the first.
     """
     columns = [goal.column for goal in tuning.objectives.goals]
     front = {trial.number for trial in tuning.front}

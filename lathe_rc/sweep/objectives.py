@@ -20,7 +20,7 @@ from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.sweep import NUMBERS, row
+from lathe_rc.sweep import NUMBERS, OF_LEARNING, row
 from lathe_rc.sweep.row import Measure
 
 _CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
@@ -177,9 +177,10 @@ def objectives(
             told = instead(column, NUMBERS)
             told = told if told.startswith("allowed") else f"{told} (or TOPIC.FIELD:STATISTIC)"
             raise InputError(f"{what} {shown(column)!r}: no such column; {told}")
-        elif not (learns if column == "margin" else has_tool):
+        elif not (learns if column in OF_LEARNING else has_tool):
+            missing = "learning controller" if column in OF_LEARNING else "tool"
             raise InputError(
-                f"{what} {column}: {'nobody learns' if column == 'margin' else 'there is no tool'} in {scenario.name}; "
+                f"{what} {column}: there is no {missing} in {scenario.name}; "
                 f"allowed: TOPIC.FIELD:STATISTIC, such as {next(iter(cell.dense))}.FIELD:rms"
             )
     if len({goal.column for goal in wanted}) < len(wanted):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Self-contained HTML page of a sweep, and its figures as PNGs beside it.
 
-`page_data` prepares the data, `effects` computes, `figures` and `parallel` draw.
+`page_data` prepares the data, `effects` computes the statistics, and `figures` and `parallel` draw the figures.
 """
 
 import math
@@ -30,13 +30,13 @@ PAGE, FIGURES = "page.html", "figures"
 
 _MOST_AXES = 6  # parameters offered for maps and lines
 _MOST_LINES = 10  # axes of parallel coordinates
-_MOST_FIELDS = 16_000  # rows of the data sets of all pairs
-_MOST_BINS = 24  # of an axis whose values are not shown one by one
-_MOST_ALONE = 200  # values of the only parameter that are shown one by one
-_FIELD = 10  # mean number of cells of a field, where values are put into bins
+_MOST_FIELDS = 16_000  # total number of rows in the data sets of all pairs
+_MOST_BINS = 24  # bins of an axis whose values are not shown individually
+_MOST_ALONE = 200  # values of a sole parameter that are shown individually
+_FIELD = 10  # mean number of cells per field where values are binned
 _BEST = 10  # listed cells
 _MOST_REASONS = 12
-_SCALE = 2.0  # of the PNGs
+_SCALE = 2.0  # scale of the PNGs
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
 
@@ -55,7 +55,7 @@ class Written:
 
 
 def write(folder: Folder, goal: str = GOAL) -> Written:
-    """Write the page of a sweep into its folder, and its figures as PNGs; existing files are replaced.
+    """Write the page of a sweep, and its figures as PNGs, into the sweep's folder; existing files are replaced.
 
     Args:
         folder: folder of the sweep; the page shows the cells computed so far.
@@ -69,7 +69,7 @@ def write(folder: Folder, goal: str = GOAL) -> Written:
     drawn = Charts()
     text = _text(seen, drawn)
     place, page = folder.path / FIGURES, folder.path / PAGE
-    # All figures are drawn before any file is written: after an error the old page still matches its figures.
+    # All figures are drawn before any file is written, so after an error the old page still matches its figures.
     pngs = {place / f"{name}.png": drawn.png(name, _SCALE) for name in drawn.specs}
     try:
         place.mkdir(exist_ok=True)

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.sweep import NUMBERS
+from lathe_rc.sweep import NUMBERS, OF_LEARNING
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
 
 GOAL = "tool.max_error"
-_LARGE = ("margin",)  # goals that are better the larger they are
+_LARGE = OF_LEARNING  # goals that are better the larger they are
 _UNITS = {"tool.in_tolerance_from": "revolutions"}
 _MOST_TEXTS = 24  # strings of an axis with separate colours; the others share one
 

@@ -21,9 +21,9 @@ _GAP = 74  # [px] from axis to axis
 _SIDE = 26  # [px] beside the axes, for the labels at their ends
 _TOP, _BOTTOM = 62, 26  # [px] above the first axis and below the last
 _REACH = 13  # [px] above and below an axis where a brush starts
-_MOST, _BEST = 400, 50  # lines, and the best among them
+_MOST, _BEST = 400, 50  # lines in total, and lines of the best cells
 _TICKS = 5
-_DECADES = 2.5  # length up to which a logarithmic axis has ticks within its decades
+_DECADES = 2.5  # length in decades up to which a logarithmic axis has ticks within its decades
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ def chosen(axes: Sequence[Axis], goal: Goal) -> tuple[NDArray[np.int64], int]:
     order = order[whole[order]]
     if order.size <= _MOST:
         return order[::-1], order.size
-    # The seed is fixed: the same rows give the same page.
+    # The seed is fixed so that the same rows give the same page.
     lot = np.random.default_rng(0).choice(order.size - _BEST, _MOST - _BEST, replace=False) + _BEST
     return order[np.concatenate([np.arange(_BEST), np.sort(lot)])][::-1], order.size
 
@@ -84,7 +84,7 @@ def _ticks(axis: Axis, low: float, high: float) -> list[tuple[float, str]]:
 def _brush(place: int) -> Spec:
     """Return the Vega signal for the brushed interval of an axis, from 0 to 1; null for the entire axis.
 
-    The signal uses events of the view near the axis, since touch events start without a pointer movement over a mark.
+    The signal uses events of the view near the axis, because a touch starts without a pointer movement over a mark.
     """
     at, held = "clamp(x() / width, 0, 1)", f"brush_{place}"
     near = [f"abs(y() - {place * _GAP}) <= {_REACH}"]

@@ -12,6 +12,7 @@
 | tool.max_errors, tool.rms_errors | largest and RMS form error of each revolution [m] |
 | tool.in_tolerance_from | first revolution from which the largest error stays within `tool.tolerance`, or none |
 | margin | 1 less the largest factor of a cycle over all frequencies (sup|Q - γZ|): below 0 learning diverges |
+| drive_margin | smallest relative error of the drive's response, at one frequency, with which learning diverges |
 | limits | nodes that reached a limit of a command or a stroke |
 | TOPIC.FIELD:STATISTIC | a measure of the last revolution |
 | revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
@@ -229,6 +230,7 @@ def compute(
         row["reason"] = str(error)
     if cell is not None and cell.factors:
         row["margin"] = 1.0 - max(cell.factors.values())
+        row["drive_margin"] = min(margin.error for margin in cell.drive_margins.values())
     row["seconds"] = time.perf_counter() - start
     return row
 

@@ -18,7 +18,7 @@ class Dimension(NamedTuple):
 
     Attributes:
         distribution: Optuna distribution.
-        choices: values of a list, by their string representations in Optuna; None for a range.
+        choices: values of a list by the strings that represent them in Optuna; None for a range.
     """
 
     distribution: CategoricalDistribution | FloatDistribution | IntDistribution
@@ -40,7 +40,7 @@ class Dimension(NamedTuple):
         return value if self.choices is None else _text(value)
 
     def suggest(self, trial: Trial, target: str) -> None:
-        """Draw the parameter's value for a trial, unless it has one already."""
+        """Draw the parameter's value for a trial, unless the trial already has one."""
         found = self.distribution
         if isinstance(found, CategoricalDistribution):
             trial.suggest_categorical(target, found.choices)
@@ -95,7 +95,7 @@ def _dimension(scenario: Scenario, target: str, told: str | Sequence[Value]) -> 
         values = axis(scenario, target, told)
         if row.type is float and not row.is_list:
             values = [float(cast("float", value)) for value in values]
-        # Optuna's choices must be scalars: strings represent the values, so that a value may be a list.
+        # Optuna's choices must be scalars, so strings represent the values, which may be lists.
         choices = {_text(value): value for value in values}
         if len(choices) < 2:
             raise InputError(

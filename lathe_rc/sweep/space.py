@@ -9,9 +9,9 @@
     for values in space.cells(scenario):
         ...
 
-The cells are the product of the given cells, the grids, the sample points and the seeds, in this order: the seeds
-vary fastest, then the points, then the values of the last grid. Each is given as a string, as on the command line, or
-as values, see `Space`.
+The cells are the product of the given cells, the grids, the sample points and the seeds, in this order: the seeds vary
+fastest, then the points, then the values of the last grid. Each of them is given as a string, as on the command line,
+or as values, see `Space`.
 """
 
 import csv
@@ -38,8 +38,8 @@ from lathe_rc.sweep.derived_parameters import Formulas, ordered
 SAMPLERS = ("sobol", "halton", "latin", "random")
 _MOST_POINTS = 2**24
 _SAMPLES = f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
-_PIECE = 2**12  # points of a sample that are drawn at a time
-_LONG = 40  # characters of an axis that a message quotes
+_PIECE = 2**12  # number of sample points drawn at a time
+_LONG = 40  # number of characters of an axis that a message quotes
 
 
 class Drawn(NamedTuple):
@@ -141,7 +141,7 @@ class Space:
         for target, told in self.sampled.items():
             _drawn(scenario, target, told)
         ordered(self.ties)
-        next(self.cells(scenario))  # the formulas are evaluated once: most errors show in the first cell
+        next(self.cells(scenario))  # evaluates the formulas once; most errors show in the first cell
 
     def cells(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
         """Yield the varied values of each cell, by target."""
@@ -182,7 +182,7 @@ class Space:
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
     """Yield points in the unit cube, shape (n, dimensions); a larger sample starts with the points of a smaller one."""
-    if name == "latin":  # all points at once, since they depend on the count
+    if name == "latin":  # all points at once, because they depend on the count
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
     generator = np.random.default_rng(seed)
@@ -193,7 +193,7 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
     }
     for first in range(0, count, _PIECE):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # Sobol's warns of counts that are no power of two
+            warnings.simplefilter("ignore", UserWarning)  # Sobol warns about counts that are not a power of two
             piece = draws[name](min(_PIECE, count - first))
         yield piece
 
@@ -256,7 +256,7 @@ def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
 
 
 def _split(text: str) -> list[str]:
-    """Split a string at commas outside of brackets and quotes."""
+    """Split a string at commas outside brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         quote = ("" if letter == quote else quote) if quote else (letter if letter in "'\"" else "")
@@ -278,7 +278,7 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
 
 
 def _check_type(target: str, row: Row, value: Value) -> None:
-    """Reject a value of a wrong type; a value out of range becomes an error in its cell's row."""
+    """Reject a value of the wrong type; a value out of range becomes an error in its cell's row."""
     kinds = (int, float) if row.type is float else row.type
     items = value if isinstance(value, list) else [value]
     wrong = [item for item in items if not isinstance(item, kinds) or (row.type is not bool and isinstance(item, bool))]
@@ -316,7 +316,7 @@ def given(path: Path) -> list[dict[str, Value]]:
     """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
 
     Raises:
-        InputError: the file cannot be read, or has neither format.
+        InputError: the file cannot be read, or is in neither format.
     """
     try:
         text = files.contents(path).decode()

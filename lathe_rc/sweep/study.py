@@ -2,8 +2,8 @@
 """Tuning on disk: Optuna's study, and the results of its trials' cells.
 
 Trials are drawn in batches. Each trial has its own random generator, seeded by the search's seed and the trial's
-number. The results of a batch are reported to Optuna in the order of the trial numbers. So the search depends neither
-on the number of processes nor on their timing.
+number. The results of a batch are reported to Optuna in the order of the trial numbers. The search therefore depends
+neither on the number of processes nor on their timing.
 """
 
 import hashlib
@@ -40,28 +40,28 @@ from lathe_rc.sweep.tuning import Trial, Tuning
 from lathe_rc.sweep.workers import Job, rows
 
 _STUDY = "tuning"
-_POPULATION = 3 * BATCH  # of NSGA-II
-_UNKNOWN = 1e9  # larger than every cost, in place of an infinite one, which the samplers do not accept
-_CHECKSUM = "checksum"  # of a line of the journal, in itself
+_POPULATION = 3 * BATCH  # population of NSGA-II
+_UNKNOWN = 1e9  # stands for an infinite cost, which the samplers do not accept; larger than all other costs
+_CHECKSUM = "checksum"  # key of a journal line's checksum, stored in the line itself
 _BY, _SCORE = "by", "score"  # attributes of a trial: the process that computes it, its result
 
 
 class _Journal(BaseJournalBackend):
     """Optuna journal with a checksum in each line; lines of older versions have none.
 
-    Optuna's own class takes a damaged last line for an unfinished one, and skips it. Here only a process that holds the
-    lock of the folder writes, so every damaged line is an error.
+    Optuna's own class mistakes a damaged last line for an unfinished one and skips it. Here only a process that holds
+    the folder's lock writes, so every damaged line is an error.
     """
 
     def __init__(self, path: Path) -> None:
         self._path, self._starts = path, [0]
-        self.line = 0  #: number of the line that was read last
+        self.line = 0  #: number of the last line read
         path.touch()
         if self._cut():
             print(f"lathe: {path}: the last line is not whole: left out, and done again", file=sys.stderr)
 
     def _cut(self) -> bool:
-        """Remove an incomplete last line: the next line would be appended to it, and both would be unreadable."""
+        """Remove an incomplete last line; the next line would be appended to it, and both would be unreadable."""
         with open(self._path, "rb+", opener=open_file) as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(size - 1, 0))
@@ -87,9 +87,9 @@ class _Journal(BaseJournalBackend):
             InputError: a line is damaged.
         """
         with open(self._path, "rb", opener=open_file) as file:
-            file.seek(self._starts[log_number_from])  # Optuna reads often, each time from its last line on
+            file.seek(self._starts[log_number_from])  # Optuna reads often, each time starting at its last line
             for self.line, line in enumerate(file, log_number_from + 1):
-                if not line.endswith(b"\n"):  # it is being written
+                if not line.endswith(b"\n"):  # the line is still being written
                     return
                 self._starts[self.line :] = [self._starts[self.line - 1] + len(line)]
                 try:
@@ -176,7 +176,7 @@ class Study:
 
     @contextmanager
     def present(self) -> Iterator[str]:
-        """Hold a lock that marks this process as computing; yield its name."""
+        """Hold a lock that marks this process as computing; yield the process's name."""
         place, me = self._folder.path / "running", uuid.uuid4().hex
         with writing(self._folder.path):
             place.mkdir(exist_ok=True)
@@ -187,7 +187,7 @@ class Study:
                 (place / me).unlink(missing_ok=True)
 
     def _is_left(self, trial: FrozenTrial, me: str) -> bool:
-        """Return whether the process assigned to a trial has ended: its lock is free."""
+        """Return whether the process assigned to a trial has ended, which leaves its lock free."""
         by = str(trial.user_attrs.get(_BY))
         path = self._folder.path / "running" / by
         with suppress(filelock.Timeout):
@@ -198,7 +198,7 @@ class Study:
         return False
 
     def count_trials(self, state: TrialState, most: int = sys.maxsize) -> int:
-        """Return the number of the first ``most`` trials in a state, including trials of other processes."""
+        """Count the trials in a state, including trials of other processes, among the first ``most`` trials."""
         return sum(trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(state,)))
 
     def ask(self, me: str, most: int) -> list[FrozenTrial]:
@@ -208,7 +208,7 @@ class Study:
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
             left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._is_left(trial, me)]
             number, batch = len(asked), self._asked.batch
-            # Batches end at multiples of their size, also after a restart: each trial uses the same results.
+            # Batches end at multiples of their size, even after a restart, so that each trial uses the same results.
             missing = batch - number % batch if number % batch or not left else 0
             for _ in range(max(0, min(missing, most - number))):
                 self._study.sampler = self._sampler(number)
@@ -219,7 +219,7 @@ class Study:
                 self._study.sampler = self._sampler(each)
                 trial = self._trial(each)
                 trial.set_user_attr(_BY, me)
-                for target, dimension in self._space.items():  # a stopped process may not have drawn all
+                for target, dimension in self._space.items():  # a stopped process may not have drawn all values
                     dimension.suggest(trial, target)
             return [trial for trial in self._study.get_trials() if trial.number in left]
 
@@ -245,7 +245,7 @@ class Study:
             for number, each in jobs.items():
                 self._tell(number, self._objectives.score(self._known[job.key] for job in each))
             tuning = self.tuning()
-            # Within the lock: a process with fewer trials could overwrite this best trial with an older one.
+            # Within the lock; otherwise a process with fewer trials could overwrite this best trial with an older one.
             if best := tuning.best:
                 tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})
@@ -270,7 +270,7 @@ class Study:
         for place, violation in enumerate(score.violations):
             trial.set_constraint(str(place), violation)
         known = [min(cost, _UNKNOWN) for cost in score.costs]
-        # CMA-ES has no constraints: an infeasible trial costs more than all others, increasing with its violation.
+        # CMA-ES has no constraints, so an infeasible trial costs more than all others, increasing with its violation.
         if self._asked.sampler == "cmaes" and not score.feasible:
             known = [_UNKNOWN * (1.0 + sum(max(violation, 0.0) for violation in score.violations))]
         self._study.sampler = self._sampler(number)

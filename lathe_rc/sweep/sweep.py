@@ -92,16 +92,16 @@ def run_sweep(
     """Compute all cells of a space that are not in the folder yet.
 
     Args:
-        scenario: the cell to vary; it must have a number of revolutions.
+        scenario: the cell to vary; it must specify a number of revolutions.
         space: variations of the cell.
         folder: folder of the results; an interrupted sweep is continued, and further spaces are added.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
         models: drive models of controllers, if the scenario does not set them: ``follow`` the varied drives, or
             stay ``nominal``, as for one controller design for many drives.
-        scheduler: address of a Dask scheduler; None: workers of this machine.
-        workers: number of worker processes of this machine; None: one per core.
-        client: client of Dask, in place of ``scheduler`` and ``workers``.
-        watch: called with the events ``began`` (cells; computed: number of existing ones), ``compiling``
+        scheduler: address of a Dask scheduler; None: workers on this machine.
+        workers: number of worker processes on this machine; None: one per core.
+        client: Dask client, used instead of ``scheduler`` and ``workers``.
+        watch: called with the events ``began`` (cells; computed: number of existing rows), ``compiling``
             (nodes), ``ready`` (dashboard: address of Dask's dashboard) and ``rows`` (statuses: numbers of cells by
             status).
 
@@ -146,7 +146,7 @@ def crew_for(
 
 
 def order_of(folder: Folder) -> Order:
-    """Return the common data of all jobs of a folder."""
+    """Return the data shared by all jobs in a folder."""
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
@@ -157,7 +157,7 @@ def order_of(folder: Folder) -> Order:
 def keep(
     folder: Folder, found: Generator[pa.Table], watch: Watch, take: Callable[[pa.Table], None] | None = None
 ) -> None:
-    """Write rows as they arrive, one file every few seconds; after an interruption the remaining ones are written, too.
+    """Write rows as they arrive, one file every few seconds; after an interruption, the remaining rows are written too.
 
     Args:
         folder: folder of the rows.
@@ -187,7 +187,7 @@ def keep(
 def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
     """Yield the cells of a space as jobs, numbered across all spaces of the folder in the order of their requests."""
     key = Key(folder)
-    # A single space has no duplicate cells: no table of keys is needed, which could have millions of entries.
+    # A single space has no duplicate cells, so no table of keys is needed, which could have millions of entries.
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
             yield Job(number, key.of(values), values)
@@ -202,7 +202,7 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
 
 
 class Key:
-    """Hash function for cells: of the scenario, the measures, and the values that differ from the scenario's own."""
+    """Hash function for cells, over the scenario, the measures, and the values that differ from the scenario's own."""
 
     def __init__(self, folder: Folder) -> None:
         scenario = folder.scenario

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning: a parameter search by Optuna, whose trials are computed by the workers of a sweep.
+"""Tuning: a parameter search by Optuna; the workers of a sweep compute its trials.
 
 DIR/trials.log       Optuna's journal: the trials and their scores
 DIR/running/         one lock file per computing process; the lock is free when the process has ended
 DIR/best.yaml        the cell with the best trial's parameters
 DIR/front/           for several goals, the cells of the Pareto front
-DIR, other files     see `lathe_rc.sweep.folder`: cell n of trial m is the row m * (cells of a trial) + n
+DIR, other files     see `lathe_rc.sweep.folder`: cell n of trial m is row m * (cells per trial) + n
 """
 
 import os
@@ -30,7 +30,7 @@ from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuning import Tuning
 
-_PAUSE = 0.2  # [s] between looks at the trials of other processes
+_PAUSE = 0.2  # [s] between checks of other processes' trials
 
 
 def tune(
@@ -56,25 +56,26 @@ def tune(
     """Search for parameters of a cell; existing trials in the folder are not computed again.
 
     Args:
-        scenario: the cell; its own parameters are the start, trial 0. It must have a number of revolutions.
+        scenario: the cell; its own parameters are the start, trial 0. It must specify a number of revolutions.
         free: search space by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
         goals: columns of a row to be minimised, see `lathe_rc.sweep.objectives`; several yield a Pareto front.
-        folder: folder of the results. Several processes, also on other machines, may compute into it simultaneously.
+        folder: folder of the results. Several processes, even on different machines, may compute into it at once.
         subjects: constraints, ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
-        over: uncertain plants and spindles; each goal is their worst value or a percentile; None: only the scenario's.
-        percentile: percentile of ``over`` that counts; 100: the worst.
+        over: uncertain plants and spindles; each goal is its worst value over them, or a percentile; None: only the
+            scenario's plant and spindle.
+        percentile: percentile of a goal over ``over`` that counts; 100: the worst value.
         trials: total number of trials, including existing ones.
         sampler: ``tpe``; ``cmaes`` for one goal and only ranges; ``nsga2`` for several goals and many trials.
         seed: random seed of the search.
-        batch: number of trials that are drawn at a time, before any of them has a score.
-        ask_formulas: whether trial 1 uses the values of `lathe_rc.sweep.formulas`, if they are within the ranges.
+        batch: number of trials that are drawn together, before any of them has a score.
+        ask_formulas: whether trial 1 uses the values given by `lathe_rc.sweep.formulas`, if they are within the ranges.
         measures: further columns, ``TOPIC.FIELD:STATISTIC``.
-        scheduler: address of a Dask scheduler; None: workers of this machine.
-        workers: number of worker processes of this machine; None: one per core.
-        client: client of Dask, in place of ``scheduler`` and ``workers``.
-        watch: called with the events of `lathe_rc.run_sweep`, ``began`` with the number of existing trials, and with
-            ``told`` (tuning: all trials so far) after each batch, and ``waiting``, repeatedly, while other processes
-            compute the remaining trials.
+        scheduler: address of a Dask scheduler; None: workers on this machine.
+        workers: number of worker processes on this machine; None: one per core.
+        client: Dask client, used instead of ``scheduler`` and ``workers``.
+        watch: called with the events of `lathe_rc.run_sweep` (``began`` gives the number of existing trials), with
+            ``told`` (tuning: all trials so far) after each batch, and repeatedly with ``waiting`` while other
+            processes compute the remaining trials.
 
     Raises:
         InputError: the arguments are invalid, or the folder has other contents.
@@ -123,7 +124,7 @@ def tune(
                 if asked:
                     crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
                     state.compute(crew, asked, watch)
-                else:  # the best is known when all trials are, also those of other processes
+                else:  # the best trial is known only when all are, including those of other processes
                     watch({"event": "waiting"})
                     time.sleep(_PAUSE)
                 asked = state.ask(me, trials)
@@ -154,7 +155,7 @@ def load(path: Path) -> Tuning:
     """Load the tuning in a folder.
 
     Raises:
-        InputError: the folder has no tuning.
+        InputError: the folder contains no tuning.
     """
     folder = Folder(path)
     if folder.tuning is None:

@@ -46,7 +46,7 @@ class Tuning:
     Attributes:
         folder: folder of the tuning.
         objectives: goals and constraints.
-        over: plants and spindles of each trial, as a space.
+        over: plants and spindles on which each trial is evaluated, as a space.
         trials: computed trials, in order.
         formulas: values given by formulas, for free parameters that have a formula.
     """
@@ -77,7 +77,7 @@ class Tuning:
 
     @property
     def feasible(self) -> list[Trial]:
-        """Feasible trials: they meet all constraints."""
+        """Feasible trials, which meet all constraints."""
         return [trial for trial in self.trials if trial.score.feasible]
 
     @property
@@ -87,7 +87,7 @@ class Tuning:
 
     @property
     def by_formula(self) -> Trial | None:
-        """Trial with the values given by formulas; None if there are none, or if they are outside of the ranges."""
+        """Trial with the values given by formulas; None if there are no such values, or they are out of range."""
         given = {target: found.value for target, found in self.formulas.items()}
         scenario = self.folder.scenario
 
@@ -109,7 +109,7 @@ class Tuning:
     def front(self) -> list[Trial]:
         """Pareto front of the feasible trials, sorted by the first goal; for one goal, only the best trial."""
         found: list[Trial] = []
-        # In this order, only a trial already on the front can be as good in all goals.
+        # In this order, only a trial already on the front can be at least as good in all goals.
         for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
             if not any(np.less_equal(other.score.costs, trial.score.costs).all() for other in found):
                 found.append(trial)
@@ -117,7 +117,7 @@ class Tuning:
 
     @property
     def best(self) -> Trial | None:
-        """Best trial; for several goals, the trial on the front nearest to the best of each; None: none is feasible."""
+        """Best trial: for several goals, the one on the front nearest to the best of each; None if none is feasible."""
         front = self.front
         if not front:
             return None
@@ -141,7 +141,7 @@ class Tuning:
         return found
 
     def scenario(self, trial: Trial) -> Scenario:
-        """Return the scenario with a trial's parameters, with its nominal plant and spindle."""
+        """Return the scenario with a trial's parameters and the nominal plant and spindle."""
         return self.folder.scenario.varied(trial.values)
 
     def trial(self, number: int) -> Trial:

@@ -32,17 +32,17 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.sweep import row
 from lathe_rc.sweep.row import Measure
 
-TASK = 2.0  #: aimed duration of a task [s]
-_GROWTH = 4  # largest ratio of a task's cells to those of the one before
+TASK = 2.0  #: target duration of a task [s]
+_GROWTH = 4  # largest ratio of a task's cells to those of the previous task
 _MOST = 4096  # most cells of a task
-_LEAST = 8  # towards the end tasks get shorter, down to the fraction 1/8 of the others
-_AHEAD = 2  # tasks per worker thread: one runs, and the next one is ready at the scheduler
-_CONNECT = 5  # [s] to reach a scheduler
-_SETTINGS = {  # of this machine's workers
-    # Dask counts the death of a worker against every task assigned to it: so only the running task is assigned.
+_LEAST = 8  # towards the end, tasks get shorter, down to 1/8 of the others
+_AHEAD = 2  # tasks per worker thread: one is running, and the next is ready at the scheduler
+_CONNECT = 5  # [s] allowed for reaching a scheduler
+_SETTINGS = {  # settings of this machine's workers
+    # Dask counts the death of a worker against every task assigned to it, so only the running task is assigned.
     "distributed.scheduler.worker-saturation": 1.0,
-    # By default Dask profiles a worker every 10 ms, checks its event loop every 20 ms and its memory every 100 ms:
-    # that takes 10 % of the time of short cells.
+    # By default Dask profiles a worker every 10 ms, checks its event loop every 20 ms and its memory every 100 ms,
+    # which takes 10 % of the time of short cells.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "200ms",
     "distributed.worker.memory.monitor-interval": "1s",
@@ -55,7 +55,7 @@ class Job(NamedTuple):
 
     Attributes:
         number: number within the sweep.
-        key: identity of the cell.
+        key: hash that identifies the cell.
         values: values of the varied parameters, by target.
     """
 
@@ -65,7 +65,7 @@ class Job(NamedTuple):
 
 
 class Order(NamedTuple):
-    """Common data of all jobs of a sweep, sent to the workers with each task.
+    """Data shared by all jobs of a sweep, sent to the workers with each task.
 
     Attributes:
         name: name of the scenario.
@@ -88,7 +88,7 @@ class Order(NamedTuple):
 
 @dataclass(frozen=True)
 class Share:
-    """Jobs of one task; a class, since Dask searches lists and tuples in its arguments for other tasks."""
+    """Jobs of one task; a class, because Dask searches lists and tuples in its arguments for other tasks."""
 
     order: Order
     jobs: Sequence[Job]
@@ -129,8 +129,8 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[distribute
     """Yield a Dask client of a scheduler, or of local workers that end with the block.
 
     Args:
-        scheduler: address, such as ``tcp://host:8786``; None: this machine.
-        workers: number of worker processes of this machine; None: one per core.
+        scheduler: address, such as ``tcp://host:8786``; None: local workers on this machine.
+        workers: number of worker processes on this machine; None: one per core.
 
     Raises:
         InputError: there is no scheduler at the address.
@@ -161,7 +161,7 @@ def _safe_path() -> Iterator[None]:
 
 
 def _cluster(workers: int | None) -> distributed.LocalCluster:
-    # A terminal sends Ctrl-C to all processes. The workers inherit that it is ignored: this process ends them.
+    # A terminal sends Ctrl-C to all processes. The workers inherit the setting to ignore it; this process ends them.
     before = None
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -170,7 +170,7 @@ def _cluster(workers: int | None) -> distributed.LocalCluster:
             return distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
-                host="127.0.0.1",  # a process that reaches a scheduler or a worker runs code there
+                host="127.0.0.1",  # any process that reaches a scheduler or a worker can run code there
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
@@ -184,12 +184,12 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
 
     Args:
         client: client whose workers compute the cells.
-        order: common data of the jobs.
+        order: data shared by the jobs.
         jobs: cells, taken from the iterator when workers become free.
         count: number of jobs.
 
     Raises:
-        LatheError: workers died repeatedly over the same cells.
+        LatheError: workers died repeatedly while computing the same cells.
     """
     waiting = iter(jobs)
     left, size = count, 1
@@ -203,7 +203,7 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
                 if not (some := list(islice(waiting, max(min(size, fair), size // _LEAST, 1)))):
                     break
                 left -= len(some)
-                # Not pure: Dask would hash all jobs of a task in order to recognise it.
+                # Not pure; otherwise Dask would hash all jobs of a task in order to recognise the task.
                 future = client.submit(compute, Share(order, some), pure=False)
                 sent[future] = some
                 arriving.add(future)
@@ -230,7 +230,7 @@ def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Tab
 
 
 def _next(size: int, found: pa.Table) -> int:
-    """Return the number of cells of the next task, from the computing times of the last one."""
+    """Return the number of cells for the next task, based on the computing times of the last task."""
     took: float = sum(found.column("seconds").to_pylist())
     fitting: int = round(TASK * found.num_rows / max(took, 1e-6))
     grown: int = _GROWTH * max(size, found.num_rows)

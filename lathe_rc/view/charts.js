@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Draws the figures of a page in its own colours, light or dark, and as wide as the page is.
-// A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows it whole.
+// A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows the whole figure again.
 const { specs: SPECS, data: DATA, chosen: CHOSEN, look: LOOK } = JSON.parse(document.getElementById("figures").textContent);
 const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
 function config(width) {
@@ -10,19 +10,19 @@ function config(width) {
     const colours = style.getPropertyValue(value).trim().split(" ");
     return colours.length > 1 ? colours : colours[0];
   });
-  found.legend.columns = width < 560 ? 1 : 0; // 0: as many as it has names
+  found.legend.columns = width < 560 ? 1 : 0; // 0: as many columns as names
   return found;
 }
 async function draw(name) {
   const place = document.getElementById(name), spec = structuredClone(SPECS[name][CHOSEN[name]]);
-  place.closest("figure")?.classList.add("drawn"); // the picture for paper gives way
+  place.closest("figure")?.classList.add("drawn"); // hides the picture for printing
   if (!spec) { place.textContent = "Choose two different parameters."; return; }
   if (spec.padding) spec.width = place.clientWidth - spec.padding.left - spec.padding.right;
   else { spec.width = place.clientWidth; spec.datasets = DATA; }
   const own = spec.usermeta || {};
   if (own.square) {
     spec.width = spec.height = Math.min(place.clientWidth, own.square) - 2 * MARGIN;
-    spec.autosize = "pad"; // else width would be what the margins leave of it, and height would not
+    spec.autosize = "pad"; // otherwise the margins would reduce the width, but not the height
   }
   for (const [channel, ends] of Object.entries(ENLARGED[name] || {})) {
     const encoding = spec.encoding[channel];
@@ -42,7 +42,7 @@ function boxed(name, place, view, square) {
   }
   const drawn = place.querySelector("canvas, svg");
   drawn.addEventListener("dblclick", () => enlarge());
-  // A finger comes down without having moved there, and on a canvas Vega knows what is under it by moves alone.
+  // A touch begins without a movement, and on a canvas Vega finds the mark under the pointer only by movements.
   drawn.addEventListener("pointerdown", event => drawn.dispatchEvent(new PointerEvent("pointermove", event)), true);
   drawn.addEventListener("pointerdown", () => addEventListener("pointerup", async () => {
     await view.runAsync();

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTML pages with figures: Vega-Lite specifications, rendered by the page itself or here as images.
+"""HTML pages with figures: Vega-Lite specifications, rendered by the page itself or, as images, by this module.
 
 The page contains Vega's library and the drawing script. Only these two scripts, identified by their hashes, can run; a
 string from a bag or a sweep cannot.
@@ -27,7 +27,7 @@ Rows = list[dict[str, Any]]
 Column = Samples | Sequence[float | str | None] | float | str | bool | None
 
 _HERE = Path(__file__).parent
-_PAPER = 900  # [px] width of an image, about that of the page
+_PAPER = 900  # [px] width of an image, approximately that of the page
 _GUIDE: Spec = {"labelColor": "--soft", "titleColor": "--ink", "gridColor": "--line", "domainColor": "--soft"}
 _GUIDE |= {"tickColor": "--soft", "labelFontSize": 11, "titleFontSize": 11}
 #: Style of all figures; names that begin with -- are colours of the page, see page.css.
@@ -68,7 +68,7 @@ def _light() -> Spec:
 
 
 def page_template(path: Path, **filters: Callable[[str], str]) -> Template:
-    """Return the template in a file; it can include files beside it and the parts that all pages share.
+    """Return the template in a file; the template can include files beside it and the parts that all pages share.
 
     Strings from a bag or a sweep are escaped, so that they cannot close an element.
     """
@@ -88,7 +88,7 @@ class Charts:
     """Figures of a page.
 
     Attributes:
-        specs: specifications by figure and choice; a figure without choices has one named "".
+        specs: specifications by figure and choice; a figure without choices has a single one named "".
         chosen: choice shown first, by figure.
         data: data sets shared by the figures.
     """
@@ -121,17 +121,17 @@ class Charts:
         return bytes(convert(spec, scale=scale))
 
     def picture(self, name: str, beside: int) -> str:
-        """Return one of ``beside`` parts of a figure as a data URI: SVG, or JPEG if it has too many marks."""
+        """Return one of ``beside`` parts of a figure as a data URI: SVG, or JPEG if the part has too many marks."""
         spec = self._static(name)
         own = spec.get("usermeta", {})
-        if "square" in own:  # as charts.js draws it
+        if "square" in own:  # drawn as in charts.js
             spec |= {"width": own["square"], "height": own["square"], "autosize": "pad"}
         else:
             spec["width"] = _PAPER // beside
         if own.get("renderer") == "canvas":
             kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
         else:
-            ids: dict[str, str] = {}  # Vega numbers them across all figures of a process
+            ids: dict[str, str] = {}  # Vega numbers clip paths across all figures of a process
             svg = re.sub(
                 r'(?<= id=")clip\d+|(?<=url\(#)clip\d+',
                 lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),
@@ -147,7 +147,7 @@ class Charts:
 
     @property
     def scripts(self) -> list[str]:
-        """Return the scripts that draw the figures; none without figures."""
+        """Return the scripts that draw the figures; empty if there are no figures."""
         return [library(), (_HERE / "charts.js").read_text(encoding="utf-8")] if self.specs else []
 
     @property
@@ -199,6 +199,6 @@ def tip(**fields: str) -> Rows:
 
 
 def axis_scale(*, log: bool = False, ends: Sequence[float] = ()) -> Spec:
-    """Return the scale of an axis or of colours: from the smallest to the largest value, or between two ends."""
+    """Return the scale of an axis or of colours, from the smallest to the largest value, or between two ends."""
     kind: Spec = {"type": "log", "nice": False} if log else {"type": "linear", "nice": False, "zero": False}
     return kind | ({"domain": [number(end, 6) for end in ends]} if len(ends) else {})

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Report of a bag: one self-contained HTML page.
 
-Strings from a bag are not trusted: the template escapes them, they are truncated, and non-printable characters are
-removed.
+Strings from a bag are not trusted: they are truncated and reduced to printable characters, and the template escapes
+them.
 """
 
 import json
@@ -141,7 +141,7 @@ def losses(data: Gathered) -> list[str]:
     host = data.host
     found = [f"reading stopped: {data.stopped}"] if data.stopped else []
     for topic, tally in islice(data.topics.items(), _MOST_ROWS):
-        if tally.open_end and not data.stopped and not data.complete:  # a snapshot ends before the run
+        if tally.open_end and not data.stopped and not data.complete:  # a snapshot ends before the run does
             found.append(f"{topic} does not say that the run ends with its last block: the recording was cut off")
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
     found += host.errors
@@ -217,7 +217,7 @@ def _budget(found: Budget) -> Grid | None:
 
 
 def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
-    """Return the key figures at the top of the report: name, value and mood."""
+    """Return the key figures at the top of the report: name, value and mood (CSS class)."""
     yield ("recording", "complete", "good") if data.complete else ("recording", "incomplete", "bad")
     yield "simulated", f"{data.seconds:.4g} s", ""
     yield "samples", f"{data.samples:,}".replace(",", " "), ""
@@ -234,14 +234,14 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
     """Return the report as an HTML page.
 
     Args:
-        data: figures of the bag.
+        data: data gathered from the bag.
         name: name of the bag.
         command: command that reproduces the page.
         made_of: budget of the form error; None: no budget.
     """
     charts = Charts()
     template = page_template(Path(__file__).with_name("report.html.j2"), printable=printable)
-    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers: they are shown unchanged
+    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers, which are shown unchanged
         cycles = {f"{topic}: {field}": found for (topic, field), found in data.curves.cycles.items() if found.size}
         forms = [_form(form, cycles, len(data.forms), charts) for form in data.forms]
         signals = list(_signals(data, charts))
@@ -276,12 +276,12 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
 
 
 def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, with_budget: bool = False) -> Gathered:
-    """Write the report of a bag; an existing report of the same name is replaced atomically.
+    """Write the report of a bag; an existing file of the same name is replaced atomically.
 
     Args:
         bag: path of the bag.
         page: path of the HTML file.
-        with_budget: add the budget of the form error, from runs of the bag's scenario.
+        with_budget: whether to add the budget of the form error, from runs of the bag's scenario.
 
     Raises:
         InputError: not a bag, or the page cannot be created; with a budget, the bag has no scenario for an offline run.

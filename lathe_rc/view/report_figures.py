@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a report as Vega-Lite specifications; they can be enlarged on a screen."""
+"""Figures of a report as Vega-Lite specifications; they can be enlarged on screen."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,19 +14,19 @@ from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
 
-_FIELDS = 40_000  # in all maps of a page
-_ACROSS = 256  # fields of a map in a revolution
+_FIELDS = 40_000  # total number of fields in all maps of a page
+_ACROSS = 256  # fields of a map per revolution
 _LINEAR = 8.0  # parameter of the symmetric logarithm: larger values give the remaining error more colours
-_SQUARE = 460  # [px] the largest polar figure
+_SQUARE = 460  # [px] size of the largest polar figure
 _INSIDE = 1.2  # radius of the desired form in a polar figure, relative to the largest deviation
-_POINTS = 720  # of a polar figure
+_POINTS = 720  # points of a polar figure
 _OTHERS = 4  # largest number of controllers with plotted cycles
 _LAST, _FIRST, _BEST, _GREY, _COLOURS = 0, 1, 2, 5, 6  # indices of the page's colours, and their number
 _LONGEST_LABEL = 60  # characters
 _LONGEST_LENGTH = 1e3  # largest drawn length [m]
 _MOST_VALUE = 1e12  # largest value of other signals
 _FLOOR = 1e-3  # smallest form error that a figure resolves [µm]
-_ALMOST = 1e-9  # relative difference from which two numbers count as different
+_ALMOST = 1e-9  # relative difference above which two numbers count as different
 
 #: Dragging selects the range to enlarge.
 _BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
@@ -66,7 +66,7 @@ def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: 
 
 
 def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
-    """Return a colour encoding by label, with the page's colours of the given indices."""
+    """Return a colour encoding by label, with the page's colours at the given indices."""
     domain = [f"_{place}" for place in range(_COLOURS)]
     for label, place in places.items():
         domain[place] = label
@@ -78,9 +78,9 @@ def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool)
 
 
 def colour_range(map_rows: Samples) -> tuple[float, float]:
-    """Return the largest magnitude of a map [µm], and the limit of linear colours: the maximum of its quietest quarter.
+    """Return the largest magnitude of a map, and that of its quietest quarter as the limit of the linear colours [µm].
 
-    With these limits the first cycles, the remaining error and faults are all visible.
+    With these limits, the first cycles, the remaining error and faults are all visible.
     """
     each = np.sort(np.abs(map_rows).max(axis=1))
     largest = max(float(each[-1]), _FLOOR)
@@ -88,8 +88,8 @@ def colour_range(map_rows: Samples) -> tuple[float, float]:
 
 
 def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
-    """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis of a direction."""
-    # The page holds one number per field; Vega computes the positions, which would make the page 5 times as large.
+    """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis per direction."""
+    # The page holds one number per field; positions, which Vega computes, would make the page 5 times as large.
     place = "(datum.k - 1)"
     return _rectangles(
         340,
@@ -115,7 +115,7 @@ def _across(step: float, ticks: int) -> Spec:
 
 
 def _downsample(fields: Samples, most: int) -> tuple[Samples, int]:
-    """Return means of neighbouring rows, ``most`` at most, and the number of rows in each mean."""
+    """Return at most ``most`` means of neighbouring rows, and the number of rows in each mean."""
     group = -(-len(fields) // most)
     starts = np.arange(0, len(fields), group)
     counts = np.minimum(starts + group, len(fields)) - starts
@@ -242,7 +242,7 @@ def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
 
 
 def spectrum_range(form: Form) -> tuple[float, float]:
-    """Return a range of amplitudes [µm] with three decades for each shown revolution; (0, 0) without any amplitude."""
+    """Return a range of amplitudes [µm] with three decades for each shown revolution; (0, 0) without amplitudes."""
     tops = [float(um(revolution.amplitude[1:]).max()) for _, revolution in shown_revolutions(form)]
     tops = [top for top in tops if top > 0.0]
     return (min(min(tops) * 1e-3, max(tops) * 1e-6), max(tops) * 2.0) if tops else (0.0, 0.0)
@@ -276,7 +276,7 @@ def spectrum(form: Form) -> Spec:
 # --- curves
 
 
-_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, index of its colour, drawn as dots
+_Drawn = Mapping[str, tuple[Envelope, int, bool]]  # by name: series, index of its colour, whether it is drawn as dots
 _Scaled = Callable[[Samples], Samples]
 
 
@@ -289,16 +289,16 @@ def _lines(
     log: bool,
     limit: float = 0.0,
 ) -> Spec:
-    """Return a plot of named lines, with a band where a point stands for several values; a limit is a dashed line.
+    """Return a plot of named lines, with a band where a point stands for several values; a limit is drawn dashed.
 
     Values that a logarithmic axis cannot show are omitted.
 
     Args:
         curves: curves by name (see `_Drawn`).
-        scaled: functions that convert places and values to the units of the axes.
+        scaled: functions that convert positions and values to the units of the axes.
         titles: titles of the axes.
         height: height of the plot [px].
-        log: use a logarithmic axis for the values.
+        log: whether the values have a logarithmic axis.
         limit: value of the limit line; 0: no limit.
     """
     across, up = titles
@@ -363,7 +363,7 @@ def against_time(gathered: Gathered, signals: Mapping[str, Envelope], unit: str,
     """Return a plot of signals over simulated time, with their extremes as a band.
 
     Args:
-        gathered: figures of the bag, with the sampling step.
+        gathered: data of the bag, with the sampling step.
         signals: envelopes by name.
         unit: quantity and unit of the axis.
         scale: factor from the signals' unit to the axis unit.
@@ -393,7 +393,7 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
 
 
 def timing(host: Host, step: float) -> list[Spec]:
-    """Return histograms of the pace, and of block lateness and latency if there are any; ``step`` in s."""
+    """Return histograms of the pace, and of block lateness and latency if available; ``step`` in s."""
     pace = _clipped(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
     least = _ALMOST * max(abs(low), abs(high))

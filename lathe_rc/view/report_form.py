@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Form of the part from a stream of samples, measured as soon as each revolution is complete."""
+"""Form of the part from a stream of samples; each revolution is measured as soon as it is complete."""
 
 from array import array
 from collections import deque
@@ -18,12 +18,12 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_series import Envelope, MeanRows
 
-ACROSS = 512  #: angles of the map
-CUTOFF = 50.0  #: of the filters for roundness and roughness [UPR], as in `lathe measure`
-_MARGIN = 64  # samples on each side for which a spline agrees with that of the whole run to a bit or two
-_AT_ONCE = 16  # revolutions
+ACROSS = 512  #: number of angles in the map
+CUTOFF = 50.0  #: cutoff of the filters for roundness and roughness [UPR], as in `lathe measure`
+_MARGIN = 64  # samples on each side, with which a spline agrees with that of the whole run to a bit or two
+_AT_ONCE = 16  # revolutions measured at a time
 _ALONG = 8  # revolutions in the surface along the part
-_LONGEST = 2**22  # samples of one revolution
+_LONGEST = 2**22  # largest number of samples in one revolution
 _TURN = 2.0 * np.pi
 
 
@@ -32,8 +32,8 @@ class Revolution:
     """Form of one revolution in the report.
 
     Attributes:
-        numbers: figures of the revolution (see `lathe_rc.part.numbers`).
-        profile: deviation of the radius at even angles [m], shape (points,).
+        numbers: key figures of the revolution (see `lathe_rc.part.numbers`).
+        profile: radius deviation at uniformly spaced angles [m], shape (points,).
         amplitude: amplitudes of the undulations [m], starting at 0 UPR.
     """
 
@@ -48,15 +48,15 @@ class Form:
     Args:
         encoder: topic with the angle.
         tool: topic with the form error.
-        tolerance: allowed form error to each side [m]; 0: no tolerance.
+        tolerance: allowed form error in either direction [m]; 0: no tolerance.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
 
     Attributes:
         tool, tolerance: see the arguments.
-        first, last, best: first, last and best (by RMS) revolution; None before the first.
+        first, last, best: first, last and best (by RMS) revolution; None until one is measured.
         rms, largest: envelopes over the revolutions [m].
         map: radius deviation [m], by revolution and angle.
-        newest: radius deviation of the last revolutions at even angles [m], shape (points,) each.
+        newest: radius deviation of the last revolutions at uniformly spaced angles [m], shape (points,) each.
         surface: surface along the part, or the reason why it is missing; None without a nose radius.
         refused: reason why the form, or the rest of it, is not measured; empty if it is.
     """
@@ -64,7 +64,7 @@ class Form:
     def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
-        self._largest, self._before = array("d"), 0  # form error [m] of every revolution, and those before the first
+        self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
         self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
@@ -83,7 +83,7 @@ class Form:
         if self.refused:
             return
         angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
-        if first and not self._held.size and not self._done:  # a snapshot begins in mid-revolution
+        if first and not self._held.size and not self._done:  # a snapshot begins in the middle of a revolution
             self._done = self._before = int(np.ceil(angle[0] / _TURN))
         height = tool["height"] if self._nose_radius else np.zeros(samples)
         new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
@@ -92,7 +92,7 @@ class Form:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Return whether the form is in tolerance; None without a tolerance, or if it cannot be measured to the end."""
+        """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
         if not self.tolerance or self.refused:
             return None
         return judge(np.array(self._largest), self.tolerance, self._before)
@@ -119,11 +119,11 @@ class Form:
         finite = np.isfinite(self._held).all(axis=0)
         broken = not finite.all()
         if broken:
-            # No samples can follow: the revolutions before are measured up to their end.
+            # No samples can follow, so the revolutions before are measured up to their end.
             margin, self._held = 0, self._held[:, : np.argmin(finite)]
         try:
             self._check()
-            with np.errstate(over="ignore", invalid="ignore"):  # for absurd samples; the numbers show them
+            with np.errstate(over="ignore", invalid="ignore"):  # for absurd samples, which the numbers show
                 while self._measure_some(margin):
                     pass
         except InputError as error:
@@ -136,7 +136,7 @@ class Form:
         self._held = np.empty((3, 0))
 
     def _check(self) -> None:
-        """Reject samples that would take too much memory or give no form.
+        """Reject samples that would take too much memory or do not give a form.
 
         Raises:
             InputError: the samples are rejected, with the reason.
@@ -158,8 +158,8 @@ class Form:
         whole = int(np.count_nonzero(edges[1:] + margin < angle.size)) if margin else _AT_ONCE
         if not whole:
             return False
-        # The spline through a revolution depends on the samples beyond its end: with them the numbers agree with those
-        # of the whole run, whatever the chunks.
+        # The spline through a revolution depends on the samples beyond its end. With these, the numbers agree with
+        # those of the whole run, however the run is divided into chunks.
         stop = int(edges[whole]) + _MARGIN
         found = measure(angle[:stop], error[:stop], roundness_cutoff=CUTOFF, roughness_cutoff=CUTOFF)
         whole = min(whole, found.form.rms.size)

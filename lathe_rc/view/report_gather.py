@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a report, gathered in one pass over the bag.
+"""Data of a report, gathered in one pass over the bag.
 
-Memory grows by 8 bytes per revolution and per report of the time master.
+Memory use grows by 8 bytes per revolution and per report of the time master.
 """
 
 from collections.abc import Mapping
@@ -26,9 +26,9 @@ from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
 
-_MOST_OF_A_TYPE = 4  # topics with figures
+_MOST_OF_A_TYPE = 4  # largest number of topics of a type that have figures
 _MOST_EVENTS = 100
-_PIECE = 65536  # samples
+_PIECE = 65536  # samples per chunk
 #: Fields plotted over time, and fields plotted over cycles, by message type.
 _CURVES = ((messages.ENCODER, "speed_true"), (messages.CUT, "force"), (messages.CUT, "wear"))
 _CYCLES = ((messages.LEARNING, "rms_error"), (messages.PERIODIC, "max_error"))
@@ -61,7 +61,7 @@ class Tally:
 
 @dataclass
 class EventKind:
-    """Events of a topic with the same text, except for numbers after a colon.
+    """Events of a topic with the same text up to a colon, or an alarm's with the same monitor and subject.
 
     Attributes:
         topic, text: topic and text of the first event.
@@ -108,7 +108,7 @@ class Curves:
                 text, alarm = event_log.text(event), bool(event.values.get("state"))
                 if len(self.events) < _MOST_EVENTS:
                     self.events.append(LogEntry(event.index, topic, text))
-                # Of an alarm: monitor and subject, which come before what was found.
+                # For an alarm: monitor and subject, which precede the finding.
                 key = topic, " ".join(text.split()[:2]) if alarm else text.partition(":")[0]
                 if key not in self.kinds and len(self.kinds) < _MOST_EVENTS:
                     self.kinds[key] = EventKind(topic, text, alarm, event.index)
@@ -124,7 +124,7 @@ def of_type(types: Mapping[str, str], kind: str) -> list[str]:
 
 @dataclass
 class Gathered:
-    """Figures of a bag for its report.
+    """Data of a bag for its report.
 
     Attributes:
         about: metadata of the bag.
@@ -134,10 +134,10 @@ class Gathered:
         run_id: identity of the run.
         forms: form error of each tool.
         curves: signals and cycles.
-        host: figures of the host topics.
+        host: data of the host topics.
         stopped: reason why the bag was not read to its end; empty if it was.
         nodes: unchecked values of the bag's scenario by node and parameter; empty without a scenario.
-        unjudged: reason why the scenario, and so the tolerance, is unknown; empty if it is known.
+        unjudged: reason why the scenario, and thus the tolerance, is unknown; empty if the scenario is known.
     """
 
     about: Mapping[str, str]
@@ -166,7 +166,7 @@ class Gathered:
 
     @property
     def missing(self) -> str:
-        """Return which of encoder and tool the bag lacks."""
+        """Name the topics that the bag lacks: encoder, tool or both."""
         kinds = {tally.type for tally in self.topics.values()}
         named = {"encoder": messages.ENCODER, "tool": messages.TOOL}
         return f"the bag has no {' and no '.join(name for name, kind in named.items() if kind not in kinds)}"
@@ -182,7 +182,7 @@ class Gathered:
 
 
 def gather(path: Path) -> Gathered:
-    """Gather the figures of a bag in one pass.
+    """Gather the data of a bag in one pass.
 
     Raises:
         InputError: not a bag.
@@ -217,7 +217,7 @@ def gather(path: Path) -> Gathered:
 
 
 def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
-    """Count every message, and pass it to the feeder or to the host figures."""
+    """Count every message, and pass it to the feeder or to the host data."""
     newest: dict[str, bytes] = {}
     for topic, log_ns, data in source.messages():
         tally = gathered.topics[topic]
@@ -225,7 +225,7 @@ def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
         tally.count, tally.size, tally.last_ns = tally.count + 1, tally.size + len(data), log_ns
         if topic in feeder.types:
             feeder.add(topic, log_ns, data)
-            newest[topic] = data  # decoded only at the end: the feeder has decoded it already
+            newest[topic] = data  # decoded again only at the end, because the feeder has already decoded it
         elif tally.type in HOST_TYPES:
             gathered.host.add(tally.type, data)
     left = feeder.finish()

@@ -14,10 +14,10 @@ TYPES = frozenset({DIAGNOSTICS, messages.CELL_STATE})
 
 _STATES = ("waiting", "running", "ended", "failed", "safe")
 _FAILED, _SAFE = 3, 4
-_ERROR = 2  # level of a status
+_ERROR = 2  # level of an error status
 _MOST_NODES = 128
 _MOST_LINES = 50
-_MOST_VALUES = 64  # of a status
+_MOST_VALUES = 64  # largest number of values kept from a status
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Node:
 
 
 class Host:
-    """Figures from the messages of host topics.
+    """State of the nodes and timing of the cell, from the messages of host topics.
 
     Attributes:
         nodes: state of each node, by name.
@@ -74,7 +74,7 @@ class Host:
             self._status(messages.stamp_ns(message) * 1e-9, status)
 
     def _append(self, lines: list[str], text: str) -> None:
-        """Append a line, unless it repeats the last one or the list is full."""
+        """Append a line unless it repeats the last line or the list is full."""
         if text in lines[-1:]:
             return
         if len(lines) < _MOST_LINES:
@@ -117,13 +117,13 @@ class Host:
         self.lateness[name], self.latency[name] = durations
         began, done, turned = self._marks.get(name, (wall, 0.0, 0.0))
         self._marks[name] = wall, blocks, samples
-        if done and wall > began and blocks > done:  # the cell was running in the whole interval
+        if done and wall > began and blocks > done:  # the cell was running throughout the interval
             pace = (samples - turned) / (wall - began)
             if math.isfinite(pace):
                 self.pace.append(pace)
 
     @property
     def lost_blocks(self) -> dict[str, int]:
-        """Return the number of lost blocks by node, without nodes that lost none."""
+        """Return the number of lost blocks by node, omitting nodes that lost none."""
         counts = {name: node.values.get("lost blocks", "0") for name, node in self.nodes.items()}
         return {name: int(count) for name, count in counts.items() if count.isdecimal() and count.strip("0")}

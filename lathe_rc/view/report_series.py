@@ -12,7 +12,7 @@ class _Groups:
     Args:
         capacity: largest number of groups, even.
         shape: shape of a value.
-        how: ufuncs that combine the values of a group, each with its identity.
+        how: ufuncs that combine the values of a group, each with its identity element.
 
     Attributes:
         group: number of values per group.
@@ -32,7 +32,7 @@ class _Groups:
             for ufunc, empty, kept in self._how:
                 kept[: self._capacity // 2] = ufunc(kept[::2], kept[1::2])
                 kept[self._capacity // 2 :] = empty
-        # One call of reduceat for all new values: a segment begins at each change of group.
+        # A single call of reduceat handles all new values; a segment begins at each change of group.
         place = np.arange(first, self.size) // self.group
         edges = np.flatnonzero(np.diff(place, prepend=-1))
         groups = place[edges]
@@ -86,6 +86,6 @@ class MeanRows(_Groups):
     def rows(self) -> Samples:
         """Return the mean of each group, shape (groups, width)."""
         (sums,) = self._kept()
-        counts = np.minimum(self.size - np.arange(len(sums)) * self.group, self.group)  # the last may be smaller
+        counts = np.minimum(self.size - np.arange(len(sums)) * self.group, self.group)  # the last group may be smaller
         mean: Samples = sums / counts[:, None]
         return mean

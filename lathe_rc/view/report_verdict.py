@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Head of a report: whether the part is in tolerance, failures and faults, and the limits of the form error.
+"""Head of a report: whether the part is in tolerance, failures and faults, and the causes that limit the form error.
 
-The data comes from a single pass over the bag: the final form error, its repeatable part, the spindle speed and the
-events of the nodes. Only a budget gives the share of each cause.
+A single pass over the bag yields the data: the final form error, its repeatable part, the spindle speed and the events
+of the nodes. Only a budget gives the share of each cause.
 """
 
 import math
@@ -21,11 +21,11 @@ from lathe_rc.view.report_gather import EventKind, Gathered
 
 GOOD, BAD, WARN = "good", "bad", "warn"
 
-_FEWEST = 4  # smallest number of revolutions with a trend
+_FEWEST = 4  # smallest number of revolutions for a trend
 _CHANGE = 0.05  # change of the form error over the last revolutions below which it counts as constant
-_VARIES = 0.005  # smallest deviation of a speed that counts as varying
+_VARIES = 0.005  # smallest relative deviation at which a speed counts as varying
 _SOME = 0.1  # smallest share of the power that is reported
-_MOST = 6  # kinds of incidents
+_MOST = 6  # largest number of kinds of incidents
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Assessment:
     Attributes:
         verdict: whether the part is in tolerance.
         wrong: failures and faults.
-        limits: causes that limit the form error, the most important first.
+        limits: causes that limit the form error, most important first.
     """
 
     verdict: Finding
@@ -52,10 +52,10 @@ class Assessment:
 
 
 def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Assessment:
-    """Assess the run from the figures of its bag.
+    """Assess the run from the data of its bag.
 
     Args:
-        data: figures of the bag.
+        data: data gathered from the bag.
         losses: rejected messages, losses and failures, one line each.
         made_of: budget of the form error, if requested.
     """
@@ -72,7 +72,7 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
         if kind.text.startswith(LIMITED):
             node = kind.topic.strip("/").removesuffix("/events")
             limits.append(Finding(f"{node} came to the limits of its command, {_when(data, kind)}.", WARN))
-    if form and not incidents and not growth:  # else incidents or growth determine the form error
+    if form and not incidents and not growth:  # otherwise incidents or growth determine the form error
         limits += _form(data, form)
     verdict = _verdict(data, form)
     if growth:
@@ -144,11 +144,11 @@ def _form(data: Gathered, form: Form) -> Iterator[Finding]:
 
 
 def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
-    """Yield a finding on the trend of the form error, if the last revolutions fall or grow clearly."""
+    """Yield a finding on the trend of the form error, if the error clearly falls or grows in the last revolutions."""
     half = len(rms) // 2
     before, after = rms[:half], rms[-half:]
     factor = float(after.mean() / before.mean()) if before.mean() else 1.0
-    each = float(np.median(rms[1:] / rms[:-1])) if rms.all() else 1.0  # a step is no trend
+    each = float(np.median(rms[1:] / rms[:-1])) if rms.all() else 1.0  # a step is not a trend
     if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
         more = ""
         if form.verdict and not form.verdict.in_tolerance:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from lathe_rc.view.rerun_scene import Scene
 
-_PIECE = 65536  # samples
-_END_NS = 1_000_000_000  # before the end of a bag, range of the search for its last blocks
-_POINTS = 300_000  # of a curve: a long bag gets fewer per second
+_PIECE = 65536  # approximate number of samples in a chunk
+_END_NS = 1_000_000_000  # length of the range at the end of a bag that is searched for its last blocks
+_POINTS = 300_000  # points of a curve; a long bag gets fewer per second
 
 
 def _block(source: Source, topic: str, *, last: bool = False) -> Block | None:
@@ -66,7 +66,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
     """Log a bag to a recording.
 
     Args:
-        recording: recording with a sink; stays open.
+        recording: recording with a sink; it stays open.
         bag: path of the bag.
         rate: largest number of curve points per second.
 
@@ -78,7 +78,7 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
         LatheError: the bag is incomplete, or the recording cannot be written.
     """
     scene = _scene(recording, bag, rate)
-    # Chunks of complete windows: the points of the curves then do not depend on the chunks.
+    # Chunks of complete windows, so that the points of the curves do not depend on the chunks.
     header = stream.feed(bag, [scene], piece=max(scene.window, _PIECE // scene.window * scene.window))
     scene.close()
     return header.samples
@@ -99,7 +99,7 @@ def write(bag: Path, output: Path, *, rate: float = RERUN_RATE) -> int:
     if not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}")
     recording = rr.RecordingStream("lathe_rc", recording_id=name_of(bag))
-    # Rerun writes continuously: under another name, so that a failure leaves an existing file unchanged.
+    # Rerun writes continuously. It writes under another name, so that a failure leaves an existing file unchanged.
     beside = output.with_name(f".{output.name}.{os.getpid()}")
     try:
         recording.save(beside)

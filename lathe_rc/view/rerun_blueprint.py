@@ -10,7 +10,7 @@ from lathe_rc.event_log import LOGGED
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 
-_LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # before the time cursor, in plots of fast signals
+_LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # range before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
 _COLOURS = ("blue", "orange", "green")  # names of the colours of a plot's first curves
 
@@ -33,7 +33,7 @@ _LATEST = _until_cursor(  # this range sets the scale of a plot
 def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
     """Return one plot per group of curves, for the curves that exist.
 
-    A legend would cover the curves: with few curves, the title names their colours instead.
+    Since a legend would cover the curves, the title names their colours instead if there are only a few.
     """
     paths: dict[str, list[str]] = {}
     labels: dict[str, list[str]] = {}
@@ -91,7 +91,7 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
 
     Args:
         types: message type by topic.
-        live: the view follows incoming data.
+        live: whether the view follows incoming data.
         silent: topics without messages.
     """
     kinds = set(types.values())

@@ -35,7 +35,7 @@ PIECE = 0.1  #: approximate length of a chunk [s] of simulated time
 class Backlog:
     """Queue of messages to be shown. When it is full, all of them are dropped, so that later chunks are complete again.
 
-    If every second message were dropped instead, no chunk would be without a gap.
+    If every second message were dropped instead, every chunk would have gaps.
 
     Args:
         limit: size of the queue [B].
@@ -49,7 +49,7 @@ class Backlog:
         self._closed = False
 
     def put(self, *added: Message | None) -> None:
-        """Add messages; None: no publisher is left."""
+        """Add messages; None means that no publisher is left."""
         with self._news:
             for message in added:
                 size = len(message[2]) if message else 0
@@ -61,7 +61,7 @@ class Backlog:
             self._news.notify()
 
     def close(self) -> None:
-        """Close the queue: the reader ends after the last message."""
+        """Close the queue; the reader ends after the last message."""
         with self._news:
             self._closed = True
             self._news.notify()
@@ -79,17 +79,17 @@ class Backlog:
 
 
 class RunOrder:
-    """Assignment of samples of many topics to runs; the order holds within each topic only, not across topics.
+    """Assignment of samples of many topics to runs; samples arrive in order within each topic, but not across topics.
 
-    Runs have run ids, but equal scenarios have equal ids: a topic whose sample index decreases also starts a new run.
-    Late samples of the previous run are recognized because they continue that topic.
+    Runs have run ids, but equal scenarios have equal ids, so a topic whose sample index decreases also starts a new
+    run. Late samples of the previous run are recognised because they continue that topic.
     """
 
     def __init__(self) -> None:
         self._run: str | None = None
         self._before: str | None = None
         self._ends: dict[str, int] = {}  # sample after the newest of each topic, in this run
-        self._old: dict[str, int] = {}  # and in the previous run
+        self._old: dict[str, int] = {}  # likewise in the previous run
 
     def place(self, topic: str, run: str, first: int, end: int) -> Literal["same", "new", "old"]:
         """Return the run that a topic's samples belong to: the current one, a new one, or the previous one."""
@@ -119,8 +119,8 @@ class ShownRun:
         first: first sample shown; above 0 if the view was started late.
         end: sample after the last one received.
         revolutions: number of revolutions shown.
-        left_out: number of chunks that lack some topics or all.
-        complete: the last block of every topic was received.
+        left_out: number of chunks that lack some or all topics.
+        complete: whether the last block of every topic was received.
     """
 
     run_id: str
@@ -218,7 +218,7 @@ class Live:
         say: called with each line for the user.
 
     Attributes:
-        present: message type by topic, for all topics with publishers; a new run begins with these.
+        present: message type by topic, for all topics with publishers; a new run begins with these topics.
         shown: summaries of the finished runs.
     """
 
@@ -230,7 +230,7 @@ class Live:
         self._decoders: dict[str, Decoder] = {}
         self._run: _RunView | None = None
         self._over = False  # the current run has ended; further samples of it are ignored
-        self._early: list[Sparse] = []  # before the first block
+        self._early: list[Sparse] = []  # messages before the first block
 
     def take(self, topic: str, msgtype: str, data: bytes) -> None:
         """Add an encoded message of a plotted topic.
@@ -271,7 +271,7 @@ class Live:
         return where != "old" and not self._over
 
     def end(self) -> None:
-        """Close the view of the current run, after its end or without publishers.
+        """Close the view of the current run once it has ended or no publishers remain.
 
         Raises:
             LatheError: the view cannot be written.

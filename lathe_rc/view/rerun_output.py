@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 _HOST = "127.0.0.1"
-_START = 30.0  # [s] for a viewer to start
-_POLL = 0.05  # [s] between attempts to reach it
+_START = 30.0  # [s] allowed for a viewer to start
+_POLL = 0.05  # [s] between attempts to reach the viewer
 
 
 def require() -> None:
@@ -38,7 +38,7 @@ def require() -> None:
 def _free_port() -> int:
     """Return a free port.
 
-    If another program takes the port before the viewer does, the viewer does not start, which is reported.
+    If another program takes the port before the viewer does, the failure of the viewer to start is reported.
     """
     with socket.socket() as listener:
         listener.bind((_HOST, 0))
@@ -55,7 +55,7 @@ def _answers(host: str, port: int) -> bool:
 
 @dataclass(frozen=True)
 class Viewer:
-    """Command of a Rerun viewer that is to be started.
+    """Command that starts a Rerun viewer.
 
     Attributes:
         options: command-line options.
@@ -68,7 +68,7 @@ class Viewer:
     message: str
 
     def start(self, *files: Path) -> "subprocess.Popen[bytes]":
-        """Start the viewer with the files to show; it does not receive Ctrl-C itself."""
+        """Start the viewer with the files to show; the viewer does not receive Ctrl-C."""
         return subprocess.Popen(
             [*allowed_code.interpreter("rerun"), *self.options, *map(str, files)],
             env=os.environ | {"RUST_LOG": "error"},
@@ -78,7 +78,7 @@ class Viewer:
 
 
 def end_viewer(process: "subprocess.Popen[bytes]") -> None:
-    """End a viewer that was started, including the child process that is the actual viewer."""
+    """End a started viewer, including the child process that is the actual viewer."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGTERM)
     process.wait()
@@ -92,7 +92,7 @@ def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
         port: port of the page.
 
     Raises:
-        InputError: no display for a window.
+        InputError: there is no display for a window.
     """
     data = _free_port()
     options = ["--bind", _HOST, "--port", str(data)]  # by default, Rerun listens on all interfaces
@@ -105,13 +105,13 @@ def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
 
 
 class Output:
-    """Output of a live view: one recording per run; a context manager.
+    """Output of a live view, with one recording per run; a context manager.
 
     Args:
         kind: destination: ``save``, ``spawn``, ``serve`` or ``connect``.
         file: file of the first recording, for ``save``; later files have a number in their names. No file is
             overwritten.
-        url: URL of a viewer, for ``connect``, as rerun+http://127.0.0.1:9876/proxy.
+        url: URL of a viewer, for ``connect``, such as rerun+http://127.0.0.1:9876/proxy.
         port: port of the page, for ``serve``.
 
     Raises:
@@ -144,7 +144,7 @@ class Output:
             due = time.monotonic() + _START
             while not _answers(_HOST, self._viewer.port):
                 if self.ended or time.monotonic() > due:
-                    self.__exit__()  # Python does not call it where __enter__ raises
+                    self.__exit__()  # Python does not call it if __enter__ raises
                     raise LatheError("Rerun does not start")
                 time.sleep(_POLL)
             self._url = f"rerun+http://{_HOST}:{self._viewer.port}/proxy"
@@ -153,7 +153,7 @@ class Output:
 
     @staticmethod
     def _check_viewer(url: str) -> None:
-        """Check that the URL is a viewer's and that the viewer answers."""
+        """Check that the URL belongs to a viewer and that the viewer answers."""
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port

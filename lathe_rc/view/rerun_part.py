@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shapes and colours of the three-dimensional view: rings of the part, the tool, and the colour scale.
 
-The axes are those of a lathe: Z along the spindle, X from it to the tool. Lengths are in millimetres; the part is
-drawn with a fixed radius, since a recording does not contain the true one.
+The axes are those of a lathe: Z along the spindle, X from the spindle to the tool. Lengths are in millimetres; the part
+is drawn with a fixed radius, since a recording does not contain the true one.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ Array = npt.NDArray[np.float64]
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
 COLOURS: Final = "turbo"  #: Rerun uses the same name
-LOG_RANGE = (-1.5, 2.5)  #: of the colours: log10 of |form error| in µm
-RADIUS = 50.0  #: of the part [mm]
-LENGTH = 110.0  #: of the part, if the extent of the run is known [mm]
-_PITCH = 0.5  # between revolutions, if it is unknown [mm]
+LOG_RANGE = (-1.5, 2.5)  #: range of the colours, as log10 of |form error| in µm
+RADIUS = 50.0  #: radius of the part [mm]
+LENGTH = 110.0  #: length of the part, if the extent of the run is known [mm]
+_PITCH = 0.5  # distance between revolutions, if the extent is unknown [mm]
 _DEEPEST = 0.4 * RADIUS  # largest drawn deviation [mm]
 _SWING = 0.24 * RADIUS  # intended range of the drawn deviations [mm]
 _LEAST = 10e-6  # lower limit of the deviations' range [m]
 _STEP = 2  # one vertex per this many angles
 _VERTICES = ANGLES // _STEP
-_SMALLEST = 1e-9  # form error that differs from 0 [m]
+_SMALLEST = 1e-9  # smallest form error that is distinguished from 0 [m]
 
 
 def log_um(error: Array) -> Array:
@@ -71,7 +71,7 @@ class Scale:
 
     @classmethod
     def of(cls, outlook: Outlook, reference: Array) -> "Scale":
-        """Return a scale that suits the outlook of the run and its first desired deviations [m], shape (n,)."""
+        """Return a scale that suits the known properties of a run and its first desired deviations [m], shape (n,)."""
         swing = float(np.ptp(reference))
         wanted = _SWING / (max(swing if np.isfinite(swing) else 0.0, _LEAST) * 1e3)
         decade = 10.0 ** np.floor(np.log10(wanted))
@@ -95,7 +95,7 @@ class Scale:
 
 
 def ring(revolution: Revolution, scale: Scale) -> Ring:
-    """Return vertices, normals and colours of the part's ring in a revolution; two rings form a strip."""
+    """Return vertices, normals and colours of the part's ring for a revolution; two rings form a strip."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))
     z = float(scale.z(np.array(revolution.number - 0.5), np.array(revolution.height)))
@@ -115,8 +115,8 @@ def _triangles() -> npt.NDArray[np.uint32]:
     return np.concatenate([np.stack(half, axis=1) for half in halves]).astype(np.uint32)
 
 
-TRIANGLES = _triangles()  #: of a strip, shape (triangles, 3)
-STRIP = 2 * _VERTICES  #: vertices in a strip
+TRIANGLES = _triangles()  #: triangles of a strip, shape (triangles, 3)
+STRIP = 2 * _VERTICES  #: number of vertices in a strip
 
 #: The tool with its tip at the origin: vertices [mm] and triangles.
 TOOL = (
@@ -127,6 +127,6 @@ TOOL = (
 
 def rotations(angle: Array) -> Array:
     """Return quaternions that rotate the point under the tool at a spindle angle [rad] to the tool, shape (n, 4)."""
-    # A quaternion has half the angle, so that 4π is its period: with 2π its sign would jump at every revolution.
+    # A quaternion contains half the angle, so its period is 4π; with 2π, its sign would jump at every revolution.
     half = -0.5 * np.mod(angle, 4.0 * np.pi)
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)

@@ -2,7 +2,7 @@
 """Chunks of equal length that all topics share, assembled from the blocks of many topics.
 
 Chunks begin at fixed samples, so that the view does not depend on the block size. They combine the blocks of several
-publishers and tolerate missing blocks, since delivery to a viewer is best effort.
+publishers and tolerate missing blocks, since delivery to a viewer is best-effort.
 """
 
 from collections import defaultdict
@@ -15,7 +15,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.rerun_signals import drawn_fields
 
-_AHEAD = 4  # chunks that wait for late topics
+_AHEAD = 4  # number of chunks that wait for late topics
 
 _Cuts = list[tuple[int, Signals]]  # first sample and signals of a topic's blocks in a chunk, in order of arrival
 
@@ -34,15 +34,15 @@ def _join(first: int, cuts: _Cuts) -> Signals | None:
 
 
 class Pieces:
-    """Assembler of chunks: passes them to a sink in order, with the topics that are complete in them.
+    """Assembler of chunks, which it passes to a sink in order, each with the topics that are complete in it.
 
     Args:
         types: message type by topic, with or without a leading slash; only plotted block types are used.
-        size: length of a chunk [sample]; chunks begin at its multiples.
+        size: length of a chunk [sample]; chunks begin at multiples of ``size``.
         sink: receives the chunks, by fully qualified topic.
 
     Attributes:
-        first: first sample of the first chunk. A view that joins in mid-run begins where all topics are complete.
+        first: first sample of the first chunk. A view that joins during a run begins where all topics are complete.
         lost: number of chunks passed on without some topics, or dropped.
     """
 
@@ -76,7 +76,7 @@ class Pieces:
         topic, size = full(topic), self._size
         if topic not in self._fields:
             return
-        if topic not in self._ends and not self._begun:  # begin with the chunk after its first sample, or later
+        if topic not in self._ends and not self._begun:  # begin with the chunk after the topic's first sample, or later
             self._next = max(self._next, -(-first // size))
             self.first = self._next * size
             for piece in [piece for piece in self._waiting if piece < self._next]:
@@ -96,7 +96,7 @@ class Pieces:
             self._emit(oldest)
 
     def message(self, message: Sparse) -> None:
-        """Add a message at a chosen sample."""
+        """Add a message at its sample."""
         self._sparse.append(message)
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Form of the part by revolution, computed from chunks of a run; memory does not grow with its length."""
+"""Form of the part by revolution, computed from chunks of a run; memory use does not grow with the run."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from lathe_rc.errors import LatheError
 
 Array = npt.NDArray[np.float64]
 
-ANGLES = 360  #: sectors of a revolution
-HIGHEST = 50  #: of the harmonics [UPR]
-_FEWEST = 4.0  # samples per revolution at the highest plausible speed
-_LONGEST = 2**22  # samples of one revolution
+ANGLES = 360  #: number of sectors in a revolution
+HIGHEST = 50  #: highest harmonic [UPR]
+_FEWEST = 4.0  # smallest number of samples per revolution, at the highest plausible speed
+_LONGEST = 2**22  # largest number of samples in one revolution
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Revolution:
 
     Attributes:
         number: number of the revolution, starting at 1.
-        end: index of the first sample after it.
+        end: index of the first sample after the revolution.
         error: form error, mean of the samples in each of `ANGLES` sectors [m], shape (ANGLES,).
         radius: radius deviation of the part, desired form minus form error [m], shape (ANGLES,).
         height: mean position along the part [m].
@@ -44,7 +44,7 @@ class Revolution:
     def harmonics(self) -> Array:
         """Return the amplitudes of the form error by undulations per revolution [m], shape (HIGHEST + 1,)."""
         amplitude = undulations(self.error[None], HIGHEST).amplitude[0]
-        # A mean over a sector attenuates an undulation by the sinc of the covered part of its period.
+        # A mean over a sector attenuates an undulation by the sinc of the covered fraction of its period.
         return np.asarray(amplitude / np.sinc(np.arange(HIGHEST + 1) / ANGLES))
 
 
@@ -76,8 +76,8 @@ class Revolutions:
         # Angle [revolution], error, reference and height of the current revolution, shape (4, n); a sample covers the
         # angle up to the next one.
         self._held = np.empty((4, 0))
-        self._next = 0  # index of the sample after it
-        self._step = 0.0  # to the last sample [revolution]
+        self._next = 0  # index of the next sample
+        self._step = 0.0  # angle step to the last sample [revolution]
         self._entire: bool | None = None  # the revolution's first samples are present; None: not known yet
 
     def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[Revolution]:
@@ -110,13 +110,13 @@ class Revolutions:
             return
         self._step = float(step[-1])
         if self._entire is None:
-            # Its first sample is less than one step after its beginning; another half step allows for varying speed.
+            # The first sample is less than one step after the beginning; another half step allows for varying speed.
             self._entire = bool(turns[0] % 1.0 <= 1.5 * step[0])
         begins = [0] * self._entire + (np.flatnonzero(np.diff(np.floor(turns))) + 1).tolist()
         for a, b in pairwise(begins):
             yield from _measured(held[:, a:b], step[a:b], start + b)
         self._entire = bool(begins) and turns.size - begins[-1] <= _LONGEST
-        self._held = held[:, begins[-1] if self._entire else -1 :]  # at least one sample, for the step to the next
+        self._held = held[:, begins[-1] if self._entire else -1 :]  # at least one sample, for the step to the next one
 
     def finish(self) -> Iterator[Revolution]:
         """Return the last revolution, if fewer than two of its samples are missing."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun scene of a run: part, tool, signals and learning progress, logged in columns, chunk by chunk.
 
-The timelines are ``time``, the simulated time since sample 0, and ``revolution``, counted from 1. Memory does not grow
-with the run.
+The timelines are ``time``, the simulated time since sample 0, and ``revolution``, counted from 1. Memory use does not
+grow with the run.
 """
 
 import contextlib
@@ -26,10 +26,10 @@ from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolut
 from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
 
 _POSES = 250.0  # poses of part and tool per second
-_ROWS = 512  # of the map
+_ROWS = 512  # rows of the map
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their position
-_FLUSH, _EVER = 30.0, 1e9  # [s] for a viewer to take the rest of a live recording, and for a file
-_GROWTH = 8  # the map is sent again when it has grown by 1/8
+_FLUSH, _EVER = 30.0, 1e9  # [s] allowed for a viewer to take the rest of a live recording, and for a file
+_GROWTH = 8  # the map is resent when it has grown by 1/8
 # Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
 
@@ -37,16 +37,16 @@ _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240,
 class Scene:
     """Scene that logs chunks of a run; a sink of `bag.reading.stream.feed` or `lathe_rc.view.rerun_pieces.Pieces`.
 
-    A chunk may lack topics, and there may be gaps between chunks. The points of a curve do not depend on the chunks if
-    these begin at multiples of ``window``.
+    A chunk may lack topics, and there may be gaps between chunks. The points of a curve do not depend on how the run
+    is divided, provided that chunks begin at multiples of ``window``.
 
     Args:
         recording: recording that receives the scene.
         types: message type by topic.
         step_ns: sampling step [ns].
-        outlook: outlook on the whole run.
+        outlook: properties of the whole run that are known in advance.
         rate: largest number of curve points per second.
-        live: the view follows incoming data.
+        live: whether the view follows incoming data.
         silent: topics without messages.
 
     Attributes:
@@ -78,7 +78,7 @@ class Scene:
         self._ring: parts.Ring | None = None
         self._rows: list[npt.NDArray[np.float16]] = []
         self._every = 1  # one row and one ring per this many revolutions
-        self._sent = 0  # rows
+        self._sent = 0  # number of rows in the map sent last
         self._newest: Revolution | None = None
         self.points = self.revolutions = 0
         self.learn(types)
@@ -91,7 +91,7 @@ class Scene:
         """
         self._types |= {full(topic): kind for topic, kind in types.items()}
         self._curves = curves(self._types)
-        by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first of each
+        by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first topic of each type
         self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
         self._recording.send_blueprint(blueprint(self._types, live=self._live, silent=self._silent))
         self._describe()
@@ -129,10 +129,10 @@ class Scene:
             self._recording.flush(timeout_sec=_FLUSH if self._live else _EVER)
 
     def note(self, index: int, text: str) -> None:
-        """Log a line at a sample among the events."""
+        """Log a line of text among the events, at a sample."""
         self._send("events", rr.TextLog.columns(text=[text], level=["WARN"]), np.array([index]))
 
-    # --- what never changes
+    # --- static content
 
     def _describe(self) -> None:
         """Log the static properties: colours, names and shapes."""
@@ -254,8 +254,8 @@ class Scene:
 
     def _add_row(self, revolution: Revolution) -> None:
         """Add a row to the map; when the map is full, every second row is dropped."""
-        self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the scale of colours
-        # Each map is sent completely: only after a relative growth, so that their total size is a multiple of the last.
+        self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the colour scale
+        # Each map is sent in full, so only after a relative growth: the total size is a multiple of the last map's.
         if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
             self._send_map(revolution)
         if len(self._rows) == _ROWS:
@@ -279,7 +279,7 @@ class Scene:
     def _send(
         self, path: str, columns: rr.ComponentColumnList, index: Samples, revolution: Samples | None = None
     ) -> None:
-        """Log columns at samples on both timelines, or on time only if the spindle angle is not known."""
+        """Log columns at samples on both timelines, or only on ``time`` if the spindle angle is not known."""
         when = [rr.TimeColumn("time", duration=(index * self._step_ns).astype("timedelta64[ns]"))]
         if revolution is not None:
             when.append(rr.TimeColumn("revolution", sequence=revolution.astype(np.int64)))
@@ -288,7 +288,7 @@ class Scene:
 
 
 def _times_of(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
-    """Return the samples after revolutions, and the revolution numbers."""
+    """Return the samples that follow the revolutions, and the numbers of the revolutions."""
     return np.array([each.end for each in revolutions]), np.array([each.number for each in revolutions])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plotted parts of a recording: fields as curves, downsampled where they are long, and states as bands over time."""
+"""Plotted parts of a recording: fields as curves, downsampled where necessary, and states as bands over time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -114,7 +114,7 @@ def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
     """
     if window <= 2 or not values.size:
         return np.arange(values.size)
-    # Padding repeats the last value: argmin and argmax return the first of equal values, so never a padded index.
+    # Padding repeats the last value; argmin and argmax return the first of equal values, so never a padded index.
     rows = np.pad(values, (0, -values.size % window), mode="edge").reshape(-1, window)
     ends = np.sort([rows.argmin(axis=1), rows.argmax(axis=1)], axis=0)
     keep = np.stack([np.ones(len(rows), dtype=bool), ends[0] != ends[1]], axis=1)

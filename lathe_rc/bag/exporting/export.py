@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export of the signal topics of a bag, in memory that is independent of its length."""
+"""Export of a bag's signal topics; the memory required does not depend on the length of the bag."""
 
 import os
 import re
@@ -21,9 +21,9 @@ from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.names import instead
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
-_LONGEST_TOPIC = 255  # characters; the limit of a file name
+_LONGEST_TOPIC = 255  # characters; the limit for a file name
 _MOST_TOPICS = 256  # each is an open file
-_ROWS = 65536  # rows of a table that are collected before they are written
+_ROWS = 65536  # number of rows of a table collected before they are written
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Table:
         self._pending = 0
 
     def add(self, rows: Mapping[str, Samples]) -> None:
-        """Append rows; arrays that have to wait are copied, because the sender reuses them."""
+        """Append rows; arrays kept for a later batch are copied, because the caller reuses them."""
         count = rows["sample"].size
         self.rows += count
         self._pending += count
@@ -67,10 +67,10 @@ class _Table:
 
 
 class Exporter:
-    """Exporter of the tables of selected topics; a sink, see `lathe_rc.cell.engine.Sink`.
+    """Exporter of selected topics, one table per topic; a sink (see `lathe_rc.cell.engine.Sink`).
 
     Args:
-        types: message type by fully qualified topic to export.
+        types: message types of the topics to export, by fully qualified name.
         step_ns: sampling step [ns].
         target: output format.
     """
@@ -90,11 +90,7 @@ class Exporter:
                 table.add(sparse_rows(table.columns, found, self._step_ns))
 
     def close(self) -> Mapping[str, int]:
-        """Complete the files and return the number of rows.
-
-        Returns:
-            Number of rows by topic.
-        """
+        """Complete the files and return the number of rows by topic."""
         for table in self._tables.values():
             table.close()
         self._target.finish()
@@ -140,9 +136,9 @@ def export_bag(
 
     Args:
         bag: path of the bag.
-        place: folder to create, for ``npz`` the file.
+        place: folder to create; for ``npz``, the file to create.
         kind: ``csv``, ``parquet`` or ``npz``.
-        topics: topics to export, with or without the leading slash; none: all.
+        topics: topics to export, with or without the leading slash; all topics if empty.
 
     Raises:
         InputError: the output exists, a topic does not exist, or the path is not a bag.
@@ -168,7 +164,7 @@ def export_bag(
             exporter = Exporter(types, step_ns, target)
             feed(bag, [exporter])
             rows = exporter.close()
-            _refuse_existing(place)  # created by another process meanwhile: a rename would replace it
+            _refuse_existing(place)  # another process may have created it meanwhile; the rename would replace it
             result.rename(place)
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None

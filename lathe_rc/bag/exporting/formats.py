@@ -18,11 +18,11 @@ from lathe_rc.cell.frames import arrow_schema
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples
 
-_MOST_TEXT = 4096  # characters of a string in an NPZ file, where every element is as wide as the widest
+_MOST_TEXT = 4096  # longest string in an NPZ file [characters]; every element takes as much space as the longest one
 
 
 class Rows(Protocol):
-    """Table opened for writing."""
+    """Table that is open for writing."""
 
     def write(self, rows: Mapping[str, Samples], /) -> None:
         """Append rows, given as arrays of shape (rows,) by column name."""
@@ -35,7 +35,7 @@ class Format(ABC):
     """Base class of the export formats; all tables of a bag go to the same file or folder.
 
     Args:
-        place: file or folder to create; must not exist.
+        place: file or folder to create; must not exist yet.
     """
 
     folder = True  #: whether the output is a folder with one file per topic
@@ -47,7 +47,7 @@ class Format(ABC):
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
         """Create the table of a topic."""
 
-    def finish(self) -> None:  # noqa: B027 - most share nothing
+    def finish(self) -> None:  # noqa: B027 - most formats share no data between tables
         """Complete the data shared by the tables, after all tables are closed."""
 
 
@@ -73,7 +73,7 @@ def file_name(topic: str) -> str:
 
 
 class Csv(Format):
-    """CSV format: one file per topic, units in the header, numbers with enough digits for bit-identical values."""
+    """CSV format: one file per topic, units in the header, and enough digits to read back bit-identical values."""
 
     def table(self, topic: str, columns: Sequence[Column]) -> Rows:
         """Create the table of a topic."""
@@ -94,7 +94,7 @@ class Parquet(Format):
 
 
 class _Spool:
-    """Temporary file of a column until all rows are known, as an archive member is preceded by its length."""
+    """Temporary file for a column until all rows are known, since an archive member begins with its length."""
 
     def __init__(self, path: Path, column: Column) -> None:
         self._path, self._column = path, column
@@ -102,7 +102,7 @@ class _Spool:
         path.touch(exist_ok=False)
 
     def add(self, values: Samples) -> None:
-        """Append values; the file is open only meanwhile, since a bag may have more columns than open files allowed."""
+        """Append values, opening the file only briefly: a bag may have more columns than files may be open at once."""
         self._rows += values.size
         with self._path.open("ab") as file:
             if self._column.dtype != TEXT:
@@ -148,7 +148,7 @@ class _NpzRows:
 
 
 class Npz(Format):
-    """NumPy archive with one array per column, such as ``tool/error``; ``units`` has pairs of name and unit."""
+    """NumPy archive with one array per column, such as ``tool/error``; ``units`` lists pairs of name and unit."""
 
     folder = False
 
@@ -170,7 +170,7 @@ class Npz(Format):
     def finish(self) -> None:
         """Write the archive from the temporary files of the columns."""
         with zipfile.ZipFile(self.place, "x") as archive:
-            # The ZipInfo object is created without a date, so that the same bag gives an identical file.
+            # The ZipInfo object is created without a date, so that the same bag always gives an identical file.
             with archive.open(zipfile.ZipInfo("units.npy"), "w") as member:
                 np.lib.format.write_array(member, np.array(self._units).reshape(-1, 2), allow_pickle=False)
             for name, spool in self._spools.items():

@@ -1,4 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of bags of any maker, in chunks."""
+"""Reading of bags from any recorder, in chunks."""
 
-__all__: list[str] = []  # all of it may change: see lathe_rc/__init__.pyi
+__all__: list[str] = []  # everything here may change: see lathe_rc/__init__.pyi

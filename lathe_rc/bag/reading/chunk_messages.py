@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled walk over the records of a section of an MCAP file, for the readers and for the index of the writer."""
+"""Compiled walk over the records in a section of an MCAP file, for the readers and for the writer's index."""
 
 import struct
 from typing import Any, NamedTuple
@@ -13,8 +13,8 @@ from lathe_rc.jit import kernel
 HEAD = struct.Struct("<BQ")  #: opcode and length at the head of a record
 _HEAD = HEAD.size
 _MESSAGE = 5  # opcode
-_BEFORE = 22  # bytes of a message record ahead of its data: channel, sequence, log time, publish time
-BEFORE_DATA = _HEAD + _BEFORE  #: bytes of a message record ahead of its data, opcode and length included [B]
+_BEFORE = 22  # length of the message fields before the data [B]: channel, sequence, log time, publish time
+BEFORE_DATA = _HEAD + _BEFORE  #: length of a message record before its data, including opcode and length [B]
 
 Bytes = npt.NDArray[np.uint8]
 Places = npt.NDArray[np.uint64]
@@ -24,9 +24,9 @@ class Found(NamedTuple):
     """Records located in a section of a file.
 
     Attributes:
-        messages: channel, log time [ns], begin and end of the data of each message, shape (messages, 4).
-        others: opcode, begin and end of the content of each other record, shape (others, 3).
-        end: offset behind the last complete record.
+        messages: channel, log time [ns], and start and end of the data of each message, shape (messages, 4).
+        others: opcode, and start and end of the content of each other record, shape (others, 3).
+        end: offset of the end of the last complete record.
     """
 
     messages: Places
@@ -36,7 +36,7 @@ class Found(NamedTuple):
 
 @kernel
 def _little(data: Bytes, place: int, size: int) -> Any:
-    """Return an unsigned little-endian number of ``size`` bytes; np.uint64."""
+    """Return an unsigned little-endian number of ``size`` bytes, as np.uint64."""
     value = np.uint64(0)
     for k in range(size):
         value |= np.uint64(data[place + k]) << np.uint64(8 * k)
@@ -45,8 +45,8 @@ def _little(data: Bytes, place: int, size: int) -> Any:
 
 @kernel
 def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[int, int, int]:  # noqa: FBT001 - a kernel
-    """Fill both tables as far as they reach; return the numbers of messages and other records, and the end."""
-    # All comparisons use the remaining length, never a sum with a length: a length near 2**64 would overflow.
+    """Fill both tables up to their capacity; return the numbers of messages and other records, and the end."""
+    # All comparisons use the remaining length, never a sum that includes a length: one near 2**64 would overflow.
     place, count, further, size = 0, 0, 0, data.size
     while place + _HEAD <= size:
         length = _little(data, place + 1, 8)
@@ -76,13 +76,13 @@ def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[i
 
 
 def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
-    """Locate the records of a section; ``alone``: only up to the first record that is no message.
+    """Locate the records of a section; with ``alone``, only up to the first record that is not a message.
 
     Raises:
-        TooMuchError: there are more records other than messages than a whole file may have.
+        TooMuchError: the section has more records other than messages than a whole file may have.
     """
     array = np.frombuffer(data, np.uint8)
-    # The section's own statements are not trusted: its records are counted before memory is allocated for them.
+    # Sizes stated in the section are not trusted: its records are counted before memory is allocated for them.
     count, further, _ = _walk(array, np.empty((0, 4), np.uint64), np.empty((0, 3), np.uint64), alone)
     if further > MOST_ANNOUNCED:
         raise TooMuchError(f"more than {MOST_ANNOUNCED} schemas and channels")
@@ -91,10 +91,10 @@ def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
 
 
 def walk_whole(data: bytes) -> Found:
-    """Locate the records of a chunk, or of a section of a file, all of which must be complete.
+    """Locate the records of a chunk or of a section of a file; all of them must be complete.
 
     Raises:
-        ValueError: a record is longer than the remaining bytes, or a message shorter than its own head.
+        ValueError: a record is longer than the remaining bytes, or a message is shorter than its head.
     """
     found = walk(data)
     if found.end != len(data):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of MCAP files, by their index if they have one, otherwise by a walk through the file.
+"""Reader of MCAP files, using the index if there is one, otherwise a walk through the whole file.
 
-No statement of a file about itself is trusted: offsets are verified, sizes are compared with the size of the file, and
-records are counted before memory is allocated for them.
+Nothing that a file states about itself is trusted: offsets are verified, sizes are compared with the size of the file,
+and records are counted before memory is allocated for them.
 """
 
 import struct
@@ -24,16 +24,16 @@ from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, read_chunk
 from lathe_rc.errors import shown
 
-_INDEX = struct.Struct("<QQQQI")  # entry of a chunk: first and last time, start, length, bytes of places by channel
+_INDEX = struct.Struct("<QQQQI")  # chunk entry: first and last time, start, length, size of the offset map
 _PLACE = np.dtype([("channel", "<u2"), ("place", "<u8")])
-_NUMBERS = 2**16  # numbers available to channels
+_NUMBERS = 2**16  # number of possible channel IDs
 _AT_ONCE = 2**14  # messages per batch
-_WRONG = (ValueError, struct.error, EndOfFile)  # exceptions that damaged bytes lead to
+_WRONG = (ValueError, struct.error, EndOfFile)  # exceptions caused by damaged bytes
 
 
 @dataclass(frozen=True)
 class _Records(Span):
-    """Records of a file starting at byte ``start``: a chunk, or a section without chunks."""
+    """Records of a file from byte ``start`` on: a chunk, or a section without chunks."""
 
     path: Path
     start: int
@@ -41,7 +41,7 @@ class _Records(Span):
     in_chunk: bool
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """Yield the messages in batches, by log time."""
+        """Yield the messages in batches, in order of log time."""
         with self.path.open("rb") as stream:
             stream.seek(self.start)
             whole = stream.read(self.length)
@@ -53,7 +53,7 @@ class _Records(Span):
         found = found[wanted[found[:, 0]]]
         if start_ns > self.first_ns or stop_ns <= self.last_ns:
             found = found[(found[:, 1] >= np.uint64(max(start_ns, 0))) & (found[:, 1] < stop_ns)]
-        # A stable sort: messages of one time keep the order of the file.
+        # The sort is stable, so messages with the same time keep their order in the file.
         if np.any(found[1:, 1] < found[:-1, 1]):
             found = found[np.argsort(found[:, 1], kind="stable")]
         for first in range(0, len(found), _AT_ONCE):
@@ -89,7 +89,7 @@ def open_mcap(path: Path) -> Storage:
 
 
 class _Mcap:
-    """Builder of the description of a file, from its summary or from a walk through all of it."""
+    """Builder of a file's description, from the summary or from a walk through the whole file."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._size = path, path.stat().st_size
@@ -102,13 +102,13 @@ class _Mcap:
         self._announcements = self._described = 0
 
     def damage(self, what: object) -> None:
-        """Note unreadable parts."""
+        """Record an unreadable part."""
         self.storage.damage.append(f"{self._path.name}: {shown(what)}")
 
     # ---- announcements ------------------------------------------------------------------------------
 
     def _announce(self, opcode: int, content: bytes) -> None:
-        """Add a schema or channel record; many writers repeat them in each chunk, and all of them in the summary."""
+        """Add a schema or channel record; many writers repeat these in each chunk, and all writers in the summary."""
         self._announcements += 1
         if self._announcements > MOST_ANNOUNCED:
             raise ValueError(f"more than {MOST_ANNOUNCED} schemas and channels")
@@ -129,7 +129,7 @@ class _Mcap:
             raise ValueError(f"channel {channel.id} is announced as {before[0]!r} and as {now[0]!r}")
 
     def _name_channels(self) -> None:
-        """Assign the channels their message types, which the file may announce after them."""
+        """Assign message types to the channels; a file may announce a type after its channel."""
         for number, channel in self._channels.items():
             kind = self._schemas.get(channel.schema_id, "") if channel.schema_id else ""
             named = Channel(channel.topic, kind, channel.message_encoding, count=int(self._counts[number]))
@@ -141,10 +141,10 @@ class _Mcap:
     # ---- index --------------------------------------------------------------------------------------
 
     def read_summary(self, stream: BinaryIO) -> bool:
-        """Read the summary, and return whether it has all that is needed.
+        """Read the summary and return whether it has everything that is needed.
 
         Raises:
-            ValueError: the summary has impossible values; mcap and struct raise other exceptions.
+            ValueError: the summary has impossible values; mcap and struct may raise other exceptions.
         """
         records = SoundRecords(stream, self._size, lambda why, _lost: self.damage(why))
         if not records.find_summary():
@@ -153,7 +153,7 @@ class _Mcap:
             return False
         stream.seek(MAGIC)
         if HEAD.unpack(stream.read(HEAD.size))[1] > records.summary_start:
-            raise ValueError(f"cut off at byte {MAGIC}")  # the header, which other readers need
+            raise ValueError(f"cut off at byte {MAGIC}")  # the header is needed by other readers
         statistics, spans = self._indexed_records(records), self.storage.spans
         if statistics is None or statistics.chunk_count != len(spans) or bool(statistics.message_count) != bool(spans):
             return False
@@ -167,7 +167,7 @@ class _Mcap:
         return True
 
     def _indexed_records(self, records: SoundRecords) -> Statistics | None:
-        """Read the records of the summary and return its statistics, if it has any."""
+        """Read the records of the summary; return its statistics, or None if it has none."""
         statistics, chunks = None, []
         for record in records.summary():
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -176,7 +176,7 @@ class _Mcap:
                 statistics = parsed(Statistics, record.content)
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunks.append(self._indexed(record.content, records.summary_start))
-        # Overlapping chunks would be unpacked once for each entry: a small file would cause hours of work.
+        # Overlapping chunks would be unpacked once per index entry: a small file could cause hours of work.
         free = MAGIC
         for chunk in sorted(chunks, key=lambda chunk: chunk.start):
             if chunk.start < free:
@@ -186,7 +186,7 @@ class _Mcap:
         return statistics
 
     def _indexed(self, content: bytes, end: int) -> _Records:
-        """Return a chunk by its entry in the index, which must lie in the file before the summary."""
+        """Return the chunk described by an index entry; it must lie before the summary."""
         first_ns, last_ns, start, length, places = _INDEX.unpack_from(content)
         if places > _NUMBERS * _PLACE.itemsize:
             raise ValueError(f"the index has a chunk of {places // _PLACE.itemsize} channels")
@@ -201,7 +201,7 @@ class _Mcap:
     # ---- whole file ----------------------------------------------------------------------------------
 
     def scan(self, stream: BinaryIO) -> None:
-        """Walk through all records; damage behind the end of the data section loses no message."""
+        """Walk through all records; damage after the end of the data section is ignored, as it affects no message."""
 
         def told(why: str, _lost: int) -> None:
             if not records.ended:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metadata of a bag as any version of rosbag2 writes them: names, quality of service, the file metadata.yaml.
+"""Metadata of a bag as written by any version of rosbag2: names, quality of service, and the file metadata.yaml.
 
-Memory and time for reading them are bounded. Settings that a quality of service does not state count as unknown.
+The memory and time for reading metadata are bounded. Settings missing from a QoS profile count as unknown.
 """
 
 import errno
@@ -46,7 +46,7 @@ class Metadata:
 
     Attributes:
         files: names of the files, without duplicates.
-        repeated: whether some files were listed more than once.
+        repeated: whether a file was listed more than once.
         packed: whether each message is compressed individually.
         span: first and last log time [ns]; None without messages.
         topics: topics by name.
@@ -65,7 +65,7 @@ def read(folder: Path) -> Metadata:
     """Read the metadata of a folder.
 
     Raises:
-        ValueError: the metadata are not in the format of rosbag2, or too long.
+        ValueError: the metadata are not in rosbag2 format, or they are too long.
         OSError: the metadata cannot be read.
     """
     try:
@@ -135,16 +135,16 @@ def _number(text: str) -> int:
 
 @lru_cache(maxsize=64)
 def qos_of_text(text: str) -> tuple[Qos, ...]:
-    """Parse the QoS profiles of a topic's publishers from YAML; cached, as most topics share the same.
+    """Parse the QoS profiles of a topic's publishers from YAML; cached, since most topics have the same profiles.
 
     Raises:
-        ValueError: the string is no YAML, or would grow when it is parsed.
+        ValueError: the string is not YAML, or would expand when parsed.
     """
     return qos_of_list(read_yaml(text, "offered_qos_profiles"))
 
 
 def qos_of_list(given: object) -> tuple[Qos, ...]:
-    """Convert QoS profiles of a topic's publishers from a list of maps or one map; skip anything else."""
+    """Convert the QoS profiles of a topic's publishers from a list of maps, or from one map; skip anything else."""
     listed = given if isinstance(given, list) else [given]
     return tuple(_profile(each) for each in listed if isinstance(each, dict))
 
@@ -187,7 +187,7 @@ def read_yaml(text: str, what: str) -> Any:
     """Parse YAML into lists, maps and strings; numbers remain strings.
 
     Raises:
-        ValueError: see `check_yaml`; or a key of a map is a collection.
+        ValueError: see `check_yaml`; or a map key is a collection.
     """
     check_yaml(text, what)
     try:
@@ -197,10 +197,10 @@ def read_yaml(text: str, what: str) -> Any:
 
 
 def check_yaml(text: str, what: str) -> None:
-    """Reject YAML that would grow when it is parsed, or take too long.
+    """Reject YAML that would expand when parsed, or take too long to parse.
 
     Raises:
-        ValueError: the string has aliases, is nested too deeply or too long, or is no YAML.
+        ValueError: the string has aliases, is nested too deeply, is too long, or is not YAML.
     """
     depth = 0
     try:
@@ -223,7 +223,7 @@ def check_name(name: object) -> None:
     """Reject a topic or type name that cannot be shown on one line.
 
     Raises:
-        ValueError: the name is no string, too long, or has characters that are not printable.
+        ValueError: the name is not a string, is empty or too long, or contains unprintable characters.
     """
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= limits.LONGEST_NAME:
         raise ValueError(f"name {str(name)[:80]!r}; allowed: up to {limits.LONGEST_NAME} characters that print")

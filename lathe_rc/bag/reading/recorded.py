@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dense topics of a bag under the topic names of the cell, validated while they are read; some may be missing."""
+"""Dense topics of a bag under the topic names of a cell, validated as they are read; some may be missing."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from lathe_rc.messages import Samples, Signals
 
 @dataclass(frozen=True)
 class Spindle:
-    """Range and length of the recorded spindle motion.
+    """Range and length of a recorded spindle motion.
 
     Attributes:
         topic: topic of the encoder in the bag.
-        samples: length of the record.
+        samples: number of samples recorded.
         has_truth: whether the true angle was recorded; otherwise the measured angle is used.
         speed: lowest and highest speed [rad/s].
-        turns: complete revolutions before sample 0 [rad].
+        turns: angle of the complete revolutions before sample 0 [rad].
     """
 
     topic: str
@@ -34,20 +34,20 @@ class Spindle:
 
     @property
     def angle(self) -> str:
-        """Return the name of the field with the angle of the workpiece."""
+        """Name of the field that contains the workpiece angle."""
         return "angle_true" if self.has_truth else "angle"
 
 
 class Recorded:
-    """Recorded topics of a bag, looked up by the relative topics of a cell.
+    """Recorded topics of a bag, looked up by a cell's relative topics.
 
     Args:
-        source: the opened bag.
-        names: topic of the bag by relative topic of the cell, where the two differ by more than a leading slash.
+        source: the open bag.
+        names: the bag's topics by the cell's relative topics, where they differ by more than a leading slash.
 
     Attributes:
         path: path of the bag.
-        namespace: namespace of the recorded cell; empty if it had none.
+        namespace: namespace of the recorded cell; empty if the cell had none.
 
     Raises:
         InputError: ``names`` refers to a topic that the bag does not have.
@@ -77,7 +77,7 @@ class Recorded:
                 raise InputError(f"--topic {name}={topic}: the cell has no {name}; allowed: {', '.join(sorted(known))}")
 
     def find(self, name: str, msgtype: str) -> str | None:
-        """Return the bag's topic for a relative topic of the cell; None if the bag does not have it.
+        """Return the bag's topic for a relative topic of the cell; None if the bag has no messages on that topic.
 
         Raises:
             InputError: the topic has another type.
@@ -91,7 +91,7 @@ class Recorded:
         return topic
 
     def lacks(self, name: str, msgtype: str) -> str:
-        """Return the message about a missing topic, with the bag's topics of the same type."""
+        """Describe a missing topic, listing the bag's topics of the same type."""
         others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
@@ -105,7 +105,7 @@ class Recorded:
         return self._source.step_ns(topic)
 
     def pieces(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[int, Signals]]:
-        """Yield the first sample and the requested fields of each block, arrays of shape (n,).
+        """Yield the first sample and the requested fields of each block, as arrays of shape (n,).
 
         Raises:
             LatheError: samples are missing or repeated, the step changes, or a number is not finite.
@@ -127,7 +127,7 @@ class Recorded:
             raise LatheError(f"{self.path}: {topic} has no block, though the bag counts some")
 
     def whole(self, topic: str, field: str, most: int | None = None) -> Samples:
-        """Return all samples of a field, or at most its first ``most`` samples, shape (n,).
+        """Return all samples of a field, or at most the first ``most`` samples, shape (n,).
 
         Raises:
             LatheError: see `pieces`.
@@ -148,14 +148,14 @@ class Recorded:
         return sum(signals[field].size for _, signals in self.pieces(topic, [field]))
 
     def spindle(self, name: str) -> Spindle:
-        """Return range and length of the recorded spindle motion, after validating all samples.
+        """Return the range and length of the recorded spindle motion, after validating all samples.
 
         Args:
             name: the encoder's relative topic in the cell.
 
         Raises:
             InputError: the bag has no encoder topic.
-            LatheError: see `pieces`; or the angle goes backwards or jumps.
+            LatheError: see `pieces`; or the angle decreases or jumps.
         """
         topic = self.find(name, messages.ENCODER)
         if topic is None:
@@ -164,7 +164,7 @@ class Recorded:
                 f"{self.lacks(name, messages.ENCODER)}; the bag has {self.holdings()}"
             )
         fields = ["angle", "speed", "angle_true", "speed_true"]
-        # Two passes over the topic: in memory, hours of a spindle would take gigabytes.
+        # The topic is read twice, since hours of spindle motion would take gigabytes of memory.
         has_truth = any(np.any(signals["angle_true"]) for _, signals in self.pieces(topic, fields))
         angle, speed = ("angle_true", "speed_true") if has_truth else ("angle", "speed")
         low, high, last, samples = np.inf, -np.inf, np.nan, 0

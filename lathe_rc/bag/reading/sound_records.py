@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk over the valid records of an MCAP file that resynchronizes behind each damaged place.
+"""Walk over the valid records of an MCAP file, resynchronizing after each damaged place.
 
-A record is valid if its checksum matches. Most records have none: then its bytes must be exactly those that the mcap
-library would write for its content, which a wrong length rules out. Messages outside of chunks have neither; they must
-be followed by a record, and the file must have no chunk: a chunk index with a damaged opcode would pass for a message.
+A record is valid if its checksum matches. Most records have no checksum; such a record is valid if its bytes are those
+that the mcap library would write for its content, which excludes a wrong length. Messages outside chunks allow neither
+test; they must be followed by a record, and the file must have no chunks, because a chunk index with a damaged opcode
+would pass for a message.
 
-The handling of damage is left to the caller: reading a bag stops at it, recovery continues behind it, a check reports
-it. A file with a valid summary is read by its summary, see `lathe_rc.bag.reading.mcap_storage`.
+The caller decides how to handle damage: reading a bag stops there, recovery continues after it, and a check reports it.
+A file with a valid summary is read by its summary (see `lathe_rc.bag.reading.mcap_storage`).
 """
 
 import re
@@ -29,13 +30,13 @@ from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, To
 from lathe_rc.bag.reading.unpacking import CHUNK, Budget, read_chunk
 
 Parsed = TypeVar("Parsed")
-Told = Callable[[str, int], None]  #: a damage, and the number of bytes in which messages may be lost
+Told = Callable[[str, int], None]  #: given a description of the damage, and the bytes in which messages may be lost
 
 MAGIC = len(MCAP0_MAGIC)  #: length of the magic bytes at both ends of a file [B]
-_INDEX = struct.Struct("<HI")  # channel, length of the pairs of time and place
+_INDEX = struct.Struct("<HI")  # channel, length of the array of pairs of time and offset
 _COMPRESSIONS = (b"", b"lz4", b"zstd")
 _FOOTER, _DATA_END = 29, 13  # [B]
-_PRIVATE = 0x80  # opcodes from here on are free for private use
+_PRIVATE = 0x80  # opcodes from here on are reserved for private use
 _PLAIN: dict[int, Any] = {
     Opcode.HEADER: records.Header,
     Opcode.FOOTER: records.Footer,
@@ -50,25 +51,25 @@ _PLAIN: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: records.SummaryOffset,
     Opcode.DATA_END: records.DataEnd,
 }
-# Maximum length of records that hold maps: as objects they take thirty times as much memory. [B]
+# Maximum length of records with maps, which take thirty times as much memory when parsed [B]
 _MOST = {Opcode.CHUNK_INDEX: MOST_TEXT, Opcode.STATISTICS: MOST_TEXT, Opcode.CHANNEL: MOST_METADATA}
-# Where a record may begin: any opcode with a length below 4 GiB, or a chunk of whatever length.
+# Possible beginning of a record: any opcode with a length below 4 GiB, or a chunk of any length.
 _BEGINS = re.compile(rb"(?=[\x01-\x0f].{4}\0{4}|\x06.{28}\0{4}.{4}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd))", re.DOTALL)
 _LONGEST_BEGIN = 49  # maximum length of a match [B]
-_WINDOW = 2**20  # bytes of a file that are searched at once
-_PART = 2**22  # maximum size of messages outside of chunks that are examined at once [B]
-_PAGE = 2**12  # unit of search effort; examining a possible beginning of a record takes as long [B]
-_PAGES = 2**18  # pages that may be searched in vain, in addition to those of the file
+_WINDOW = 2**20  # bytes of a file searched at once
+_PART = 2**22  # maximum size of the messages outside chunks that are examined at once [B]
+_PAGE = 2**12  # unit of search effort; examining a possible record takes as long as searching a page [B]
+_PAGES = 2**18  # search effort allowed in addition to twice the pages of the file [pages]
 
 
 class Record(NamedTuple):
-    """Valid record, or consecutive messages outside of chunks.
+    """Valid record, or consecutive messages outside chunks.
 
     Attributes:
-        place: file offset of its first byte.
-        end: file offset behind its last byte.
-        opcode: kind of the record.
-        content: its bytes; for a chunk its unpacked records; for messages their records, including the heads.
+        place: file offset of the first byte.
+        end: file offset after the last byte.
+        opcode: kind of record.
+        content: content of the record; for a chunk, the unpacked records; for messages, the records with their heads.
         checked: whether a checksum confirms the content.
     """
 
@@ -84,7 +85,7 @@ class _UnsoundError(ValueError):
 
     Attributes:
         chunk: whether the record is a chunk.
-        end: file offset of the next record, if it is certain in spite of the damage.
+        end: file offset of the next record, if known with certainty despite the damage.
     """
 
     def __init__(self, why: str, *, chunk: bool = False, end: int | None = None) -> None:
@@ -100,7 +101,7 @@ class _Effort:
         self.left = _PAGES + 2 * (size // _PAGE)
 
     def spend(self, size: int) -> bool:
-        """Count the search of ``size`` bytes plus a fixed cost; return whether the limit allows it."""
+        """Charge the search of ``size`` bytes plus a fixed cost; return whether the limit allows the search."""
         self.left -= 1 + size // _PAGE
         return self.left >= 0
 
@@ -110,13 +111,13 @@ class SoundRecords:
 
     Args:
         stream: stream of the file, at any position.
-        size: of the file [B].
-        told: called with each damage; may be replaced between two iterations.
-        effort: remaining work, passed for the records of a chunk; None: in proportion to the size.
+        size: size of the file [B].
+        told: callback for each damaged place; may be replaced between two iterations.
+        effort: remaining work, given for the records of a chunk; None: proportional to the size of the file.
 
     Attributes:
-        summary_start: offset of the summary, once `find_summary` has found it; before that the size of the file.
-        ended: whether the newest iteration has passed the end of the data section.
+        summary_start: offset of the summary, once `find_summary` has found it; before that, the size of the file.
+        ended: whether the latest iteration has passed the end of the data section.
         data_wrong, summary_wrong: whether the checksum of the data section, or of the summary, does not match.
     """
 
@@ -130,7 +131,7 @@ class SoundRecords:
         self.ended = self.data_wrong = self.summary_wrong = False
 
     def inside(self, record: Record) -> Iterator[tuple[bytes, Found]]:
-        """Yield the bytes and walked records of a chunk or of messages; any other record is yielded alone."""
+        """Yield the bytes and located records of a chunk or of messages; any other record is yielded as a whole."""
         if record.opcode == Opcode.CHUNK and not record.checked:
             inner = SoundRecords(BytesIO(record.content), len(record.content), self.told, self._effort)
             yield from ((each.content, _found(each, Opcode.MESSAGE)) for each in inner)
@@ -215,8 +216,8 @@ class SoundRecords:
                 record = self._with_following(record)
             self._chunked |= opcode in (Opcode.CHUNK, Opcode.CHUNK_INDEX)
             self.ended = opcode == Opcode.DATA_END or (self.ended and opcode not in (Opcode.CHUNK, Opcode.MESSAGE))
-            # A record may have lost bytes at its end and extend into the next one: the search begins within it.
-            # Of several messages the last one begins within the last bytes; each of the others is followed by one.
+            # A record may have lost bytes at its end and extend into the next one, so a search begins within it.
+            # A message is accepted only if another record may begin after it.
             before = record.end if record.checked or opcode == Opcode.MESSAGE else place
             yield record
             place = record.end
@@ -228,10 +229,10 @@ class SoundRecords:
         return self._stream.read(length)
 
     def _with_following(self, record: Record) -> Record:
-        """Extend a message record by the messages after it, as files without chunks have millions."""
+        """Extend a message record by the messages that follow it, since files without chunks have millions of them."""
         whole = self._at(record.end, self._window)
         ends = walk(whole, alone=True).messages[:, 3].tolist()
-        # The window grows while messages are consecutive: a file with scattered messages is not reread for each.
+        # The window grows only while messages are consecutive, so scattered messages do not cause repeated reading.
         self._window = min(2 * self._window, _PART) if 2 * (ends or [0])[-1] > self._window else _PAGE
         if ends and not self._begins(record.end + ends[-1]):
             ends.pop()
@@ -243,7 +244,7 @@ class SoundRecords:
         return record
 
     def _sound(self, place: int, head: bytes | None = None) -> Record:
-        """Return the record at a file offset, whose first bytes ``head`` contains if given.
+        """Return the record at a file offset; ``head``, if given, contains the record's first bytes.
 
         Raises:
             _UnsoundError: the record is not valid.
@@ -289,7 +290,7 @@ class SoundRecords:
         return bool(0 < opcode <= Opcode.DATA_END and place + HEAD.size + length <= self._size)
 
     def _chunk(self, place: int, end: int) -> Record:
-        """Return the chunk at a file offset; of its two stated lengths, one may be wrong."""
+        """Return the chunk at a file offset; one of its two stated lengths may be wrong."""
         begin = place + HEAD.size
         head = self._at(begin, CHUNK.size + 4 + 8)
         if len(head) < CHUNK.size + 8:
@@ -337,7 +338,7 @@ class SoundRecords:
         return self._size
 
     def _is_anchor(self, place: int) -> bool:
-        """Return whether a valid record is at an offset, followed by another one unless a checksum confirms it."""
+        """Return whether a valid record is at an offset, confirmed by a checksum or by a valid record after it."""
         try:
             record = self._sound(place)
             if not record.checked and record.end < self._size and self._at(record.end, MAGIC) != MCAP0_MAGIC:
@@ -353,7 +354,7 @@ def parsed(kind: type[Parsed], content: bytes) -> Parsed:
 
 
 def _found(record: Record, *walked: int) -> Found:
-    """Return the records inside a record; if its opcode is not in ``walked``, the record itself."""
+    """Return the records inside a record, or the record itself if its opcode is not in ``walked``."""
     if record.opcode in walked:
         return walk(record.content)
     size = len(record.content)
@@ -369,7 +370,7 @@ def _as_written(opcode: int, content: bytes) -> bool:
         parsed(_PLAIN[opcode], content).write(builder)
     except MemoryError:
         raise
-    except Exception:  # noqa: BLE001 - mcap raises whatever broken bytes lead to
+    except Exception:  # noqa: BLE001 - mcap can raise any exception on damaged bytes
         return False
     again = builder.end()[HEAD.size :]
     if opcode == Opcode.ATTACHMENT and not any(content[-4:]):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of bags of any maker: rosbag2 folders with any storage and compression, or a single file of one.
+"""Reader of bags from any recorder: rosbag2 folders with any storage and compression, or a single file from one.
 
-No size stated by a bag is trusted: each is checked before memory of that size is allocated. The limits are in
+No size stated in a bag is trusted: each is checked before memory of that size is allocated. The limits are in
 `lathe_rc.bag.reading.limits`.
 """
 
@@ -36,7 +36,7 @@ _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
 _KINDS = (".mcap", ".db3", ".zstd")
 _RECOVER = "; lathe bag recover saves the rest"
-_WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # caused by damaged bytes and files
+_WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # exceptions caused by damaged bytes and files
 
 Read = tuple[Span, Mapping[int, str]]  # a span and its requested channels
 
@@ -58,17 +58,17 @@ class Unread:
     count: int
 
     def __str__(self) -> str:
-        """Return topic, type, message count and reason as text."""
+        """Return the topic, type, message count and reason as text."""
         return f"{self.topic} {self.type}".strip() + f", {self.count} messages {self.why}"
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the message files of a bag, by name: those of a folder, or the named file itself.
+    """Return the message files of a bag, sorted by name: those in a folder, or the named file itself.
 
-    If a player left an unpacked copy beside a compressed file, only the compressed file is returned.
+    If a player has left an unpacked copy next to a compressed file, only the compressed file is returned.
 
     Raises:
-        InputError: a message file is a link that leads out of the folder.
+        InputError: a file of the bag is a link that leads out of the folder.
     """
     found = [path] if path.is_file() else [*path.glob("*")]
     for file in found:
@@ -79,7 +79,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _refuse_link(file: Path, bag: Path) -> None:
-    """Reject a file that is a link out of its bag.
+    """Reject a file that is a link leading out of its bag.
 
     Raises:
         InputError: the file is such a link.
@@ -98,20 +98,20 @@ class Source:
     """Bag opened for reading; a context manager.
 
     Args:
-        path: a rosbag2 folder, or a single file of one.
-        partial: read whatever is readable of a damaged bag.
+        path: rosbag2 folder, or a single file from one.
+        partial: whether to read the readable parts of a damaged bag.
 
     Attributes:
         path: path of the bag.
         topics: readable topics by name.
-        unread: further topics, whose messages have no type or are not serialized as in ROS 2.
-        about: strings from the metadata of the bag, see docs/bags.md.
+        unread: other topics, whose messages have no type or are not serialized as in ROS 2.
+        about: strings from the bag's metadata (see docs/bags.md).
         first_ns, last_ns: smallest and largest log time [ns]; both 0 if the bag is empty.
-        contradictions: differences between the bag's metadata and its files, one line each; the files are used.
+        contradictions: differences between the bag's metadata and its files, one line each; the files take precedence.
         damage: unreadable parts, one line each; empty unless ``partial``.
 
     Raises:
-        InputError: the path is not a bag, or the bag is incomplete; with ``partial``: nothing of it is readable.
+        InputError: the path is not a bag, or the bag is incomplete or, with ``partial``, has no readable part.
     """
 
     def __init__(self, path: Path, *, partial: bool = False) -> None:
@@ -180,7 +180,7 @@ class Source:
             raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
     def _metadata(self, files: Sequence[Path]) -> Metadata | None:
-        """Return the metadata of a folder, or None if they are missing and the files alone are used."""
+        """Return the metadata of a folder; None if they are missing or unreadable, and only the files are used."""
         if not (self.path / metadata.NAME).exists():
             if not files:
                 raise ValueError(f"no {metadata.NAME} in that folder, nor a .mcap or .db3 file")
@@ -289,13 +289,13 @@ class Source:
     def messages(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        """Yield topic, log time [ns] and bytes of each message, in the order of log times; see `batches`."""
+        """Yield the topic, log time [ns] and bytes of each message, in order of log time (see `batches`)."""
         return chain.from_iterable(self.batches(topics, start_ns=start_ns, stop_ns=stop_ns))
 
     def batches(
         self, topics: set[str] | None = None, *, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Batch]:
-        """Yield the messages in the order of log times, in batches of a convenient size.
+        """Yield the messages in order of log time, in batches of a convenient size.
 
         Args:
             topics: topics to read; None: all.
@@ -370,8 +370,8 @@ def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Ite
         if at_a_time > MOST_OPEN:
             raise ValueError(f"chunks of the same time take more than {MOST_OPEN} B; record them in order of time")
 
-    # The merge requests the first message of each generator at once, which would unpack all chunks of the group: a mark
-    # at the span's first time precedes them.
+    # The merge starts by requesting one message from each generator, which would unpack all chunks of the group. Each
+    # generator therefore begins with a marker at the first time of its span.
     def late(span: Span, wanted: Mapping[int, str]) -> Iterator[Message]:
         yield "", span.first_ns, b""
         yield from chain.from_iterable(span.read(wanted, start, stop, budget))

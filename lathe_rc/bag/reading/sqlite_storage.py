@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of SQLite files as rosbag2 writes them, without changes to them or to the files beside them."""
+"""Reader of SQLite files written by rosbag2; neither these files nor the files beside them are changed."""
 
 import contextlib
 import json
@@ -18,20 +18,20 @@ from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget
 from lathe_rc.errors import InputError, shown
 
-_LAST = 2**63 - 1  # largest integer of SQLite
-_LOG_HEAD, _FRAME_HEAD = 32, 24  # of a write-ahead log [B]; both have the same two random numbers while a frame counts
+_LAST = 2**63 - 1  # largest integer in SQLite
+_LOG_HEAD, _FRAME_HEAD = 32, 24  # in a write-ahead log [B]; the same two random numbers in both mark a current frame
 _JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"  # at the end of a rollback journal that names a super-journal
-_WRONG = (ValueError, sqlite3.Error, OverflowError)  # exceptions that damaged bytes lead to
+_WRONG = (ValueError, sqlite3.Error, OverflowError)  # exceptions caused by damaged bytes
 
 
 def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
-    """Return a database that includes the messages of its logs: itself, or a copy in ``folder`` if it has logs.
+    """Return a database that includes the messages in its logs: the original, or a copy in ``folder`` if it has logs.
 
-    A killed recorder leaves a write-ahead log or a rollback journal, which the next writer applies to the database;
+    A killed recorder leaves a write-ahead log or a rollback journal, which the next writer would apply to the database;
     here it is applied to the copy.
 
     Returns:
-        The database, and the number of unusable bytes of the write-ahead log: damaged, or of no complete transaction.
+        The database, and the number of unusable bytes in the write-ahead log: damaged, or of an incomplete transaction.
 
     Raises:
         InputError: a log is a link.
@@ -45,7 +45,7 @@ def with_journal(path: Path, folder: Path) -> tuple[Path, int]:
     for log in logs:
         if log.is_symlink():
             raise InputError(f"{log}: a link; allowed: the file itself in its place")
-        if log.name.endswith("-journal") and _names_another(log):  # which SQLite would delete
+        if log.name.endswith("-journal") and _names_another(log):  # SQLite would delete the named journal
             raise ValueError(f"{log.name}: it names a further journal; no recorder writes such")
     if not logs:
         return path, 0
@@ -67,7 +67,7 @@ def _names_another(journal: Path) -> bool:
 
 
 def _left(log: Path, frames: int) -> int:
-    """Return the bytes of a write-ahead log behind its valid frames, not counting frames of an earlier log."""
+    """Return the number of bytes after a write-ahead log's valid frames, not counting frames of an earlier log."""
     end = log.stat().st_size
     if frames <= 0:
         return end
@@ -82,7 +82,7 @@ def _left(log: Path, frames: int) -> int:
 
 def connect(path: Path) -> sqlite3.Connection:
     """Open a database read-only."""
-    # Immutable: no locks, and neither -wal nor -shm files beside a bag that may be on a read-only disk.
+    # With immutable, SQLite takes no locks and creates no -wal or -shm files: the bag may be on a read-only disk.
     return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
 
 
@@ -93,7 +93,7 @@ class _Table(Span):
     path: Path
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """Yield the messages one by one, by log time."""
+        """Yield the messages one by one, in order of log time."""
         query = """SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END FROM messages
             WHERE topic_id IN (SELECT value FROM json_each(?)) AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"""
         with contextlib.closing(connect(self.path)) as base:
@@ -109,7 +109,7 @@ class _Table(Span):
 
 
 def open_sqlite(path: Path, folder: Path) -> Storage:
-    """Return the topics of a database and one span with its messages; ``folder`` may get a copy of it.
+    """Return a database's topics and one span with its messages; a copy may be created in ``folder``.
 
     Raises:
         InputError, ValueError, OSError, sqlite3.Error: see `with_journal`.
@@ -132,7 +132,7 @@ def open_sqlite(path: Path, folder: Path) -> Storage:
 
 
 def left_over(size: int) -> str:
-    """Describe a number of unusable bytes of a write-ahead log."""
+    """Describe the unusable bytes of a write-ahead log."""
     return f"{size} B of its write-ahead log are broken, or were not written to the end"
 
 
@@ -146,12 +146,12 @@ def _read_topics(base: sqlite3.Connection, storage: Storage) -> None:
 
 
 def select(base: sqlite3.Connection, table: str, columns: tuple[str, ...]) -> list[tuple[Any, ...]]:
-    """Return the rows of a table as strings, with a number in the first column; old bags lack columns and tables."""
+    """Return the rows of a table as strings, with a number in the first column; old bags may lack columns or tables."""
     there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
     if columns[0] not in there:
         return []
     listed = ", ".join(name if name in there else "''" for name in columns)
-    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS + 1)  # noqa: S608 - of constants
+    rows = base.execute(f"SELECT {listed} FROM {table}").fetchmany(MOST_TOPICS + 1)  # noqa: S608 - built from constants
     return [(first, *(text if isinstance(text, str) else "" for text in rest)) for first, *rest in rows]
 
 
@@ -187,7 +187,7 @@ def _count_rows(base: sqlite3.Connection) -> list[tuple[int, int, int, int]]:
 
 
 def check_tables(base: sqlite3.Connection) -> None:
-    """Reject a SQLite file with computed content: views, triggers, generated columns.
+    """Reject a SQLite file with computed content: views, triggers or generated columns.
 
     Raises:
         ValueError: the file has such content, or a message that is too long.
@@ -203,7 +203,7 @@ def check_tables(base: sqlite3.Connection) -> None:
             raise ValueError(f"{str(kind)[:20]} {str(name)[:80]!r} in the database; rosbag2 makes plain tables only")
     if any(name == "messages" for name, _, _ in made):
         longest = None
-        with contextlib.suppress(sqlite3.DatabaseError):  # damaged somewhere: its readable parts are examined later
+        with contextlib.suppress(sqlite3.DatabaseError):  # partly damaged: the readable parts are examined later
             (longest,) = base.execute("SELECT max(length(data)) FROM messages").fetchone()
         if isinstance(longest, int) and longest > MOST_BYTES:
             raise ValueError(f"a message of {longest} B; allowed: up to {MOST_BYTES}")

@@ -14,7 +14,7 @@ from lathe_rc.bag.reading.unpacking import Budget
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 
-CDR = "cdr"  #: serialization of ROS 2, the only supported one
+CDR = "cdr"  #: serialization used by ROS 2, the only one supported
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Batch:
     Attributes:
         whole: the byte string.
         topics: topic name by channel.
-        places: channel, log time [ns], begin and end of each message, shape (messages, 4).
+        places: channel, log time [ns], start and end of each message, shape (messages, 4).
     """
 
     whole: bytes
@@ -36,7 +36,7 @@ class Batch:
         return len(self.places)
 
     def __iter__(self) -> Iterator[Message]:
-        """Yield topic, log time [ns] and bytes of each message."""
+        """Yield the topic, log time [ns] and bytes of each message."""
         for channel, log_ns, begin, end in self.places.tolist():
             yield self.topics[channel], log_ns, self.whole[begin:end]
 
@@ -49,12 +49,12 @@ class Batch:
 
 @dataclass
 class Channel:
-    """Topic as announced in a file.
+    """Topic as declared in a file.
 
     Attributes:
         topic: name of the topic.
         type: message type; empty if the file states none.
-        encoding: serialization of its messages.
+        encoding: serialization of the messages.
         qos: profiles offered by the publishers, as far as the file states them.
         count: number of messages.
     """
@@ -67,7 +67,7 @@ class Channel:
 
     @property
     def unread(self) -> str:
-        """Return the reason why the messages are not read; empty if they are read."""
+        """Reason why the messages are not read; empty if they are read."""
         if self.encoding != CDR:
             return f"serialized as {self.encoding[:64]!r}, not {CDR!r}"
         return "" if self.type else "without a message type"
@@ -75,12 +75,12 @@ class Channel:
 
 @dataclass(frozen=True)
 class Span:
-    """Messages that are read together: a chunk, a section of a file without chunks, a database.
+    """Messages that are read together: a chunk, a section of a file without chunks, or a database.
 
     Attributes:
         first_ns, last_ns: smallest and largest log time [ns].
-        size: size in memory [B]; 0: the messages are read one by one.
-        channels: channels that may have messages in it; empty: any.
+        size: size in memory [B]; 0 if the messages are read one by one.
+        channels: channels that may have messages in the span; empty for any channel.
     """
 
     first_ns: int
@@ -89,7 +89,7 @@ class Span:
     channels: frozenset[int]
 
     def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
-        """Yield the messages by log time.
+        """Yield the messages in order of log time.
 
         Args:
             topics: topic name by requested channel.
@@ -98,7 +98,7 @@ class Span:
             budget: budget to which the bytes and messages read are charged.
 
         Raises:
-            ValueError: the span is damaged; OSError and sqlite3.Error likewise.
+            ValueError, OSError, sqlite3.Error: the span is damaged.
         """
         raise NotImplementedError
 
@@ -110,9 +110,9 @@ class Storage:
     Attributes:
         channels: channels by number.
         spans: spans in the order of the file.
-        first_ns, last_ns: smallest and largest log time of its messages, if it has any [ns].
+        first_ns, last_ns: smallest and largest log time of the messages, if there are any [ns].
         damage: unreadable parts, one line each; with a valid summary, damage may be detected later.
-        remarks: wrong statements of the file about itself that make no message unreadable.
+        remarks: incorrect statements in the file about itself that do not make any message unreadable.
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -121,13 +121,13 @@ class Storage:
     last_ns: int = 0
     damage: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    _offered: int = 0  # characters of quality of service
+    _offered: int = 0  # total length of the QoS profiles [characters]
 
     def announce(self, number: int, channel: Channel, offered: str) -> None:
-        """Add a channel with its quality of service.
+        """Add a channel with its QoS profiles.
 
         Raises:
-            ValueError: a name is not printable, or there are too many channels.
+            ValueError: a name is not printable, there are too many channels, or their QoS profiles are too long.
         """
         check_name(channel.topic)
         if channel.type:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streaming of a bag in chunks: its signals go to sinks as from an offline run, with as little memory."""
+"""Streaming of a bag in chunks: its signals are passed to sinks as in an offline run, with as little memory."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -20,22 +20,22 @@ from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Signals
 
-_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # messages of a topic that are decoded together, and their total size
+_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # number and total size [B] of a topic's messages decoded together
 _AHEAD = 64  # chunks that one topic may be ahead of another
-_MOST_WAITING = 2**18  # messages of a sparse topic ahead of the blocks
+_MOST_WAITING = 2**18  # messages of a sparse topic that may be waiting for blocks
 
 
 @dataclass(frozen=True)
 class BagHeader:
-    """Header of a bag of the cell, available once the bag has been read.
+    """Header of a cell's bag, available once the bag has been read.
 
     Attributes:
         types: message type by fully qualified signal topic.
-        samples: index after the last sample that every dense topic has; equals their number, except in a snapshot.
-        left: further samples of some topics, left by an interrupted recording; otherwise 0.
+        samples: index after the last sample that all dense topics have; equals the sample count, except in a snapshot.
+        left: number of samples that some topics have beyond `samples` after an interrupted recording; otherwise 0.
         step_ns: sampling step [ns]; 0 if the bag has no dense topic.
-        run_id: identity of the run.
-        about: strings from the metadata of the bag.
+        run_id: ID of the run.
+        about: strings from the bag's metadata.
     """
 
     types: Mapping[str, str]
@@ -52,8 +52,8 @@ def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
     Args:
         topic: topic of the block.
         block: the decoded block.
-        end: expected index of its first sample.
-        step_ns: sampling step so far [ns]; 0: any step.
+        end: expected index of the block's first sample.
+        step_ns: sampling step so far [ns]; 0 if any step is accepted.
 
     Raises:
         LatheError: samples are missing or repeated, or the step changes.
@@ -65,7 +65,7 @@ def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
 
 
 class _Dense:
-    """Blocks of a topic that have not been handed on yet, starting at sample ``first``."""
+    """Blocks of a topic that have not been passed on yet, starting at sample ``first``."""
 
     def __init__(self, topic: str, msgtype: str, first: int = 0) -> None:
         self.topic, self.type = topic, msgtype
@@ -95,13 +95,13 @@ class _Dense:
         Raises:
             LatheError: see `read_all`.
         """
-        # The decoder joins blocks of one memory area: decoded together they take a fraction of the time of each alone.
+        # The decoder joins blocks in one memory area: decoding them together is several times faster than one by one.
         messages, self._messages, self._bytes = self._messages, [], 0
         ends = np.cumsum([0, *map(len, messages)])
         self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
 
     def read_all(self, whole: bytes, places: Places) -> None:
-        """Decode messages located in ``whole`` by begin and end of each, shape (messages, 2).
+        """Decode messages in ``whole``, given the start and end of each, shape (messages, 2).
 
         Raises:
             LatheError: samples are missing or repeated, or a block cannot be decoded.
@@ -144,13 +144,13 @@ class Feeder:
 
     Args:
         types: message type by fully qualified topic; topics other than signal topics are ignored.
-        sinks: sinks that get the chunks.
+        sinks: sinks that receive the chunks.
         piece: samples per chunk.
         first: index of the first sample of all topics.
 
     Attributes:
         types: message type by fully qualified signal topic.
-        first: index of the first sample that has not been handed on.
+        first: index of the first sample that has not been passed on.
     """
 
     def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0) -> None:
@@ -164,16 +164,16 @@ class Feeder:
 
     @property
     def step_ns(self) -> int:
-        """Return the sampling step [ns]; 0 before the first block."""
+        """Sampling step [ns]; 0 before the first block."""
         return next((dense.newest.step_ns for dense in self._dense.values() if dense.newest), 0)
 
     @property
     def run_id(self) -> str:
-        """Return the identity of the run."""
+        """ID of the run; empty before the first block."""
         return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
 
     def add(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Add a message, and hand on the chunks it completes.
+        """Add a message, and pass on the chunks that it completes.
 
         Raises:
             LatheError: samples are missing, or a topic stalls while others continue.
@@ -181,7 +181,7 @@ class Feeder:
         dense = self._dense.get(topic)
         if dense is None:
             if not self._dense:
-                return  # without blocks there is no chunk to hand them on with
+                return  # without blocks there are no chunks in which to pass on the messages
             if len(self._sparse[topic]) >= _MOST_WAITING:
                 raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
             try:
@@ -216,7 +216,7 @@ class Feeder:
         self.first += samples
 
     def finish(self) -> int:
-        """Hand the remaining samples to the sinks.
+        """Pass the remaining samples to the sinks.
 
         Returns:
             Number of samples that some topics have beyond the others; 0 if the recording is complete.
@@ -234,7 +234,7 @@ class Feeder:
 
 
 class SampleReader:
-    """Reader of a dense topic of a bag, on demand.
+    """On-demand reader of a dense topic in a bag.
 
     Args:
         source: the bag; must stay open while the topic is read.
@@ -267,11 +267,11 @@ class SampleReader:
 
 
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
-    """Read a bag of the cell and pass its signals to sinks, in chunks.
+    """Read a cell's bag and pass its signals to sinks, in chunks.
 
     Args:
         path: path of the bag.
-        sinks: sinks that get every sample once, in order; topics are fully qualified.
+        sinks: sinks that receive every sample once, in order; topics are fully qualified.
         piece: samples per chunk; the last chunk may be shorter.
 
     Raises:

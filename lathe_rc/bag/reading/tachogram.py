@@ -14,7 +14,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples
 from lathe_rc.signals import tachogram
 
-_RPM = 30.0 / np.pi  # for 1 rad/s
+_RPM = 30.0 / np.pi  # 1 rad/s in revolutions per minute
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Made:
         points: number of rows of the file.
         samples: number of samples of the recording.
         largest: largest deviation of the file's line segments from the recorded speed [1/min].
-        field: field of the encoder from which the speed was taken.
+        field: encoder field from which the speed was taken.
         standstill: total time at speed 0 [s].
-        stands_from: time of the first standstill after sample 0 [s]; None: the spindle turns throughout.
+        stands_from: time of the first standstill since sample 0 [s]; None if the spindle turns throughout.
     """
 
     points: int
@@ -39,16 +39,16 @@ class Made:
 
 
 def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
-    """Write the speed of a recorded spindle to a CSV file, with as few rows as linear interpolation allows.
+    """Write a recorded spindle speed to a CSV file, with as few rows as linear interpolation within a tolerance needs.
 
     Args:
         bag: path of the recording.
         output: path of the CSV file; an existing file is replaced.
         tolerance: largest deviation of the line segments from the recorded speed [1/min].
-        topic: topic of the encoder; empty: the only encoder of the bag.
+        topic: topic of the encoder; empty for the bag's only encoder.
 
     Raises:
-        InputError: the path is no bag, the bag has no encoder or several, or the output is not writable.
+        InputError: the path is not a bag, the bag has no encoder or several, or the output is not writable.
         LatheError: samples are missing or not finite, or the spindle reverses its direction.
     """
     with Source(bag) as source:

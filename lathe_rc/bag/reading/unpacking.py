@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decompression of chunks, messages and files of a bag, limited to their stated size and the allowed size."""
+"""Decompression of a bag's chunks, messages and files, limited to their stated size and to the allowed size."""
 
 import struct
 from collections.abc import Iterator
@@ -12,13 +12,13 @@ from isal.isal_zlib import crc32
 from lathe_rc.bag.reading.limits import EXPANSION, MOST_BYTES, MOST_SMALL, MOST_SMALL_MESSAGES, TooMuchError
 from lathe_rc.errors import shown
 
-_OVERHEAD = 2**16  # of compression, beyond 1/128 of incompressible data [B]
-_PIECE = 2**20  # of a file that is unpacked at a time [B]
+_OVERHEAD = 2**16  # compression overhead beyond 1/128 of incompressible data [B]
+_PIECE = 2**20  # size of the pieces in which a file is unpacked [B]
 CHUNK = struct.Struct("<QQQII")  #: first and last time, size, CRC, length of the compression's name
 
 
 class Budget:
-    """Budget of bytes and messages that files may still yield, see `limits`.
+    """Budget of bytes and messages that files may still yield (see `limits`).
 
     Args:
         size: size of the files [B].
@@ -69,7 +69,7 @@ def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
 
 
 def unpacked_size(data: bytes) -> int:
-    """Return the size stated by a zstd frame [B], from its first 18 bytes; -1 if it states none or is no frame."""
+    """Return the size stated in the first 18 bytes of a zstd frame [B]; -1 if there is no frame or no stated size."""
     try:
         return int(zstandard.frame_content_size(data))
     except zstandard.ZstdError:
@@ -103,7 +103,7 @@ def read_chunk(content: bytes, place: int) -> bytes:
         ValueError: the chunk is damaged.
     """
     try:
-        # The checksum is that of the unpacked records; 0 stands for none.
+        # The checksum is that of the unpacked records; 0 means that there is none.
         _, _, size, crc, name = CHUNK.unpack_from(content)
         start = CHUNK.size + name
         name_of = content[CHUNK.size : start].decode("utf-8", "replace")

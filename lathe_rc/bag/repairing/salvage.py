@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reader of every valid message of a bag that is truncated or damaged in places.
+"""Reader of all valid messages in a bag that is truncated or damaged in places.
 
-Bytes are copied without decoding: schemas, channels and messages keep every byte except their numbers.
+Bytes are copied without decoding: schemas, channels and messages keep every byte except their IDs.
 """
 
 import sqlite3
@@ -32,18 +32,18 @@ from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.bag.writing.writer import definition
 from lathe_rc.errors import InputError, shown
 
-ROS2 = "ros2"  #: profile of the files of rosbag2
+ROS2 = "ros2"  #: profile of rosbag2 files
 
-_MESSAGE = struct.Struct("<IQQ")  # sequence, log time, publish time: ahead of the data of a message
+_MESSAGE = struct.Struct("<IQQ")  # sequence, log time and publish time, before a message's data
 _ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of an individually compressed message; CDR begins with a zero
-_PAGE = 4096  # bytes of a database that are reported as lost where SQLite gives no number
-_MOST_ID_BITS = 62  # of a row
-_MOST_DAMAGE = 1000  # reported places
+_PAGE = 4096  # bytes of a database reported as lost when SQLite does not state how many
+_MOST_ID_BITS = 62  # maximum size of a row ID [bit]
+_MOST_DAMAGE = 1000  # maximum number of places reported
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as in rosbags
 
 
 class Topic(NamedTuple):
-    """Channel of a bag; its byte fields are those of the records, including the numbers at their beginning.
+    """Channel of a bag; the byte fields hold the raw record contents, including the leading IDs.
 
     Attributes:
         name: name of the topic.
@@ -83,25 +83,25 @@ class _Definition(NamedTuple):
 
 @dataclass
 class Salvage:
-    """Readable content of a damaged bag; iterate over it to get each intact message.
+    """Readable content of a damaged bag; iteration yields each intact message.
 
     Args:
-        path: a rosbag2 folder, or a single file of one.
+        path: rosbag2 folder, or a single file from one.
 
     Attributes:
-        copied: called with opcode and content of attachments, and of metadata from other software.
+        copied: callback for the opcode and content of each attachment, and of metadata from other software.
         topics: all topics that can be copied.
         profile: profile of the MCAP files.
-        about: strings from the metadata of the bag.
-        damage: kind and place of each damage, one line each.
-        lost_bytes: bytes of the files that yielded no message.
+        about: strings from the bag's metadata.
+        damage: kind and location of the damage, one line per damaged place.
+        lost_bytes: number of bytes in the files that yielded no message.
         saved: number of recovered messages, set by `recover`.
-        skipped: number of messages of topics that cannot be copied.
-        missing: number of messages that the bag counts beyond those found.
+        skipped: number of messages on topics that cannot be copied.
+        missing: number of messages that the bag counts but that were not found.
         lossy: whether messages are missing, or may be wrong.
 
     Raises:
-        InputError: the path has no bag file.
+        InputError: there is no bag file at the path.
     """
 
     path: Path
@@ -114,8 +114,8 @@ class Salvage:
     skipped: int = 0
     missing: int = 0
     lossy: bool = False
-    _described: int = 0  # characters of strings and definitions
-    _counted: int | None = None  # messages stated by the file being read
+    _described: int = 0  # total length of strings and definitions [characters]
+    _counted: int | None = None  # number of messages stated in the file being read
     _ended: bool = True  # whether that file is complete
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ class Salvage:
         self.profile = self._profile(self._files[0])
 
     def _read_metadata(self) -> metadata.Metadata | None:
-        """Return the metadata of a folder, or None if they are unreadable."""
+        """Return the metadata of a folder; None if they are missing or unreadable."""
         if not (self.path / metadata.NAME).exists():
             return None
         try:
@@ -210,7 +210,7 @@ class Salvage:
         self.lost_bytes += size
 
     def count(self, length: int) -> None:
-        """Count characters of the content kept beside the messages.
+        """Count the characters of content kept in addition to the messages.
 
         Raises:
             ValueError: the total exceeds the limit.
@@ -225,7 +225,7 @@ class Salvage:
         self.about |= about
 
     def add(self, topic: Topic, offered: str) -> Topic:
-        """Announce a topic; its quality of service is copied even if it cannot be parsed.
+        """Announce a topic; its QoS profiles are copied even if they cannot be parsed.
 
         Raises:
             ValueError: the topic cannot be copied.
@@ -273,13 +273,13 @@ class Salvage:
                 self.lossy = True
 
     def _other(self, opcode: int, content: bytes, lost: int, told: Told) -> None:
-        """Keep a record that is neither a message, nor a schema or channel."""
+        """Process a record that is not a message, schema or channel."""
         try:
             if opcode == Opcode.METADATA:
                 metadata = parsed(Metadata, content)
                 if metadata.name == "lathe_rc":
                     self._describe(metadata.metadata)
-                elif metadata.name != "rosbag2":  # the new bag gets its own
+                elif metadata.name != "rosbag2":  # the new bag has its own
                     self.copied(opcode, content)
             elif opcode == Opcode.ATTACHMENT:
                 self.copied(opcode, content)
@@ -301,7 +301,7 @@ class Salvage:
                 if left:
                     self._lose(file, left_over(left), left)
                 base = stack.enter_context(closing(connect(database)))
-                with suppress(sqlite3.DatabaseError):  # of a damaged page; the others are read below
+                with suppress(sqlite3.DatabaseError):  # caused by a damaged page; the other pages are read below
                     check_tables(base)
                 topics = self._sqlite_topics(file, base)
                 for number, log_ns, data in _readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
@@ -337,18 +337,18 @@ class Salvage:
 
 
 class _Definitions:
-    """Schemas and channels of an MCAP file, wherever they are in it."""
+    """Schemas and channels of an MCAP file, wherever they are located."""
 
     def __init__(self, salvage: Salvage, sound: SoundRecords) -> None:
         self._salvage, self._sound = salvage, sound
         self._known: dict[tuple[int, int], _Definition] = {}
-        self.topics: dict[int, Topic] = {}  #: by channel number, of the messages so far
-        self._lost: Counter[str] = Counter()  # messages by the reason for not copying them
+        self.topics: dict[int, Topic] = {}  #: topics of the messages so far, by channel number
+        self._lost: Counter[str] = Counter()  # number of messages not copied, by reason
         self._why: dict[int, str] = {}
         self._searched = False
 
     def add(self, opcode: int, content: bytes, *, checked: bool) -> None:
-        """Add a schema or channel record; among contradicting ones, the last with a checksum counts."""
+        """Add a schema or channel record; of contradictory records, the last one with a checksum is used."""
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
             return
         key = opcode, int.from_bytes(content[:2], "little")
@@ -364,7 +364,7 @@ class _Definitions:
             self.topics.clear()
 
     def _find(self, opcode: int, number: int) -> bytes | None:
-        """Return the content of a record, searching the rest of the file once if it has not been read yet."""
+        """Return the content of a schema or channel record; if it is not known yet, search the whole file once."""
         key = opcode, number
         if key not in self._known and not self._searched:
             self._searched = True
@@ -378,7 +378,7 @@ class _Definitions:
         return self._known[key].content if key in self._known else None
 
     def topic_of(self, number: int) -> Topic | None:
-        """Return the topic of a message's channel; None if it cannot be copied."""
+        """Return the topic of a message's channel; None if the topic cannot be copied."""
         if number not in self._why:
             try:
                 content = self._find(Opcode.CHANNEL, number)
@@ -387,7 +387,7 @@ class _Definitions:
                 topic = self.topics[number] = self._made(content)
             except MemoryError:
                 raise
-            except Exception as error:  # noqa: BLE001 - mcap raises any exception for damaged bytes
+            except Exception as error:  # noqa: BLE001 - mcap can raise any exception on damaged bytes
                 self._why[number] = shown(error)
             else:
                 return topic
@@ -421,7 +421,7 @@ class _Definitions:
 
 
 def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield topic, time and bytes of the messages on all intact pages; no bytes if a message is too long."""
+    """Yield the topic, time and bytes of each message on an intact page; the bytes are None if they are too long."""
     query = (
         f"SELECT id, topic_id, timestamp, CASE WHEN length(data) <= {MOST_BYTES} THEN data END"  # noqa: S608 - a constant
         " FROM messages WHERE id >= ? ORDER BY id"
@@ -444,7 +444,7 @@ def _readable_rows(base: sqlite3.Connection, told: Told) -> Iterator[tuple[Any, 
             told(f"from message {first} on: {error}", _PAGE)
         else:
             return
-        # Rows behind a damaged page are searched by doubling, then by bisection: row numbers have gaps of any length.
+        # The first row after a damaged page is located by doubling, then by bisection: row IDs have gaps of any length.
         step = next((2**k for k in range(_MOST_ID_BITS) if readable(2**k)), None)
         if step is None:
             return

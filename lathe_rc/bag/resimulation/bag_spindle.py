@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cell driven by the recorded spindle of a bag, and comparison of the recorded with the re-simulated tool position."""
+"""Cell driven by a bag's recorded spindle, and comparison of the recorded and re-simulated tool positions."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ _TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
 
 
 class Memory(NamedTuple):
-    """Memory of the time-master step: recorded samples read ahead.
+    """State of the time master's step function: recorded samples, read ahead.
 
     Attributes:
         span: index of the first sample, and the index after the last.
@@ -57,7 +57,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class _RecordedSpindle(TimeMaster):
-    """Time master that replays the recorded spindle."""
+    """Time master that replays the recorded spindle motion."""
 
     step = staticmethod(step)
 
@@ -71,9 +71,10 @@ class _RecordedSpindle(TimeMaster):
         self._span = np.zeros(2, np.int64)
 
     def speed_range(self) -> tuple[float, float]:
-        """Return the speed range of the scenario's law, or without one the recorded range [rad/s].
+        """Return the speed range of the bag's own scenario or, with another scenario, the recorded range [rad/s].
 
-        If the recorded spindle stands still, the lowest speed is the scenario's, as the checks need a moving spindle.
+        If the recorded spindle stands still, the lowest speed is the scenario's, because the checks need a moving
+        spindle.
         """
         made = self._made.speed_range()
         if self._said is None:
@@ -91,7 +92,7 @@ class _RecordedSpindle(TimeMaster):
 
     @property
     def memory(self) -> Memory:
-        """Return the memory of the step."""
+        """Current state of the step function."""
         return Memory(self._span, *self._ready.values())
 
     def prepare(self, first: int, samples: int) -> None:
@@ -100,7 +101,7 @@ class _RecordedSpindle(TimeMaster):
         Raises:
             LatheError: the recording has fewer samples, or some are missing.
         """
-        # Samples that were read ahead move to the front: the kernel sees one contiguous array.
+        # Samples that were read ahead are moved to the front, so that the kernel sees one contiguous array.
         begin, end = self._span.tolist()
         if first + samples <= end:
             return
@@ -122,11 +123,11 @@ class _RecordedSpindle(TimeMaster):
         self._scheduled.append((index, action))
 
     def act(self, action: str, index: int) -> None:
-        """Ignore the action: faults of the encoder are already in the recording."""
+        """Ignore the action: encoder faults are already in the recording."""
 
 
 def _positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
-    """Return topics and fields of a bag whose sum is the tool's position; empty if any of them is missing.
+    """Return the topics and fields of a bag whose sum is the tool position; empty if any of them is missing.
 
     These are the tool's own topic, or the measured positions of the drives that move it.
     """
@@ -139,10 +140,10 @@ def _positions(recorded: Recorded, tool: Tool) -> list[tuple[str, str]]:
 
 
 class Comparison:
-    """Form error of the recorded tool position and its difference from the re-simulation, by revolution; a sink.
+    """Comparison of the recorded and re-simulated tool positions for each revolution; a sink.
 
-    The recorded form error is that of the re-simulation with the recorded position in place of the simulated one: same
-    desired form, same cross slide, same deflection.
+    The recorded form error is computed as in the re-simulation, but with the recorded position instead of the simulated
+    one; the desired form, the cross slide and the deflection are the same.
 
     Args:
         recorded: recorded topics of the bag.
@@ -169,15 +170,15 @@ class Comparison:
             sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
 
     def recorded_rms(self) -> Samples:
-        """Return the form error of the recorded position by revolution, RMS [m], shape (revolutions,)."""
+        """Return the RMS form error of the recorded position for each revolution [m], shape (revolutions,)."""
         return self._recorded.rms()
 
     def between_rms(self) -> Samples:
-        """Return the difference of the two positions by revolution, RMS [m], shape (revolutions,)."""
+        """Return the RMS difference between the two positions for each revolution [m], shape (revolutions,)."""
         return self._between.rms()
 
 
-Events = dict[str, list[tuple[int, str]]]  #: sample and action of the events of each node
+Events = dict[str, list[tuple[int, str]]]  #: sample and action of each event, by node
 
 
 def wire(
@@ -187,17 +188,18 @@ def wire(
 
     Args:
         chosen: scenario to run.
-        original: scenario of the bag; None: ``chosen`` takes its place.
+        original: scenario of the bag; None if ``chosen`` replaces it.
         recorded: recorded topics of the bag.
-        source: the opened bag.
+        source: the open bag.
 
     Returns:
-        The cell; the comparison of its tool position with the recorded one, if the bag has that position but not its
-        error; and the bag's events, as they took effect. A scenario that is not the bag's keeps its own events.
+        The cell; the comparison of its tool position with the recorded one, if the bag has that position but not the
+        form error; and the bag's events, at the samples at which they took effect. A scenario other than the bag's
+        keeps its own events.
 
     Raises:
-        InputError: the bag has no encoder or a step other than the scenario's, or the checks before a start fail.
-        LatheError: samples that are needed are missing or not finite.
+        InputError: the bag has no encoder, its step differs from the scenario's, or the pre-start checks fail.
+        LatheError: required samples are missing or not finite.
     """
     nodes = dict(chosen.nodes)
     if original is not None:
@@ -255,14 +257,14 @@ def _samples(source: Source, topic: str) -> int:
     step_ns = source.step_ns(topic)
     if not step_ns:
         raise InputError(f"{source.path}: {topic} has no block")
-    # Log times may be those of another clock: then all blocks are read.
+    # Log times may come from another clock; in that case all blocks are read.
     late = source.last_ns - 2 * messages.MAX_BLOCK * step_ns
     (last,) = deque(source.blocks(topic, start_ns=late), 1) or deque(source.blocks(topic), 1)
     return last.first_index + last.samples
 
 
 def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
-    """Return sample and action of each node's events, as they took effect."""
+    """Return the events of each node: the sample at which each took effect, and its action."""
     topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
     found: dict[str, list[tuple[int, str]]] = {}
     for topic, _, data in source.messages(topics):

@@ -44,10 +44,10 @@ class Identified:
 
 
 def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
-    """Identify the electrodynamic drives of a scenario, or without a scenario the drive on the default topics.
+    """Identify the electrodynamic drives of a scenario or, without a scenario, the drive on the default topics.
 
     Raises:
-        InputError: there is no such drive, the bag lacks its command or position, or the signals do not suffice.
+        InputError: there is no such drive, the bag lacks its command or position, or the signals are insufficient.
         LatheError: samples are missing or not finite.
     """
     kind = ElectrodynamicActuator.kind
@@ -103,7 +103,7 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
     """Return the scenario with the identified parameters in place of its own.
 
     Raises:
-        InputError: a value is not valid for the drive's table.
+        InputError: a value is invalid in the drive's table.
     """
     nodes = dict(scenario.nodes)
     for drive in found:
@@ -113,9 +113,9 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
 
 
 def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Identified]) -> None:
-    """Write a parameter file: the whole scenario, or without a scenario the identified parameters.
+    """Write a parameter file with the whole scenario or, without a scenario, the identified parameters.
 
-    Files that the scenario refers to are copied beside it, because the files unpacked from a bag are temporary.
+    Files that the scenario refers to are copied into the same folder, because files unpacked from a bag are temporary.
 
     Raises:
         InputError: the file cannot be written.
@@ -134,7 +134,7 @@ def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Iden
 
 
 def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
-    """Return a node's table with its files copied beside ``path``, and no identity, as the values have changed."""
+    """Return a node's table with its files copied next to ``path``, and no run ID, since the values have changed."""
     update: dict[str, str] = {"run_id": ""}
     for row in type(table).rows().values():
         file = Path(str(getattr(table, row.name))) if row.is_path else Path()
@@ -148,12 +148,12 @@ def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
 
 @dataclass(frozen=True)
 class Form:
-    """Averaged tool position over the spindle angle.
+    """Tool position over the spindle angle, averaged over several revolutions.
 
     Attributes:
         radius: position at equally spaced angles from 0 [m], shape (points,).
-        revolutions: first and last averaged revolution, counted from 1.
-        scatter: RMS difference of a revolution from the average [m].
+        revolutions: first and last revolution included in the average, counted from 1.
+        scatter: RMS deviation of the revolutions from the average [m].
     """
 
     radius: np.ndarray
@@ -162,10 +162,10 @@ class Form:
 
 
 def form(recorded: Recorded) -> Form:
-    """Return the recorded tool position averaged by angle, over the second half of the revolutions.
+    """Return the recorded tool position over the angle, averaged over the second half of the revolutions.
 
     Raises:
-        InputError: the bag has no encoder, no tool position, or not one complete revolution.
+        InputError: the bag has no encoder, no tool position, or no complete revolution.
         LatheError: samples are missing or not finite.
     """
     tool = recorded.find("tool", messages.TOOL)
@@ -180,7 +180,7 @@ def form(recorded: Recorded) -> Form:
     arrays = [recorded.whole(topic, field) for topic, field in ((spindle.topic, spindle.angle), source)]
     common = min(array.size for array in arrays)
     angle, position = arrays[0][:common] - spindle.turns, arrays[1][:common]
-    # An encoder with few counts repeats its value for some samples: the first of each counts.
+    # An encoder with few counts repeats each value for several samples, of which the first is used.
     new = np.diff(angle, prepend=-np.inf) > 0.0
     every = evenly(angle[new], position[new], _FORM_POINTS)
     if not every.size:

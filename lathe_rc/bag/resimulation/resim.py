@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Re-simulation: the spindle turns as recorded in a bag, everything downstream of it is computed again.
+"""Re-simulation: the spindle turns as recorded in a bag, and everything downstream of it is computed again.
 
-Without changes the results are bit-identical to the recording. With another controller the run shows how that
+Without changes, the results are bit-identical to the recording. With another controller, the run shows how that
 controller would have performed with the same spindle, disturbances and form.
 
-A bag without a scenario needs one beside it: the spindle is the recorded one, the rest is the scenario's, on request
-with the drive identified from the recorded command and position.
+For a bag without a scenario, one must be given: only the spindle motion is taken from the bag, everything else from the
+scenario, optionally with the drive identified from the recorded command and position.
 """
 
 import tempfile
@@ -48,18 +48,18 @@ class Resimulation:
 
     Attributes:
         scenario: the simulated scenario.
-        changed: whether it differs from that of the bag, or the bag has none.
-        samples: length of the run.
+        changed: whether the scenario differs from that of the bag, or the bag has none.
+        samples: number of samples of the run.
         wall_s: wall time of the run [s].
         digest: digest of each signal topic.
-        recorded: the same digests of the bag; empty if the recording is incomplete.
-        rms: form error by revolution, RMS [m], shape (revolutions,); empty without a tool.
-        recorded_rms: recorded form error by revolution, RMS [m].
-        between_rms: difference of the recorded and the re-simulated tool position by revolution, RMS [m], if the
-            recorded error is not in the bag but derived from both; otherwise empty.
-        positions: topics and fields of the bag that give the recorded position; otherwise empty.
+        recorded: recorded digests of the bag's topics; empty if the recording is incomplete.
+        rms: RMS form error of each revolution [m], shape (revolutions,); empty without a tool.
+        recorded_rms: recorded RMS form error of each revolution [m].
+        between_rms: RMS difference between the recorded and the re-simulated tool position for each revolution [m], if
+            the recorded error is derived from these positions because the bag does not contain it; otherwise empty.
+        positions: in the same case, topics and fields of the bag that give the recorded position; otherwise empty.
         drives: identified drives.
-        warnings: changes of third-party classes since the bag was made.
+        warnings: changes of third-party classes since the bag was made and, for a changed cell, warnings of its check.
     """
 
     scenario: Scenario
@@ -77,22 +77,22 @@ class Resimulation:
 
     @property
     def different(self) -> list[str]:
-        """Return the topics whose digests differ from the recorded ones."""
+        """Topics whose digests differ from the recorded ones."""
         return [topic for topic in sorted(self.recorded) if self.digest.get(topic) != self.recorded[topic]]
 
     @property
     def missing(self) -> list[str]:
-        """Return the topics that were not recorded."""
+        """Topics that were not recorded."""
         return sorted(self.digest.keys() - self.recorded.keys())
 
     @property
     def simulated_s(self) -> float:
-        """Return the simulated time [s]."""
+        """Simulated time [s]."""
         return self.samples * self.scenario.shared.step
 
 
 class _Digests:
-    """Sink that computes the digests of an offline run by fully qualified topic."""
+    """Sink that computes the digests of an offline run, by fully qualified topic."""
 
     def __init__(self, cell: Cell) -> None:
         self._step_ns = cell.master.shared.step_ns
@@ -114,10 +114,10 @@ class _Digests:
 
 
 def with_controller(scenario: Scenario, file: Path) -> Scenario:
-    """Replace the nodes contained in a parameter file; parameters shared by all nodes remain unchanged.
+    """Replace the nodes that a parameter file contains; parameters shared by all nodes remain unchanged.
 
     Raises:
-        InputError: the scenario does not have a node of the file, or a parameter is not valid.
+        InputError: the file contains a node that the scenario does not have, or a parameter is invalid.
     """
     shared = {name: getattr(scenario.shared, name) for name in SharedParameters.model_fields}
     nodes = dict(scenario.nodes)
@@ -163,22 +163,22 @@ def resimulate(
     parameters: Path | None = None,
     output: Path | None = None,
 ) -> Resimulation:
-    """Run the cell of a bag again with its recorded spindle.
+    """Run the cell of a bag again with the recorded spindle.
 
     Args:
         path: path of the bag.
-        overrides: parameters as ``NODE.PARAM=VALUE``; not of the spindle, if the scenario is the bag's.
+        overrides: parameters as ``NODE.PARAM=VALUE``; not for the spindle if the scenario is the bag's.
         scenario: parameter file that replaces the bag's scenario; None: the scenario of the bag.
         controller: parameter file whose nodes replace those of the scenario.
-        topics: topic of the bag by relative topic of the cell, where the two differ.
+        topics: the bag's topics by the cell's relative topics, where they differ.
         identified: whether to identify the electrodynamic drives from the bag.
-        parameters: file for the parameters of the simulated scenario; None: no file.
-        output: folder of a bag for the result; must not exist; None: no bag.
+        parameters: file to which the parameters of the simulated scenario are written; None: no file.
+        output: folder of a new bag for the result; must not exist yet; None: no bag.
 
     Raises:
-        InputError: the bag has no encoder, or no scenario and none is given; the changes cannot work; a drive
-            cannot be identified.
-        LatheError: samples that are needed are missing or not finite.
+        InputError: the bag has no encoder, or it has no scenario and none is given; the changes are not possible; or a
+            drive cannot be identified.
+        LatheError: required samples are missing or not finite.
     """
     if output is not None:
         refuse_existing(output)
@@ -204,7 +204,7 @@ def resimulate(
         with _without_strangers(path, changed=changed):
             cell, compared, events = wire(chosen, original, recorded, source)
         warnings += cell.warnings if changed else []
-        # Events are inserted as they took effect: their samples depended on an operator or on the recorded spindle.
+        # Events are inserted at the samples at which they took effect, which depended on an operator or the spindle.
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)
@@ -251,7 +251,7 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequenc
     """Return the bag's scenario; ``overrides`` name the files that the bag does not contain.
 
     Raises:
-        InputError: the bag has no scenario; the message states what it has and what is needed.
+        InputError: the bag has no scenario; the message states what the bag has and what is needed.
     """
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
@@ -262,11 +262,11 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequenc
 
 @contextmanager
 def _without_strangers(path: Path, *, changed: bool) -> Iterator[None]:
-    """Explain an unpublished topic in the cell that a third-party node, not part of the bag, once published.
+    """Explain that an unpublished topic was once published by a third-party node that is not part of the bag.
 
     Args:
         path: path of the bag.
-        changed: whether the cell differs from the recorded one; then the cause may be another.
+        changed: whether the cell differs from the recorded one; if so, the error may have another cause.
     """
     try:
         yield
@@ -295,7 +295,7 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
 
 
 def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
-    """Reject events and faults that differ from those of the bag; a node without any gets those of the bag."""
+    """Reject events and faults that differ from the bag's; a node without any takes those of the bag."""
     if original is None:
         return
     for name, table in chosen.nodes.items():
@@ -306,5 +306,5 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
 
 
 def _recorded_digests(path: Path) -> dict[str, str]:
-    """Return the digests of a bag, stored or computed from all of it; empty if the bag is incomplete."""
+    """Return the stored digests of a bag or, without them, those computed from its content; empty if incomplete."""
     return check.recorded(path) or check.check(path).digests

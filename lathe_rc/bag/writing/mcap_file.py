@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writer of MCAP files, chunk by chunk.
 
-The records are those of the mcap library, but its own writer takes 14 µs per message, as long as a stage of the cell
-takes per block: offline runs of piston and full_cell, recorded by it, ran at 0.3 of the speed. Here a message costs a
-header and two appends, and a row of blocks one append; the index of a chunk is built when the chunk is full, by the
-compiled walk that the readers use. The library's writer also keeps one object per chunk of a long run, and has no
-flush.
+The records are those of the mcap library, but the library's own writer takes 14 µs per message, as long as a stage of
+the cell takes per block: offline runs of piston and full_cell recorded with it ran at 0.3 times the speed. Here a
+message costs a header and two appends, and a row of blocks costs one append; the index of a chunk is built when the
+chunk is full, using the readers' compiled walk. The library's writer also keeps one object per chunk, however long the
+run, and cannot flush.
 
-Schemas and channels are repeated at the beginning of chunks 2, 3, 5, 9, 17 and so on: a damaged chunk makes no other
-chunk unreadable, not even in a file that was cut off before its summary.
+Schemas and channels are repeated at the beginning of chunks 2, 3, 5, 9, 17 and so on, so that a damaged chunk does not
+make other chunks unreadable, not even in a file that was cut off before its summary.
 """
 
 import io
@@ -29,11 +29,11 @@ from mcap.writer import MCAP0_MAGIC
 from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-TIMES = (16, 8)  #: distance of log time and publish time from the beginning of a message's data [B]
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the following pairs of log time and place
+TIMES = (16, 8)  #: offsets of log time and publish time, backwards from a message's data [B]
+_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the following pairs of log time and offset
 _FOOTER = struct.Struct("<BQQQ")
-_ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # reserved on the disk for index and metadata [B]
-_LEVEL = -5  # of zstd: 20 % of the time of its default level, for files 7 % larger (docs/bags.md)
+_ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # disk space reserved for index and metadata [B]
+_LEVEL = -5  # zstd level: 20 % of the time of the default level, for files that are 7 % larger (docs/bags.md)
 
 
 class _Record(Protocol):
@@ -44,14 +44,14 @@ class _Record(Protocol):
 
 
 def message_head(channel: int, log_ns: int, length: int, publish_ns: int | None = None, sequence: int = 0) -> bytes:
-    """Return the bytes before a message's ``length`` data bytes; publish time defaults to the log time."""
+    """Return the bytes that precede a message's ``length`` data bytes; publish time defaults to log time."""
     published = log_ns if publish_ns is None else publish_ns
     size = length + _MESSAGE.size - HEAD.size
     return _MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence, log_ns, published)
 
 
 def _record(opcode: int, *parts: bytes) -> bytes:
-    """Return a serialized record with these contents."""
+    """Return a serialized record with the given parts as its content."""
     return b"".join([HEAD.pack(opcode, sum(map(len, parts))), *parts])
 
 
@@ -63,42 +63,42 @@ def _encoded(*each: _Record) -> bytes:
 
 
 def schema_content(name: str, encoding: str, text: bytes) -> bytes:
-    """Return the content of a schema record, with schema number 0."""
+    """Return the content of a schema record, with schema ID 0."""
     return _encoded(records.Schema(id=0, data=text, encoding=encoding, name=name))[HEAD.size :]
 
 
 def channel_content(topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """Return the content of a channel record, with channel number 0."""
+    """Return the content of a channel record, with channel ID 0."""
     channel = records.Channel(id=0, topic=topic, message_encoding=encoding, metadata=dict(metadata), schema_id=0)
     return _encoded(channel)[HEAD.size :]
 
 
 class McapFile:
-    """MCAP file opened for writing.
+    """MCAP file that is open for writing.
 
     Args:
-        path: path of the file; must not exist.
-        chunk_size: bytes of messages after which a chunk is written.
-        compress: compress the chunks with zstd.
+        path: path of the file; must not exist yet.
+        chunk_size: size of the messages after which a chunk is written [B].
+        compress: whether to compress the chunks with zstd.
         profile: profile of the file.
 
     Attributes:
-        counts: messages by channel in the chunks written so far.
+        counts: number of messages by channel in the chunks written so far.
         first_ns, last_ns: smallest and largest log time so far [ns]; None before the first message.
 
     Raises:
-        OSError: the file cannot be created; from any later method: writing to the disk fails.
+        OSError: the file cannot be created; in any later method, writing to the disk fails.
     """
 
     def __init__(self, path: Path, *, chunk_size: int, compress: bool, profile: str = "ros2") -> None:
-        # Unbuffered: flush() hands all bytes to the operating system, and a failed write is cut off again by `_put`.
+        # Unbuffered, so that flush() hands all bytes to the operating system and `_put` can truncate a failed write.
         self._stream = path.open("xb", buffering=0)
         self._chunk_size = chunk_size
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
         self._chunks = 0
-        self._chunk_index = bytearray()  # encoded: as objects, the chunks of a long run take ten times as much memory
+        self._chunk_index = bytearray()  # encoded: for a long run, objects would take ten times as much memory
         self._metadata: list[records.MetadataIndex] = []
         self._attachments: list[records.AttachmentIndex] = []
         self.counts: dict[int, int] = {}
@@ -120,7 +120,7 @@ class McapFile:
             self._size += self._chunk.write(b"".join([*self._schemas, *self._channels]))
 
     def _put(self, *parts: bytes | memoryview) -> None:
-        """Append bytes to the file; a failed write is truncated again, so that no partial record remains."""
+        """Append bytes to the file; after a failed write, truncate the file so that no partial record remains."""
         try:
             for part in parts:
                 rest = memoryview(part)
@@ -135,12 +135,12 @@ class McapFile:
             self._crc = crc32(part, self._crc)
 
     def _keep_room(self) -> None:
-        """Reserve the disk space for completing the file, so that a full disk cannot make the file unreadable."""
+        """Reserve disk space for completing the file, so that a full disk cannot make the file unreadable."""
         needed = _ROOM + _ROOM_PER_CHUNK * (self._chunks + 1) + 4 * self._described
         if needed > self._kept:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
-                # A sparse file would not reserve any blocks of the disk.
+                # A sparse file would not reserve any disk blocks.
                 os.posix_fallocate(stream.fileno(), 0, needed)
             self._kept = needed
 
@@ -149,29 +149,29 @@ class McapFile:
         self._reserve.unlink(missing_ok=True)
 
     def add_schema(self, name: str, text: str) -> int:
-        """Add the schema of a message type and return its number."""
+        """Add the schema of a message type and return the schema's ID."""
         return self.copy_schema(schema_content(name, "ros2msg", text.encode()))
 
     def add_channel(self, topic: str, schema: int, encoding: str, metadata: Mapping[str, str]) -> int:
-        """Add the channel of a topic and return its number."""
+        """Add a channel for a topic and return the channel's ID."""
         return self.copy_channel(channel_content(topic, encoding, metadata), schema)
 
     def copy_schema(self, content: bytes) -> int:
-        """Add a schema with the record content of another file and return its number in this file."""
+        """Add a schema copied from another file's record, and return its ID in this file."""
         number = len(self._schemas) + 1
         self._schemas.append(_record(Opcode.SCHEMA, struct.pack("<H", number), content[2:]))
         self._append(self._schemas[-1])
         return number
 
     def copy_channel(self, content: bytes, schema: int) -> int:
-        """Add a channel with the record content of another file.
+        """Add a channel copied from another file's record.
 
         Args:
             content: content of the channel record.
-            schema: number of its schema in this file; 0: no schema.
+            schema: ID of the channel's schema in this file; 0: no schema.
 
         Returns:
-            Number of the channel in this file.
+            ID of the channel in this file.
         """
         number = len(self._channels) + 1
         self._channels.append(_record(Opcode.CHANNEL, struct.pack("<HH", number, schema), content[4:]))
@@ -197,7 +197,7 @@ class McapFile:
         """Append rows of ``size`` bytes, each consisting of complete message records."""
         rest = memoryview(data)
         while rest:
-            # As many complete rows as bring the chunk beyond its size, at least one.
+            # Add complete rows, at least one, until the chunk exceeds its size.
             fill = (max(self._chunk_size - self._size, 0) // size + 1) * size
             self._size += self._chunk.write(rest[:fill])
             self._filled, rest = True, rest[fill:]
@@ -205,7 +205,7 @@ class McapFile:
                 self.flush()
 
     def flush(self) -> None:
-        """Hand all messages so far to the operating system, as a chunk; they are lost if the write fails."""
+        """Hand all messages added so far to the operating system as a chunk; they are lost if the write fails."""
         if not self._filled:
             return
         try:
@@ -221,7 +221,7 @@ class McapFile:
     def _write_chunk(self) -> None:
         self._keep_room()
         with self._chunk.getbuffer() as memory, memory[: self._size] as whole:
-            # Copies: views of the chunk, kept alive by the traceback of a full disk, would block its buffer.
+            # Copies: views of the chunk, kept alive by the traceback of a full-disk error, would lock its buffer.
             messages = walk(whole.toreadonly()).messages
             crc = crc32(whole)
             data = self._compressor.compress(whole) if self._compressor else bytes(whole)
@@ -259,15 +259,15 @@ class McapFile:
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
-        """Append strings as a metadata record; ``last``: use the disk space reserved for completing the file."""
+        """Append strings as a metadata record; with ``last``, use the disk space reserved for completing the file."""
         content = _encoded(records.Metadata(name=name, metadata=dict(values)))[HEAD.size :]
         self.copy_record(Opcode.METADATA, content, last=last)
 
     def copy_record(self, opcode: int, content: bytes, *, last: bool = False) -> None:
-        """Append an attachment or metadata record copied from another file; ``last``: see `add_metadata`."""
+        """Append an attachment or metadata record copied from another file; for ``last``, see `add_metadata`."""
         self.flush()
         record, stream = _record(opcode, content), ReadDataStream(io.BytesIO(content))
-        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long because of escapes
+        if opcode == Opcode.METADATA and not last:  # metadata.yaml may repeat it, twice as long due to escapes
             self._described += len(record)
             self._keep_room()
         place = {"offset": self._offset, "length": len(record)}

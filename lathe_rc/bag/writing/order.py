@@ -11,7 +11,7 @@ from lathe_rc.cell.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 
-_BUFFER = 2**20  # size of a buffer, unless one row takes more [B]
+_BUFFER = 2**20  # size of a buffer, unless a single row is larger [B]
 
 
 class _Single(NamedTuple):
@@ -26,23 +26,23 @@ class _Single(NamedTuple):
 class Merger:
     """Merger of all signal topics into bag order.
 
-    A row of blocks is written once every dense topic has delivered its block and every source the sparse messages up to
-    the end of the row, whose number the block contains: then no message with an earlier time can follow. The arrival of
-    later messages is no criterion: a source sends on several topics, and DDS preserves the order within a topic, not
-    between topics.
+    A row of blocks is written once every dense topic has delivered its block and every source has delivered its sparse
+    messages up to the end of the row; each block states how many there are. No message with an earlier time can follow
+    after that. The arrival of later messages is not a sufficient criterion, because a source publishes on several
+    topics, and DDS preserves the order within a topic, but not between topics.
 
     Args:
-        writer: output, one or more bags; its topics must have been added.
+        writer: output to one or more bags, to which the topics have been added.
         dense: message type and source by fully qualified dense topic.
         sparse: source by fully qualified sparse topic.
-        run_id: identity of the run.
+        run_id: ID of the run.
         step_ns: sampling step [ns].
         samples: samples per block; the last block may be shorter.
 
     Attributes:
         rows: number of rows written so far.
         samples: number of samples written so far, per dense topic.
-        log_ns: time of the last written sample [ns].
+        log_ns: time of the last sample written [ns].
         complete: whether the last block of every topic has been written.
     """
 
@@ -59,22 +59,22 @@ class Merger:
         self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
         self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
         self._places = {each.topic: place for place, each in enumerate(self._topics)}
-        self._ends = [0] * len(self._topics)  # rows that each topic has delivered
-        self._late = len(self._topics)  # topics that have not delivered the next row
-        self._final: int | None = None  # the last row
-        self._finals = 0  # topics that have delivered it
+        self._ends = [0] * len(self._topics)  # number of rows delivered by each topic
+        self._late = len(self._topics)  # number of topics that have not delivered the next row
+        self._final: int | None = None  # index of the last row
+        self._finals = 0  # number of topics that have delivered the last row
         self._plan = Plan(self._topics, run_id, step_ns, samples)
-        self._buffer_rows = max(_BUFFER // self._plan.rows.size, 1)  # rows
-        self._buffers: dict[int, RowBuffer] = {}  # by number
+        self._buffer_rows = max(_BUFFER // self._plan.rows.size, 1)  # rows per buffer
+        self._buffers: dict[int, RowBuffer] = {}  # by buffer number
         self._free: list[RowBuffer] = []
         self._tail: RowBuffer | None = None  # the last row, if it is shorter
         self._sparse = sparse
         self._repeats: Counter[tuple[str, int, bytes]] = Counter()
         self._sequence = dict.fromkeys(sparse, 0)
-        self._written: Counter[str] = Counter()  # sparse messages by source
-        self._needs: list[tuple[int, str, int]] = []  # row, source and the messages that it has sent up to its end
+        self._written: Counter[str] = Counter()  # number of sparse messages written, by source
+        self._needs: list[tuple[int, str, int]] = []  # row, source, and messages it has sent up to the row's end
         self._waiting: list[_Single] = []
-        self._lost: set[str] = set()  # sources
+        self._lost: set[str] = set()  # lost sources
         self.rows = self.samples = 0
         self.log_ns = START_NS
         self.complete = False
@@ -82,15 +82,15 @@ class Merger:
     # ---- input ---------------------------------------------------------------------------------------
 
     def add_block(self, topic: str, block: Block, data: bytes | None = None) -> bool:
-        """Add a block and return whether every topic has one for the next row, so that `release` may write it.
+        """Add a block and return whether all topics have delivered the next row, so that `release` may write it.
 
         Args:
             topic: fully qualified topic.
             block: the decoded block.
-            data: its serialized message, if there is one.
+            data: serialized message of the block, if there is one.
 
         Raises:
-            LatheError: the block belongs to another run, or the topics are cut into different blocks.
+            LatheError: the block belongs to another run, or the topics are divided into different blocks.
         """
         place = self._places[topic]
         if block.run_id != self._run_id:
@@ -104,7 +104,7 @@ class Merger:
         return self._brought(place, row + 1)
 
     def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> bool:
-        """Add consecutive blocks whose sparse messages have all been added; the result is that of `add_block`.
+        """Add consecutive blocks whose sparse messages have all been added; return the same as `add_block`.
 
         Args:
             topic: fully qualified topic.
@@ -134,7 +134,7 @@ class Merger:
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Add a sparse message."""
-        # A restarted node publishes its newest messages again; duplicates of waiting messages are dropped.
+        # A restarted node republishes its newest messages; duplicates of waiting messages are dropped.
         if self._repeats[topic, log_ns, data]:
             self._repeats[topic, log_ns, data] -= 1
             return
@@ -148,18 +148,18 @@ class Merger:
         )
 
     def forget(self, sources: Collection[str]) -> None:
-        """Stop waiting for sparse messages of lost sources."""
+        """Stop waiting for sparse messages from lost sources."""
         self._lost.update(sources)
         self._needs = [need for need in self._needs if need[1] not in sources]
 
     def _lacks(self, row: int, source: str, messages: int) -> bool:
-        """Return whether sparse messages of a source up to the end of a row are still missing."""
+        """Return whether sparse messages from a source, up to the end of a row, are still missing."""
         end_ns = START_NS + (row + 1) * self._length * self._step_ns
         came = sum(each.log_ns < end_ns and self._sparse[each.topic] == source for each in self._waiting)
         return self._written[source] + came < messages
 
     def _check(self, place: int, first: int, samples: int, *, last: bool) -> int:
-        """Return the row of the next block of a topic, after checking that the block fits it."""
+        """Return the row of a topic's next block, after checking that the block fits this row."""
         row = self._ends[place]
         short = samples != self._length and not (last and (self._tail is None or self._tail.plan.samples == samples))
         if first != row * self._length or short or (self._final is not None and row > self._final):
@@ -181,15 +181,15 @@ class Merger:
         self._finals += 1
 
     def _brought(self, place: int, end: int) -> bool:
-        # Only a topic without a block for the next row changes whether that row is complete; so callers need not check
-        # all topics for each block.
+        # Only a topic that has not yet delivered the next row can complete it, so callers need not check all topics for
+        # each block.
         if self._ends[place] == self.rows:
             self._late -= 1
         self._ends[place] = end
         return not self._late
 
     def _find(self, row: int, samples: int) -> tuple[RowBuffer, int]:
-        """Return the buffer of a row, and the index of the row in it."""
+        """Return the buffer of a row, and the row's index in this buffer."""
         if samples != self._length:
             if self._tail is None:
                 self._tail = RowBuffer(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
@@ -226,7 +226,7 @@ class Merger:
         self._late = sum(end == ready for end in self._ends)
 
     def _together(self, ready: int) -> int:
-        """Return the end of the rows for one write: rows of one buffer without a sparse message between them."""
+        """Return the end of the rows to write at once: rows of one buffer with no sparse message between them."""
         end = min(ready, (self.rows // self._buffer_rows + 1) * self._buffer_rows)
         # The short last row has a buffer of its own, because its byte layout differs.
         if self._tail is not None and self.rows != self._final and end > (self._final or 0):
@@ -245,7 +245,7 @@ class Merger:
             self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
             self._written.update(self._sparse[single.topic] for single in due)
         if due and due[-1].log_ns == first_ns:
-            # Among messages of equal time the topic decides, so this row has to be split into its messages.
+            # Messages with equal times are ordered by topic, so this row must be split into its messages.
             due += [_Single(first_ns, each.topic, 0, buffer.message(k, within)) for k, each in enumerate(self._topics)]
             first += 1
         for single in sorted(due):
@@ -257,7 +257,7 @@ class Merger:
         self.rows, self.samples = end, (end - 1) * self._length + buffer.plan.samples
         self.log_ns = START_NS + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final
-        # A used buffer already has its template and step; a new one costs a copy of the template for each row.
+        # A used buffer already has its template and step; a new one would cost a copy of the template for each row.
         if end % self._buffer_rows == 0 and buffer is not self._tail:
             self._free.append(self._buffers.pop(end // self._buffer_rows - 1))
 

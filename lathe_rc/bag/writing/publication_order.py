@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publication order and log times of messages of any topics, independent of their order of arrival.
+"""Publication order and log times of messages on any topics, independent of their order of arrival.
 
-DDS stamps each message with the wall time of its publication and numbers the messages of each publisher. On one machine
-the stamps of all publishers come from one clock: sorted by stamp, messages are in the order of publication, and the
-preceding message on /clock gives the simulated time of a message.
+DDS stamps each message with the wall time of its publication and numbers the messages of each publisher. On one
+computer, the stamps of all publishers come from the same clock: messages sorted by stamp are in publication order, and
+the simulated time of a message is given by the preceding message on /clock.
 """
 
 import heapq
@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 from lathe_rc.errors import LatheError
 
-MOST_EARLY = 2**28  #: total size of messages that may wait for the first one on /clock [B]
+MOST_EARLY = 2**28  #: total size of messages that may wait for the first message on /clock [B]
 
 
 class Recorded(NamedTuple):
-    """Message with the log time it gets in the bag.
+    """Message with its log time in the bag.
 
     Attributes:
         topic: fully qualified topic.
@@ -32,26 +32,26 @@ class Recorded(NamedTuple):
 class Continuity:
     """Counter of the missing messages of a topic.
 
-    Messages are numbered from 1 for each publisher, but do not identify their publisher.
+    Messages are numbered from 1 for each publisher, but do not identify the publisher.
 
     Args:
         whole: whether reception starts with the first message; otherwise it may start with any message.
 
     Attributes:
         missing: number of missing messages so far.
-        first: number of the first message received; 0 before it.
+        first: sequence number of the first message received; 0 before that.
     """
 
     def __init__(self, *, whole: bool) -> None:
-        self._expected = [1] if whole else []  # the next number of each publisher
+        self._expected = [1] if whole else []  # next sequence number of each publisher
         self.missing = self.first = 0
 
     def take(self, sequence: int, publishers: Callable[[], int]) -> None:
-        """Count the next message by its sequence number; the numbers of one publisher increase.
+        """Register the sequence number of the next message; the numbers of one publisher increase.
 
         Args:
             sequence: sequence number of the message.
-            publishers: returns the current number of publishers; called only for an unexpected sequence number.
+            publishers: function that returns the current number of publishers; called only for an unexpected number.
         """
         expected = self._expected
         self.first = self.first or sequence
@@ -67,10 +67,10 @@ class Continuity:
 
 
 class _Held(NamedTuple):
-    """Message waiting for its turn; sorts by publication, with /clock first among equal stamps."""
+    """Message waiting for its turn; sorts by publication time, with /clock first among equal stamps."""
 
     source_ns: int
-    topic: str  # empty: /clock
+    topic: str  # empty for /clock
     sequence: int
     data: bytes
     time_ns: int  # simulated time given by /clock
@@ -80,15 +80,15 @@ class PublicationOrder:
     """Buffer that holds messages until no earlier publication can still arrive, and returns them in order.
 
     Args:
-        hold_ns: largest delay by which a message may arrive after a later published one [ns].
-        sim_time: log times are those of /clock; otherwise the wall times of publication.
+        hold_ns: longest delay with which a message may arrive after one that was published later [ns].
+        sim_time: whether log times are those on /clock; otherwise they are the wall times of publication.
         began_ns: wall time of the start of the recording [ns]; older messages were latched.
 
     Attributes:
         newest_ns: latest publication time so far [ns]; 0 before the first message.
         late: number of messages that arrived too late for their place in the order; they follow those already returned.
-        left_out: number of messages without a simulated time: published after the start of the recording and before the
-            first received message of a /clock that was already running.
+        left_out: number of messages without a simulated time, because they were published after the start of the
+            recording, but before the first message received from a /clock that was already running.
     """
 
     def __init__(self, *, hold_ns: int, sim_time: bool, began_ns: int) -> None:
@@ -101,11 +101,11 @@ class PublicationOrder:
         self.newest_ns = self.late = self.left_out = 0
 
     def add(self, topic: str, source_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message that its publisher sent at ``source_ns`` with number ``sequence``."""
+        """Add a message that its publisher sent at ``source_ns`` with sequence number ``sequence``."""
         self._hold(_Held(source_ns, topic, sequence, data, 0))
 
     def add_clock(self, source_ns: int, sequence: int, time_ns: int) -> None:
-        """Add a message of /clock with the simulated time ``time_ns``."""
+        """Add a message from /clock with the simulated time ``time_ns``."""
         self._hold(_Held(source_ns, "", sequence, b"", time_ns))
 
     def _hold(self, held: _Held) -> None:
@@ -116,7 +116,7 @@ class PublicationOrder:
         """Yield the messages that are ready, in publication order.
 
         Args:
-            seen_ns: publication time up to which all earlier arrivals have been added [ns].
+            seen_ns: publication time of a message [ns]; all messages that arrived before it must have been added.
 
         Raises:
             LatheError: /clock goes backwards, or too many messages wait for it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording of an offline run with the same messages, in the same order, as a cell of ROS nodes sends."""
+"""Recording of an offline run with the same messages, in the same order, as for a cell of ROS nodes."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,7 +38,7 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
     Args:
         path: folder of the bag.
         scenario: scenario of the run.
-        snapshots: result of `begin_snapshots`; None: the whole run is recorded, whatever the scenario sets.
+        snapshots: result of `begin_snapshots`; None: the whole run is recorded, whatever the scenario specifies.
 
     Raises:
         InputError: the folder exists or cannot be created.
@@ -49,7 +49,7 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
 
 
 def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | None:
-    """Create the snapshots that a scenario's recorder writes beside the bag in ``path``; None without snapshots.
+    """Create the snapshot output of a scenario's recorder, whose bag is at ``path``; None without snapshots.
 
     Raises:
         InputError: see `Snapshots` and its `prepare`.
@@ -63,18 +63,18 @@ def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | N
 
 
 def _dense(cell: Cell) -> dict[str, tuple[str, str]]:
-    """Return message type and source by fully qualified dense topic."""
+    """Return the message type and source of each dense topic, by fully qualified name."""
     return {f"/{topic}": (source.type, f"/{source.node}") for topic, source in cell.dense.items()}
 
 
 class OfflineRecorder:
-    """Recorder of an offline run that cuts the engine's chunks into blocks; a sink of the engine.
+    """Recorder of an offline run that divides the engine's chunks into blocks; a sink of the engine.
 
     Args:
         cell: the running cell.
         samples: length of the run.
         writer: writer of the bag.
-        snapshots: snapshots written instead of or beside the bag, if any.
+        snapshots: snapshot output instead of or in addition to the bag, if any.
     """
 
     def __init__(self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None) -> None:
@@ -97,10 +97,10 @@ class OfflineRecorder:
         )
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Cut a chunk into blocks and write them."""
+        """Divide a chunk into blocks and write the blocks."""
         ends = first + np.minimum(np.arange(self._block, samples + self._block, self._block), samples)
         before = {name: framer.companions for name, framer in self._framers.items()}
-        sent: dict[str, list[int]] = {}  # samples of the sparse messages of each node
+        sent: dict[str, list[int]] = {}  # sample indices of each node's sparse messages
         for topic, found in sparse.items():
             node = self._cell.sparse[topic].node
             for message in found:
@@ -115,7 +115,7 @@ class OfflineRecorder:
         self._merger.release()
 
     def close(self) -> None:
-        """End the recording, also that of an interrupted run.
+        """End the recording, including that of an interrupted run.
 
         Raises:
             LatheError: writing to the disk fails.

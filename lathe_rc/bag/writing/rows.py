@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a bag: the blocks of all dense topics over the same samples, one after the other.
+"""Rows of a bag: the blocks of all dense topics for the same samples, one after another.
 
-All rows have the same bytes except for a few numbers and the samples. So the layout is computed once, and writing a
-block only copies its samples into place.
+All rows have the same bytes except for a few numbers and the samples. The layout is therefore computed only once, and
+writing a block only copies its samples into place.
 """
 
 from typing import Any, NamedTuple
@@ -50,7 +50,7 @@ class Plan:
 
     Args:
         topics: the dense topics, in the order of the row.
-        run_id: identity of the run.
+        run_id: ID of the run.
         step_ns: sampling step [ns].
         samples: samples per block.
 
@@ -58,7 +58,7 @@ class Plan:
         step_ns, samples: as passed in.
         layouts: layouts of the messages.
         places: byte offsets of the messages in a row.
-        template: a row with all numbers and samples 0, shape (bytes,).
+        template: row in which all numbers and samples are 0, shape (bytes,).
         rows: size and period of the rows for an `Output`.
     """
 
@@ -93,7 +93,7 @@ class RowBuffer:
         self.bytes[:] = plan.template
         layouts = list(zip(plan.layouts, plan.places, strict=True))
         messages = [self._view(layout.dtype, place) for layout, place in layouts]
-        # A record array creates a new view for each access to a field; these fields are accessed constantly.
+        # A record array creates a new view for each field access, and these fields are accessed constantly.
         self._numbers = [{name: message[name] for name in NUMBERS} for message in messages]
         self._samples = [
             {name: message[name] for name in layout.fields}
@@ -109,9 +109,9 @@ class RowBuffer:
         return view
 
     def _whole(self, layout: Layout, place: int) -> Samples | None:
-        """Return all samples of a message as a view, shape (rows, fields, samples); None unless all are float64."""
+        """Return a view of all samples of a message, shape (rows, fields, samples); None unless all are float64."""
         places = [start for dtype, start in layout.fields.values() if dtype == np.float64]
-        # The message has array lengths between its arrays: a view with strides skips them.
+        # The message has array lengths between its arrays; a view with strides skips them.
         gaps = set(np.diff(places).tolist()) or {0}
         if len(places) != len(layout.fields) or len(gaps) > 1:
             return None
@@ -120,7 +120,7 @@ class RowBuffer:
         return whole
 
     def begin(self, first: int) -> None:
-        """Set times and sample indices of all rows, the first of which begins at sample ``first``."""
+        """Set the times and sample indices of all rows; the first row begins at sample ``first``."""
         firsts = first + np.arange(len(self.bytes)) * self.plan.samples
         times = START_NS + (firsts + self.plan.samples - 1) * self.plan.step_ns
         for place in self._times:
@@ -131,7 +131,7 @@ class RowBuffer:
             numbers["last"][:] = False
 
     def put(self, place: int, row: int, block: Block, data: bytes | None) -> None:
-        """Set the block of topic number ``place`` in one row; copy its serialized message if there is one."""
+        """Set the block of topic number ``place`` in one row; copy the block's serialized message if there is one."""
         if data is not None:
             start = self.plan.places[place]
             self.bytes[row, start : start + len(data)] = np.frombuffer(data, np.uint8)
@@ -148,7 +148,7 @@ class RowBuffer:
             numbers["last"][row] = True
 
     def put_many(self, place: int, row: int, signals: Signals, companions: Samples, *, last: bool) -> None:
-        """Set consecutive blocks of a topic starting at a row; arrays have shape (blocks * samples,), by field name."""
+        """Set a topic's consecutive blocks from a row on; ``signals`` has arrays of shape (blocks * samples,)."""
         stop = row + companions.size
         for name, samples in self._samples[place].items():
             samples[row:stop] = signals[name].reshape(companions.size, self.plan.samples)

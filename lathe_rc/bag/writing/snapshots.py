@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Buffer of the last seconds of a run in memory, and a snapshot bag of them at every trigger.
+"""In-memory buffer of the last seconds of a run, written to a snapshot bag at every trigger.
 
-All times are sample indices, and a snapshot consists of complete rows of blocks. So its content depends on its triggers
-alone, and its messages equal those of a recording of the whole run over the same samples.
+All times are sample indices, and a snapshot consists of complete rows of blocks. The content of a snapshot therefore
+depends only on its triggers, and its messages equal those of the same samples in a recording of the whole run.
 """
 
 import math
@@ -24,8 +24,8 @@ from lathe_rc.messages import START_NS
 from lathe_rc.names import instead
 
 _CATCH_UP = 4  # buffered messages or rows written to disk per incoming one, until a snapshot has caught up
-_SPARE_ROWS = 2  # kept beyond the time before a trigger: a trigger may lie in the row before the newest
-_IN_FLIGHT = 16  # further rows that may be in memory: rows arrive several at a time
+_SPARE_ROWS = 2  # rows kept beyond the pre-trigger time: a trigger may lie in the row before the newest
+_IN_FLIGHT = 16  # further rows that may be in memory, since rows arrive several at a time
 _HEARD = (messages.EVENT, messages.SAFETY_STATUS)  # message types that may contain a trigger
 
 
@@ -38,22 +38,22 @@ class _Item(NamedTuple):
 
 
 class Snapshots:
-    """Buffer of the latest messages that writes a bag of them at every trigger; an `Output` that expects bag order.
+    """Buffer of the latest messages, written to a bag at every trigger; an `Output` that expects bag order.
 
-    A trigger whose pre-trigger time overlaps or touches the newest snapshot extends that snapshot: no sample is written
-    twice, and at most one bag is open. A snapshot is closed as soon as no trigger can extend it any more.
+    A trigger whose pre-trigger time overlaps or touches the newest snapshot extends that snapshot, so no sample is
+    written twice, and at most one bag is open. A snapshot is closed as soon as no trigger can extend it any more.
 
     Args:
-        folder: folder of the snapshot bags; must not exist.
+        folder: folder of the snapshot bags; must not exist yet.
         table: parameters of the recorder.
         name: name of the recorder.
-        namespace: namespace of the cell, ends with a slash; removed from the names of nodes.
-        told: called with each snapshot when it is opened, and again when it is closed.
+        namespace: namespace of the cell, ending with a slash; removed from node names.
+        told: callback for each snapshot, when it is opened and again when it is closed.
 
     Attributes:
         folder: folder of the snapshot bags.
         bags: number of bags closed so far.
-        held: memory of the buffered messages [B].
+        held: total size of the buffered messages [B].
 
     Raises:
         InputError: the folder exists.
@@ -93,11 +93,11 @@ class Snapshots:
             nodes: node names that triggers may refer to.
 
         Returns:
-            Memory needed for the time before a trigger [B].
+            Memory needed for the pre-trigger time [B].
 
         Raises:
-            InputError: the memory exceeds the limit of the table; a trigger names an unknown node; the folder cannot be
-                created.
+            InputError: the memory exceeds the limit in the table, a trigger names an unknown node, or the folder cannot
+                be created.
         """
         self._check_triggers(nodes)
         needed = self._needed(dense)
@@ -145,7 +145,7 @@ class Snapshots:
             self._open[1].add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
-        """Return the channel number of a topic; channels of a file count from 1."""
+        """Return the channel number of a topic; the channels of a file are numbered from 1."""
         return list(self._topics).index(topic) + 1
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
@@ -164,7 +164,7 @@ class Snapshots:
         Raises:
             LatheError: writing to the disk fails, or the buffer exceeds its limit.
         """
-        # One copy for all rows: the caller reuses its memory, and the rows stay in the buffer for some seconds.
+        # All rows are copied at once: the caller reuses its memory, and the rows stay in the buffer for some seconds.
         whole = memoryview(bytes(data))
         for row, start in enumerate(range(0, len(data), plan.size)):
             self._take(_Item(first_ns + row * plan.period_ns, plan, whole[start : start + plan.size]))
@@ -187,7 +187,7 @@ class Snapshots:
         if self._open is None:
             self._kept.append(item)
         else:
-            # A few items per incoming one: writing all the seconds before a trigger at once would delay the cell.
+            # Only a few items are written per incoming one: the whole pre-trigger time at once would delay the cell.
             self._waiting.append(item)
             self._catch_up(_CATCH_UP)
             if self._newest_ns > self._stamp(self._open[0].last) + self._margin_ns:
@@ -215,7 +215,7 @@ class Snapshots:
 
     @property
     def next_sample(self) -> int:
-        """Return the index of the sample after the newest one received."""
+        """Index of the sample after the newest one received."""
         return (self._newest_ns - START_NS) // self._table.step_ns + 1
 
     def trigger(self, cause: str, sample: int | None = None) -> Snapshot:
@@ -260,7 +260,7 @@ class Snapshots:
     # ---- output --------------------------------------------------------------------------------------
 
     def _write(self, item: _Item, snapshot: Snapshot, bag: BagWriter) -> None:
-        """Write an item if it belongs to a snapshot; an earlier latched message gets the first sample's time."""
+        """Write an item if it belongs to a snapshot; an earlier latched message is given the first sample's time."""
         first_ns = self._stamp(snapshot.first)
         if isinstance(item.key, RowPlan):
             if item.log_ns >= first_ns:
@@ -298,7 +298,7 @@ class Snapshots:
         self._told(snapshot)
 
     def flush(self) -> None:
-        """Hand messages to the operating system; if none is new since the last flush, write the buffered ones too.
+        """Hand messages to the operating system, also the buffered ones if none have arrived since the last flush.
 
         Raises:
             LatheError: writing to the disk fails.
@@ -310,7 +310,7 @@ class Snapshots:
         self._flushed_ns = self._newest_ns
 
     def interrupt(self, cause: str) -> None:
-        """Record an aborted run: a trigger, if any signal has been received; its snapshot counts as incomplete.
+        """Trigger a snapshot for an aborted run, if any signal has been received; the snapshot counts as incomplete.
 
         Raises:
             LatheError: the bag cannot be created.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writer of rosbag2 folders: an MCAP file, and its metadata in the layout of the rosbags package.
 
-The storage of rosbags' own writer offers neither a chunk size nor a flush, and both are needed to limit the loss in a
-crash; `lathe_rc.bag.writing.mcap_file` offers them. The YAML writer of rosbags takes 0.2 s per bag and would delay the
-recorded cell for that long; libyaml takes a few ms.
+The storage of rosbags' own writer offers neither a chunk size nor a flush, both of which are needed to limit the loss
+in a crash; `lathe_rc.bag.writing.mcap_file` offers them. The YAML writer of rosbags takes 0.2 s per bag and would delay
+the recorded cell for that long; libyaml takes a few ms.
 """
 
 import shutil
@@ -26,16 +26,16 @@ Compression = Literal["zstd", "none"]
 Durability = Literal["volatile", "transient_local"]
 Records = tuple[bytes | None, bytes]
 
-FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they fill no chunk [s]
+FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they do not fill a chunk [s]
 _FOREVER = QosTime(9223372036, 854775807)
-_NEVER = 2**63 - 1  # start of a bag without a message, as rosbags writes it [ns]
+_NEVER = 2**63 - 1  # start of a bag without messages, as written by rosbags [ns]
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]  # absent without libyaml
     """YAML dumper that quotes all strings, so that no reader of any YAML version parses one as a number."""
 
     def ignore_aliases(self, data: object) -> bool:
-        """Disable YAML aliases: write equal subtrees out each time, as rosbags does."""
+        """Disable YAML aliases, so that equal subtrees are written out each time, as rosbags does."""
         return True
 
 
@@ -47,7 +47,7 @@ def _yaml(tree: Any) -> str:
 
 
 class ListedTopic(NamedTuple):
-    """Topic as listed in the metadata of a bag; several channels of a file may share one.
+    """Topic as listed in the metadata of a bag; several channels of a file may share one entry.
 
     Attributes:
         name: fully qualified topic.
@@ -95,7 +95,7 @@ def definition(msgtype: str) -> tuple[str, str]:
 
 
 def offered_qos(depth: int, durability: Durability) -> Qos:
-    """Return the quality of service that every lathe node offers: reliable, keep last."""
+    """Return the QoS profile that every lathe node offers: reliable, keep last."""
     return Qos(
         QosHistory.KEEP_LAST,
         depth,
@@ -113,7 +113,7 @@ def refuse_existing(path: Path) -> None:
     """Reject a path at which no bag can be created.
 
     Raises:
-        InputError: the path exists already, or its parent folder does not exist.
+        InputError: the path already exists, or its parent folder does not.
     """
     if path.exists():
         raise InputError(f"{path} exists; a bag is never overwritten: name another folder or remove it")
@@ -125,10 +125,10 @@ class BagWriter:
     """Writer of one bag.
 
     Args:
-        path: folder of the bag; must not exist.
+        path: folder of the bag; must not exist yet.
         compression: compression of the chunks.
-        chunk_size: size after which a chunk is written out, and so the largest loss in a crash [B].
-        about: strings for the metadata of the bag, see `tell`.
+        chunk_size: size after which a chunk is written out, and thus the largest loss in a crash [B].
+        about: strings for the bag's metadata (see `tell`).
         profile: profile of the MCAP file.
 
     Raises:
@@ -166,7 +166,7 @@ class BagWriter:
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """Convert I/O errors of the disk into a one-line `LatheError`."""
+        """Convert disk I/O errors into a one-line `LatheError`."""
         try:
             yield
         except OSError as error:
@@ -174,7 +174,7 @@ class BagWriter:
             raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
 
     def tell(self, about: Mapping[str, str]) -> None:
-        """Store strings in the metadata of the bag: at once in the file (crash-safe), at the end in metadata.yaml.
+        """Store strings in the bag's metadata: in the file at once (crash-safe), and in metadata.yaml at the end.
 
         Raises:
             LatheError: writing to the disk fails.
@@ -202,7 +202,7 @@ class BagWriter:
         """Announce a topic with the schema and channel records of another bag, whether or not they can be decoded.
 
         Args:
-            topic: entry of the topic in the metadata.
+            topic: metadata entry of the topic.
             digest: hash of the message type; may be empty.
             records: content of the schema record (None without a schema) and of the channel record.
 
@@ -276,7 +276,8 @@ class BagWriter:
         """Complete the file and its metadata, and close it.
 
         Raises:
-            LatheError: the last messages could not be written; without them the bag is complete, unless reported.
+            LatheError: the last messages could not be written; apart from them, the bag is complete unless the error
+                says otherwise.
         """
         try:
             self.flush()
@@ -284,7 +285,7 @@ class BagWriter:
             self._complete()
 
     def _complete(self) -> None:
-        """Write index and metadata into the disk space reserved for them."""
+        """Write the index and metadata into the disk space reserved for them."""
         tree = self._metadata()
         try:
             self._file.free_room()
@@ -335,7 +336,7 @@ class BagWriter:
 
 
 class Both:
-    """Pair of outputs with the same topics, which both get every message; an `Output`.
+    """Pair of outputs with the same topics, both of which receive every message; an `Output`.
 
     Args:
         first, second: the two outputs.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of a drive's command, and events about clipped samples."""
+"""Limits on a drive's command, and events about clipped samples."""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +11,13 @@ from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 
-LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; none has been for a while
-_TELL = 0.1  # [s] interval of reports about a command that remains clipped
-_QUIET = 10e-3  # [s] without a clipped sample until a command is free again
+LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; no sample has been clipped for a while
+_TELL = 0.1  # interval of reports about a command that remains clipped [s]
+_QUIET = 10e-3  # time without a clipped sample until a command counts as free again [s]
 
 
 class LimitedParameters(NodeParameters):
-    """Limits of the command on its way to the drive."""
+    """Limits on the command sent to the drive."""
 
     command_stroke: NonNegative = parameter(0.0, "the command is kept within this to each side; 0: none", "m")
     command_velocity: NonNegative = parameter(0.0, "and within this velocity; 0: none", "m/s")
@@ -25,19 +25,20 @@ class LimitedParameters(NodeParameters):
     command_jerk: NonNegative = parameter(0.0, "and within this jerk; 0: none", "m/s^3")
 
     def command_limits(self) -> CommandLimits:
-        """Active limits of the command."""
+        """Active limits on the command."""
         given = (self.command_stroke, self.command_velocity, self.command_acceleration, self.command_jerk)
         return CommandLimits(*(limit or np.inf for limit in given))
 
 
 class Clipping:
-    """Monitor of the clipping of a command: events at its start and end.
+    """Monitor that reports, as events, when the clipping of a command starts and ends.
 
     Args:
         node: name of the commanding node.
         parameters: parameter table of the node.
-        which: name of the command; empty if the node has one.
-        flags: whether sample n was clipped, at n modulo the length, a power of two; length 1: no limit.
+        which: name of the command; empty if the node has only one.
+        flags: ring buffer of whether sample n was clipped, at index n modulo the length, a power of two; a length of
+            1 means that there is no limit.
     """
 
     def __init__(self, node: str, parameters: NodeParameters, which: str, flags: npt.NDArray[np.uint8]) -> None:
@@ -54,7 +55,7 @@ class Clipping:
         found: list[Sparse] = []
         if self._flags.size == 1:
             return found
-        # A ring buffer: samples at its end and start may be consecutive.
+        # In a ring buffer, consecutive samples may be at the end and the start.
         begin, start = first & (self._flags.size - 1), 0
         clipped = self._flags[begin : begin + end - first]
         if clipped.size < end - first:
@@ -115,7 +116,7 @@ class LimitedCommand(Clipping):
     Args:
         node: name of the commanding node.
         parameters: parameter table of the node.
-        which: name of the command; empty if the node has one.
+        which: name of the command; empty if the node has only one.
 
     Attributes:
         on: whether there is a limit.

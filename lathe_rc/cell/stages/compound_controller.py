@@ -2,8 +2,8 @@
 """Compound law for non-circular turning: PID with input feed-forward and dynamic compensation.
 
 The structure is that of PMC8878366, of which only the abstract was available: input feed-forward of the form with its
-velocity and acceleration, dynamic compensation of the drive's lag (here its inverse and its delay), and a PID on
-the following error. The settings are ours, tuned on the conditions of ``lathe study robust``.
+velocity and acceleration, dynamic compensation of the drive's lag (here by the drive's inverse and delay), and a PID on
+the following error. The settings are our own, tuned under the conditions of ``lathe study robust``.
 """
 
 from collections.abc import Callable
@@ -28,12 +28,12 @@ class CompoundControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the compound law.
+    """State and constants of the compound law.
 
     Attributes:
-        forward: feed-forward of the form through the inverse of the drive.
-        proportional, integral, derivative: gains of the PID, the latter two per sample.
-        keep: weight of the previous sample in the low-pass of the derivative.
+        forward: feed-forward of the part profile, computed with the drive's inverse.
+        proportional, integral, derivative: gains of the PID; the last two are per sample.
+        keep: weight of the previous sample in the derivative's low-pass.
         state: integral, filtered derivative, previous error, shape (3,).
     """
 
@@ -47,7 +47,7 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """Return the command of the law at one sample [m]."""
+    """Return the law's command at one sample [m]."""
     state, late = memory.state, memory.forward.late
     command = fed_forward(memory.forward, now.angle)
     if now.sample < late:
@@ -62,7 +62,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class CompoundController(FormLaw):
-    """Law that feeds the form forward, with a PID on the error.
+    """Law with feed-forward of the form and a PID on the error.
 
     Attributes:
         parameters: parameter table of the node.
@@ -74,7 +74,7 @@ class CompoundController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """Return the memory of the law before the first sample."""
+        """Return the initial state of the law, before the first sample."""
         parameters = self.parameters
         step = parameters.step
         return Memory(

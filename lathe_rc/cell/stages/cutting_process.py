@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cutting process: from tool, feed and part to the force, and the resulting deflection of the edge."""
+"""Cutting process: from tool, feed and part to the force and the resulting deflection of the edge."""
 
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
@@ -31,7 +31,7 @@ READ = {
     "longitudinal": Input("longitudinal/state", messages.STATE, ("position", "velocity")),
 }
 TURNS = Input("encoder", messages.ENCODER, ("angle_true", "speed_true"))
-_HEIGHTS = 201  # positions along a shaft, with linear interpolation of the compliance
+_HEIGHTS = 201  # positions along a shaft between which the compliance is interpolated linearly
 
 
 class CuttingProcessParameters(NodeParameters):
@@ -151,11 +151,11 @@ class CuttingProcessParameters(NodeParameters):
             )
 
     def deflecting(self) -> Elasticity:
-        """Transfer function W3; of a shaft only the dynamics, since the compliance is that of the shaft itself."""
+        """Transfer function W3; for a shaft, only its dynamics, since the compliance is that of the shaft itself."""
         return _ELASTICITIES["realistic" if self.shaft != "none" and self.elasticity == "rigid" else self.elasticity]
 
     def process(self, node: str, prefix: str = "") -> CuttingProcess:
-        """Return the cutting process of a node before its first sample (see `part`)."""
+        """Return the cutting process of a node in its initial state (arguments as for `part`)."""
         part = self.part(node, prefix)
         with about(node, f"{prefix}lag"):
             return made_of(
@@ -171,15 +171,15 @@ class CuttingProcessParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the cutting process.
+    """State of the cutting process's step function.
 
     Attributes:
-        cut: the machine.
+        cut: simulated cutting process.
         allowance: machining allowance of the blank.
         sensor: sensor of the force.
-        tool, cross, longitudinal: number of the first input of each; -1 if it does not move the edge.
-        even: whether the blank has the desired form.
-        feed: constant feed without a longitudinal slide [m/rad].
+        tool, cross, longitudinal: index of the first input of each device; -1 if the device does not move the edge.
+        even: whether the blank already has the desired form.
+        feed: constant feed if there is no longitudinal slide [m/rad].
         room: scratch arrays for displacement, position of the cross slide, feed velocity and height.
     """
 
@@ -202,7 +202,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     n = angle.size
     displacement, cross_position, feed_velocity = memory.room[0, :n], memory.room[1, :n], memory.room[2, :n]
     height = memory.room[3, :n]
-    # A device that does not move the edge counts as standing still.
+    # A device that does not move the edge is taken to be at rest.
     displacement[:] = cross_position[:] = height[:] = 0.0
     if memory.tool >= 0:
         height = inputs[memory.tool + 2]
@@ -225,14 +225,14 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class CutStage(Stage):
-    """Stage with a cut, whose encoder is its first input and whose cut its last output.
+    """Stage with a cut; its first input is the encoder, and its last output is the cut.
 
     Attributes:
-        cut: the machine.
+        cut: simulated cutting process.
     """
 
     devices = ("cut",)
-    failure = staticmethod(failure)  #: why it cannot go on
+    failure = staticmethod(failure)  #: function that explains why the cut cannot continue
 
     def __init__(self, name: str, parameters: NodeParameters, table: CuttingProcessParameters, prefix: str) -> None:
         super().__init__(name, parameters)
@@ -249,7 +249,7 @@ class CutStage(Stage):
         self._suffer()
 
     def mend(self, fault: Fault | None) -> bool:
-        """Repair a broken edge, or remove a hard spot; None: a new tool in uniform material."""
+        """Repair a broken edge or remove a hard spot; None installs a new tool in uniform material."""
         mended = self._damages[:] if fault is None else [damage for damage in self._damages if damage == fault][:1]
         for damage in mended:
             self._damages.remove(damage)
@@ -305,7 +305,7 @@ class CuttingProcessStage(CutStage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the cutting process."""
+        """Current state of the cutting process's step function."""
         parameters = self.parameters
         places, place = dict.fromkeys(READ, -1), 2
         for name in parameters.moved_by:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoupler between the force and the position loop (paper 004, Figs 5 and 10)."""
+"""Decoupler of the force and position loops (paper 004, Figs 5 and 10)."""
 
 from typing import Annotated, Literal, NamedTuple
 
@@ -43,7 +43,7 @@ class DecouplerParameters(NodeParameters):
 
     @property
     def commanded_topic(self) -> str:
-        """Topic of the drive modelled by W2; W1, W3 and W4 do not belong to a single drive."""
+        """Topic of the drive that W2 describes; W1, W3 and W4 do not belong to a single drive."""
         return "cross/command"
 
     def channels(self, node: str) -> Channels:
@@ -63,7 +63,7 @@ class DecouplerParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step: K1 and K2 with their states."""
+    """State of the decoupler's step function: K1 and K2 with their states."""
 
     k1: System
     state1: Samples
@@ -82,7 +82,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class DecouplerStage(Stage):
-    """Decoupler between force and position loop (see `lathe_rc.control.decoupler`).
+    """Decoupler of the force and position loops (see `lathe_rc.control.decoupler`).
 
     Attributes:
         parameters: parameter table of the node.
@@ -96,7 +96,7 @@ class DecouplerStage(Stage):
         super().__init__(name, parameters)
         self.parameters = parameters
         channels = parameters.channels(name)
-        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # inverted models, and the lag of the inverse
+        with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # inverted models, and the inverse's lag
             k1, k2 = compensators(channels, parameters.inverse_lag, parameters.leak)
         self._decoupler = Decoupler(k1 if parameters.k1 else None, k2 if parameters.k2 else None, parameters.step)
         fields = ("command", "set_point", "error")
@@ -113,6 +113,6 @@ class DecouplerStage(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the decoupler."""
+        """Current state of the decoupler's step function."""
         made = self._decoupler
         return Memory(made.k1, made.state1, made.k2, made.state2)

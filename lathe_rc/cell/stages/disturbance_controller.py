@@ -137,7 +137,7 @@ class DisturbanceController(FormLaw):
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
         """Return candidate remedies: fewer learned waves, a slower observer, or both where neither suffices alone."""
         parameters = self.parameters
-        waves = [float(f"{parameters.learned_waves * 0.8**k:.2g}") for k in range(9)]
+        waves = [float(f"{parameters.learned_waves * 0.75**k:.2g}") for k in range(12)]
         observers = [float(f"{parameters.observer_bandwidth * 0.6**k:.2g}") for k in range(9)]
         yield ({"learned_waves": each} for each in waves[1:])
         if parameters.observer_bandwidth:
@@ -151,8 +151,8 @@ class DisturbanceController(FormLaw):
         p = 1j * frequency
         return np.asarray(drive(frequency) * (1.0 + a1 * p + a2 * p * p) * np.exp(p * self.parameters.model_delay) - 1)
 
-    def contraction(self, drive: Response, waves: Array, speed: float) -> Complex:
-        """Return the factor of the memory, or |E·L| of the observer where larger, with the given model."""
+    def factors(self, drive: Response, waves: Array, speed: float) -> Complex:
+        """Return the factor E·L of the observer and that of the memory, with the given model, shape (2, n)."""
         parameters, frequency = self.parameters, waves * speed
         error, p = self._model_error(drive, frequency), 1j * frequency
         inside = np.zeros_like(error)
@@ -160,11 +160,11 @@ class DisturbanceController(FormLaw):
             late = parameters.model_delay + parameters.feedback_delay * parameters.step
             inside = error * np.exp(-p * late) / (1.0 + p / parameters.observer_bandwidth) ** 3
         if not parameters.learning_gain:
-            return inside
+            return inside[None]
         smooth, stages = self._smoothed(waves), 1.0 + p / parameters.learning_bandwidth
         learned = parameters.learning_gain * smooth * np.exp(3.0 * p / parameters.learning_bandwidth) / stages**3
         factor = 1.0 - LEAK * (1.0 - smooth) - learned * (1.0 + error) / (1.0 + inside)
-        return np.where(np.abs(inside) > np.abs(factor), np.abs(inside), factor)
+        return np.stack((inside, factor))
 
     def _smoothed(self, waves: Array) -> Array:
         points = self.parameters.points_per_revolution

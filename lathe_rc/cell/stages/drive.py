@@ -16,14 +16,14 @@ from lathe_rc.messages import Samples
 
 
 class BoundedParameters(NodeParameters):
-    """Bounds of a command during a takeover."""
+    """Bounds on a command during a takeover."""
 
     retract_velocity: Positive = parameter(0.1, "largest velocity of a takeover", "m/s")
     retract_acceleration: Positive = parameter(50.0, "its largest acceleration", "m/s^2")
     retract_jerk: Positive = parameter(1e5, "its largest jerk", "m/s^3")
 
     def bounds(self) -> Bounds:
-        """Return the bounds of a takeover."""
+        """Return the bounds on a takeover."""
         return made_of(Bounds, self, "retract_")
 
 
@@ -36,11 +36,11 @@ class RetractionParameters(BoundedParameters):
 
 
 class OwnRetraction:
-    """Command of a drive with an autonomous retraction.
+    """Command of a drive with autonomous retraction.
 
     Args:
         parameters: parameter table of the node.
-        stroke: largest displacement of the drive to each side [m], beyond which commands are out of reach.
+        stroke: largest displacement of the drive in either direction [m]; commands beyond it are out of reach.
     """
 
     def __init__(self, parameters: RetractionParameters, stroke: float) -> None:
@@ -53,14 +53,14 @@ class OwnRetraction:
         return self._takeover.table
 
     def begin(self) -> None:
-        """Start the retraction with the next sample, overriding the command."""
+        """Start the retraction at the next sample, overriding the command."""
         self._takeover.change(Mode.RETRACT)
 
 
 @kernel
 def followed(takeover: TakeoverTable, command: Samples) -> Samples:
     """Return the command that the drive follows [m], shape (n,)."""
-    # The input is another node's output, and a takeover writes into it.
+    # A takeover would write into the command, which is another node's output.
     own = command if follows(takeover) else command.copy()
     take_over(takeover, own)
     return own
@@ -68,11 +68,11 @@ def followed(takeover: TakeoverTable, command: Samples) -> Samples:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the motion that a drive can follow."""
+    """Limits on the motion that a drive can follow."""
 
-    stroke: float  #: [m] to each side
-    velocity: float  #: [m/s]
-    acceleration: float  #: [m/s²]
+    stroke: float  #: largest displacement in either direction [m]
+    velocity: float  #: largest velocity [m/s]
+    acceleration: float  #: largest acceleration [m/s²]
 
 
 class Drive(Stage):
@@ -80,25 +80,25 @@ class Drive(Stage):
 
     announces = (LIMITED, FREE)
     _commands: Sequence[LimitedCommand] = ()
-    _clippings: Sequence[Clipping] = ()  # of further limited quantities
-    _limits: Limits | None = None  # of a drive that follows the whole profile
-    _retraction: OwnRetraction | None = None  # of a drive that retracts the tool
+    _clippings: Sequence[Clipping] = ()  # clipping of further limited quantities
+    _limits: Limits | None = None  # only for a drive that follows the whole profile
+    _retraction: OwnRetraction | None = None  # only for a drive that retracts the tool
 
     @abstractmethod
     def responses(self) -> Mapping[str, Response]:
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
 
     def limits(self) -> Mapping[str, Limits]:
-        """Limits of the drive, by state topic before remapping; for drives that follow the whole profile."""
+        """Limits of the drive by state topic before remapping, for a drive that follows the whole profile."""
         return {"coarse/state": self._limits} if self._limits else {}
 
     def go_safe(self) -> None:
-        """Retract the carriage, overriding the command, after a loss of cell members."""
+        """Retract the carriage after a loss of cell members, overriding the command."""
         if self._retraction:
             self._retraction.begin()
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return the events of the samples that the step has computed last."""
+        """Return the events of the last computed samples."""
         return [message for each in (*self._commands, *self._clippings) for message in each.tell(first, end)]
 
     def finish(self, index: int) -> list[Sparse]:

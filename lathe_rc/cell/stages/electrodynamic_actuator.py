@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarse electrodynamic tool drive."""
 
+import math
 from collections.abc import Mapping
 from typing import Annotated
 
 from annotated_types import Ge, Le
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.cell.parameters import Positive, parameter
+from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.command_limits import limited
 from lathe_rc.cell.stages.drive import followed
 from lathe_rc.cell.stages.plant import PlantMemory, PlantParameters, SingleDrive
 from lathe_rc.cell.stages.tables import made_of
+from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
 from lathe_rc.plants.linear import Discretisation
+from lathe_rc.plants.modes import Modes
 from lathe_rc.signals.noise import measure
 
 
@@ -28,6 +31,25 @@ class ElectrodynamicActuatorParameters(PlantParameters):
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
     moving_mass: Positive = parameter(1.2, "carriage, coil and tool", "kg")
     force_constant: Positive = parameter(30.0, "force of the coil per current", "N/A")
+    mode_frequency: list[Positive] = parameter([], "further resonances: frequency of each", "rad/s")
+    mode_damping: list[Positive] = parameter([], "their damping ratios", "1")
+    mode_participation: list[float] = parameter(
+        [], "their parts in the motion of the position sensor; the part of the drive itself is the rest to 1", "1"
+    )
+    mode_edge: list[float] = parameter([], "their parts in the motion of the edge; empty: as at the sensor", "1")
+
+    def modes(self, node: str, prefix: str = "") -> Modes:
+        """Return the modes of a node; ``prefix`` precedes its parameters in a composed table."""
+        names = [f"{prefix}mode_{each}" for each in ("frequency", "damping", "participation", "edge")]
+        for frequency in self.mode_frequency:
+            if frequency >= math.pi / self.step:
+                raise InputError(
+                    f"{node}.{names[0]} = {frequency:g} rad/s; allowed: below half the sample rate, "
+                    f"{math.pi / self.step:.6g} rad/s (a higher sample_rate, or without this mode)"
+                )
+        sensor, edge = self.mode_participation, self.mode_edge
+        with about(node, *names):
+            return Modes(*map(tuple, (self.mode_frequency, self.mode_damping, sensor, edge or sensor)))
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
         """Quantities of the drive that controllers may know, by command topic."""
@@ -40,8 +62,8 @@ def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fie
     """Move the drive through one block, within its limits."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
     given = limited(memory.limits, first, followed(memory.retraction, command))
-    advance(memory.plant, given, position, velocity, effort)
-    measure(memory.sensor, position, measured_position)
+    advance(memory.plant, given, position, velocity, effort, measured_position)
+    measure(memory.sensor, measured_position, measured_position)
     return command.size, DONE
 
 
@@ -58,7 +80,9 @@ class ElectrodynamicActuator(SingleDrive):
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
         self.parameters = parameters
-        self.drive = made_of(ElectrodynamicDrive, parameters, method=parameters.discretisation)
+        self.drive = made_of(
+            ElectrodynamicDrive, parameters, method=parameters.discretisation, modes=parameters.modes(name)
+        )
         super().__init__(name, parameters)
 
     @property
@@ -67,5 +91,5 @@ class ElectrodynamicActuator(SingleDrive):
         return self.drive.table
 
     def responses(self) -> Mapping[str, Response]:
-        """Response of the position to the command, by topic."""
+        """Response of the sensor's position to the command, by topic."""
         return {"coarse/command": self.drive.plant.response}

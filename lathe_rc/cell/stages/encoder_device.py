@@ -33,15 +33,25 @@ class EncoderDeviceParameters(TimeMasterParameters):
     counts_per_revolution: Annotated[int, Ge(1), Le(2**31 - 1)] = parameter(
         4096, "encoder counts per revolution after quadrature"
     )
+    edge_clock: Annotated[float, Ge(0), Le(1)] = parameter(
+        0.0,
+        "line, file: each reading has the time of its last edge, rounded down to this resolution; topic: the position "
+        "has parts of a count, from such times; 0: neither",
+        "s",
+    )
     source: Literal["topic", "line", "file"] = parameter(
         "topic", "sensor_msgs/JointState on a topic; lines of text from a serial line, pipe or file; or a CSV file"
     )
     topic: str = parameter("spindle/joint_states", "topic: its name; nobody else in the cell reads it")
     joint: str = parameter("", "topic: name of the joint; empty: the first one")
     position: Literal["angle", "counts"] = parameter("angle", "topic: what its position is, in rad or counts")
-    device: str = parameter("", "line: path of the terminal, pipe or file, with lines of time_ns,counts")
+    device: str = parameter(
+        "", "line: path of the terminal, pipe or file, with lines of time_ns,counts (edge_clock: and edge_ns)"
+    )
     baud_rate: Annotated[int, Ge(50)] = parameter(115200, "line: speed of a terminal, in baud", "1/s")
-    counts_file: str = parameter("", "file: CSV file with time_ns,counts or time_s,counts", path=True)
+    counts_file: str = parameter(
+        "", "file: CSV file with time_ns,counts or time_s,counts (edge_clock: and edge_ns)", path=True
+    )
     counter_range: Annotated[int, Ge(0)] = parameter(0, "the counter begins anew after so many counts; 0: never")
     inverted: bool = parameter(default=False, doc="the counter counts down while the spindle turns forward")
     max_reverse: NonNegative = parameter(
@@ -104,8 +114,10 @@ class EncoderDevice(TimeMaster):
 
     def _read(self, path: Path) -> None:
         try:
-            for time_ns, count in CsvReader(path).read():
-                self.counted.add(time_ns, count)
+            reader = CsvReader(path)
+            self._check_edges(path, timed=reader.timed)
+            for reading in reader.read():
+                self.counted.add(*reading)
         except InputError:
             raise
         except LatheError as error:
@@ -118,6 +130,19 @@ class EncoderDevice(TimeMaster):
         if self.samples is None:
             raise InputError(self._too_short(str(path)))
 
+    def _check_edges(self, path: Path, *, timed: bool) -> None:
+        """Check that a file has the times of edges if, and only if, their resolution is given."""
+        clock = self.parameters.edge_clock
+        if timed and not clock:
+            raise InputError(
+                f"{self.name}.edge_clock = 0, and {path} has times of edges; allowed: their resolution, such as 1e-6"
+            )
+        if clock and not timed:
+            raise InputError(
+                f"{self.name}.edge_clock = {clock:g} s, and {path} has no times of edges; allowed: 0, or a third "
+                "column edge_ns or edge_s"
+            )
+
     def _too_short(self, what: str) -> str:
         return (
             f"{what} ends at {self.counted.time:.6g} s, after {at_most(self.counted.angle / _TURN)} revolutions; "
@@ -126,14 +151,14 @@ class EncoderDevice(TimeMaster):
 
     # ---- readings -----------------------------------------------------------------------------------
 
-    def hear(self, time_ns: int, count: float) -> None:
-        """Append a reading: its time [ns] and the counter.
+    def hear(self, time_ns: int, count: float, edge_ns: int | None = None) -> None:
+        """Append a reading: its time [ns], the counter and, if known, the time of its last edge [ns].
 
         Raises:
             LatheError: the reading is invalid; the message names the node.
         """
         with self.named():
-            self.counted.add(time_ns, count)
+            self.counted.add(time_ns, count, edge_ns)
         self._look_for_the_end()
 
     def end(self) -> None:

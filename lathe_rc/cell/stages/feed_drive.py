@@ -42,7 +42,7 @@ _COEFFICIENTS = {
     "dc_screw": ("velocity_gain", "lags", "zero"),
     "fourth_order": ("gain", "a1", "a2", "a3", "a4"),
     "sampled": ("sampled_gain", "sampled_lag"),
-}  # by model
+}  # coefficients of each model
 
 
 class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
@@ -118,7 +118,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         """Transfer function from command to position.
 
         Raises:
-            InputError: see `lathe_rc.plants.feed`.
+            InputError: as for `lathe_rc.plants.feed_models.dc_screw`.
         """
         if self.model == "fourth_order":
             return feed_models.fourth_order(self.gain, self.a1, self.a2, self.a3, self.a4)
@@ -127,10 +127,10 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         return feed_models.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
 
     def rubbing(self, node: str) -> Friction | None:
-        """Return the friction of a node, if there is any.
+        """Return the friction of a node; None if there is none.
 
         Raises:
-            InputError: the mechanical lag of the model is unknown, or see `Friction`.
+            InputError: the mechanical lag of the model is unknown, or as for `Friction`.
         """
         if self.friction == "none":
             return None
@@ -150,7 +150,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
         """Return the feed screw of a node.
 
         Raises:
-            InputError: see `Screw`.
+            InputError: as for `Screw.check`.
         """
         screw = made_of(Screw, self, "pitch_", "screw_")
         with about(node, "pitch_slope", "pitch_amplitude", "pitch_lead"):
@@ -169,15 +169,15 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the feed drive.
+    """State of the feed drive's step function.
 
     Attributes:
-        drive: machine of the drive.
+        drive: simulated drive.
         sensor: sensor of the position.
-        who: obedience to the supervisor, if it ``listens``; off once the drive is ``safe``.
+        who: obedience to the supervisor, used if ``listens``, which is false once the drive is ``safe``.
         disturbance: amplitude of the disturbance added to the command.
         period: sampling step [s].
-        clipped: whether the command was limited at sample n, stored at n modulo the length.
+        clipped: ring buffer of whether the command was clipped at sample n, at index n modulo the length.
         room: scratch arrays for the command, the disturbance, the motor and the sensor input.
     """
 
@@ -205,7 +205,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 return start, OBEY
         given, samples, now = command[start:stop], stop - start, first + start
         if memory.listens or memory.safe:
-            # A takeover changes the command, and the input is another node's output.
+            # A copy, since a takeover changes the command, which is another node's output.
             given = memory.room[0, :samples]
             put(given, command[start:stop])
         apply(memory.who, given)
@@ -226,7 +226,7 @@ class FeedDriveStage(Obedient):
 
     Attributes:
         parameters: parameter table of the node.
-        drive: machine of the drive.
+        drive: simulated drive.
     """
 
     kind = "feed_drive"
@@ -247,7 +247,7 @@ class FeedDriveStage(Obedient):
                 model=parameters.transfer(),
                 command_limit=parameters.command_limit or np.inf,
                 speed_limit=parameters.speed_limit or np.inf,
-                resolution=0.0,  # the sensor of the stage rounds instead of the drive's own
+                resolution=0.0,  # the stage's sensor rounds, not the drive's own
                 limits=limits,
                 friction=rubbing,
                 screw=screw,
@@ -271,7 +271,7 @@ class FeedDriveStage(Obedient):
         )
 
     def go_safe(self) -> None:
-        """Stop the slide and ignore further reactions, after a loss of cell members."""
+        """Stop the slide after a loss of cell members, and ignore further reactions."""
         self._safe = True
         self._said = self._obedience.obey(Reaction.STOP, 0)
 
@@ -281,7 +281,7 @@ class FeedDriveStage(Obedient):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the feed drive."""
+        """Current state of the feed drive's step function."""
         parameters = self.parameters
         return Memory(
             drive=self.drive.whole,
@@ -296,7 +296,7 @@ class FeedDriveStage(Obedient):
         )
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return the events of the samples that the step has computed last."""
+        """Return the events of the last computed samples."""
         said, self._said = self._said, []
         for message in said:
             message.index = first

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force controller of the main cutting force by the longitudinal feed (paper 004)."""
+"""Controller of the main cutting force through the longitudinal feed (paper 004)."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class ForceControllerParameters(ServoParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the force controller."""
+    """State of the force controller's step function."""
 
     course: Course
     pid: PidTable
@@ -49,7 +49,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class ForceController(Servo):
-    """PID of the cutting force on the longitudinal feed (see `lathe_rc.control.pid`).
+    """PID that controls the cutting force through the longitudinal feed (see `lathe_rc.control.pid`).
 
     Attributes:
         parameters: parameter table of the node.
@@ -66,7 +66,7 @@ class ForceController(Servo):
         self.pid = parameters.pid(name)
         self.declare(
             inputs=[
-                # The angle itself is not used: the spindle's blocks determine which samples are due.
+                # The angle itself is not used; the spindle's blocks determine which samples are due.
                 Input("encoder", messages.ENCODER, ("angle",)),
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
                 *listens(parameters),
@@ -76,5 +76,5 @@ class ForceController(Servo):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the force controller."""
+        """Current state of the force controller's step function."""
         return Memory(self.trajectory.course, self.pid.table, self.pid.state, self.listener)

@@ -20,11 +20,11 @@ from lathe_rc.messages import Samples
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
-from lathe_rc.signals.profile_table import deviation_along, height_along, tabulated
+from lathe_rc.signals.profile_table import ProfileTable, deviation_along, height_along, tabulated
 from lathe_rc.signals.tip_path import TipPath
 
 _OWN = ("harmonics", "piston", "polygon", "csv")
-#: by name, those of other packages: ours have parameters of their own
+#: third-party profiles, by name; built-in profiles have parameters of their own
 PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc.profiles")
 
 
@@ -36,6 +36,12 @@ class FormParameters(NodeParameters):
         [], "profile of others: numbers that it is made of, in the order of its constructor"
     )
     profile_file: str = parameter("", "csv: file with angle_deg, (height_mm,) radius_um", path=True)
+    programmed_file: str = parameter(
+        "",
+        "CSV file of the programmed form, which the controllers follow, as lathe correct writes it; the form error is "
+        "that of the form itself; empty: the form itself",
+        path=True,
+    )
     harmonic_order: list[Annotated[int, Ge(0), Le(2000)]] = parameter(
         [], "harmonics: waves per revolution; none at all: an oval of 225 µm (paper 000, Fig. 6)"
     )
@@ -77,8 +83,8 @@ class FormParameters(NodeParameters):
         """Return the profile of a node.
 
         Raises:
-            InputError: lists differ in length, sizes do not fit, a file cannot be used, or a third-party profile
-                is invalid.
+            InputError: lists differ in length, dimensions do not fit together, a file cannot be used, or a third-party
+                profile is invalid.
         """
         if self.profile not in _OWN:
             make: Callable[..., PartProfile] = PROFILES[self.profile]
@@ -103,8 +109,19 @@ class FormParameters(NodeParameters):
         with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
+    def programmed_form(self, node: str) -> Measured | None:
+        """Return the programmed form of the controllers of a node; None: the form itself.
 
-FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of its parameters
+        Raises:
+            InputError: the file cannot be used.
+        """
+        if not self.programmed_file:
+            return None
+        with about(node, "programmed_file"):
+            return read_csv(resources.find(Path(self.programmed_file)))
+
+
+FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters
 
 
 class FormTable(NamedTuple):
@@ -114,8 +131,9 @@ class FormTable(NamedTuple):
         heights, table: required tool position, see `lathe_rc.signals.profile_table.ProfileTable`.
         told: table of the tool position assumed by the controllers.
         alike: whether both tables are equal.
-        slide: number of the first input of the longitudinal slide, if it determines the height; 0: it does not.
-        feed, start, part: height without a slide, see `lathe_rc.signals.profile_table.height_along`.
+        slide: index of the first input of the longitudinal slide if the slide determines the height, otherwise 0.
+        feed, start, part: parameters of the height without a slide, see `lathe_rc.signals.profile_table.height_along`.
+        told_heights: heights of the table of the controllers.
     """
 
     heights: Samples
@@ -126,11 +144,12 @@ class FormTable(NamedTuple):
     feed: float
     start: float
     part: int
+    told_heights: Samples
 
 
 @kernel
 def equal(one: Samples, other: Samples) -> bool:
-    """Return whether two signals of shape (n,) are equal, sample by sample."""
+    """Return whether two signals of shape (n,) are equal in every sample."""
     differs = False
     for k in range(one.size):
         differs |= one[k] != other[k]
@@ -139,7 +158,7 @@ def equal(one: Samples, other: Samples) -> bool:
 
 @kernel
 def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> None:
-    """Fill the height [m] at an angle [rad] or position of the longitudinal slide [m]."""
+    """Fill the height [m] at an angle [rad] or at a position of the longitudinal slide [m]."""
     if form.slide:
         for k in range(height.size):
             height[k] = form.start + slide[k]
@@ -151,9 +170,9 @@ def _place(form: FormTable, angle: Samples, slide: Samples, height: Samples) -> 
 def evaluate(
     form: FormTable, inputs: tuple[Samples, ...], reference: Samples, expected: Samples, height: Samples
 ) -> None:
-    """Fill the desired displacement, the controllers' estimate of it, and the height [m], each of shape (n,).
+    """Fill the desired displacement, the controllers' estimate of it, and the height [m], shape (n,) each.
 
-    The inputs of the `Form` are the first of ``inputs``.
+    The first of ``inputs`` are those of the `Form`.
     """
     angle, angle_true = inputs[0], inputs[1]
     position, measured = angle_true, angle
@@ -161,13 +180,19 @@ def evaluate(
         position, measured = inputs[form.slide], inputs[form.slide + 1]
     _place(form, angle_true, position, height)
     deviation_along(form.heights, form.table, angle_true, height, reference)
-    # Equal angles give bit-identical results: the angle of an ideal encoder is evaluated once.
+    # Equal angles give bit-identical results, so the form is evaluated only once for an ideal encoder.
     if form.alike and equal(angle, angle_true) and equal(position, measured):
         put(expected, reference)
     else:
-        # The result array holds the height first, which is copied before the result is written.
+        # The result array first contains the height, which is copied before the result is written.
         _place(form, angle, measured, expected)
-        deviation_along(form.heights, form.told, angle, expected.copy(), expected)
+        deviation_along(form.told_heights, form.told, angle, expected.copy(), expected)
+
+
+def _tip_path(node: str, parameters: FormParameters, form: Profile) -> ProfileTable:
+    """Return the table of the path on which a round tip turns a form."""
+    with about(node, "tip_radius"):
+        return tabulated(TipPath(form, parameters.part_radius, parameters.tip_radius))
 
 
 class Form:
@@ -179,25 +204,34 @@ class Form:
 
     Attributes:
         surface: table of the form of the part.
-        profile: table of the path of the drives: the form, or the path of a round tip.
+        profile: table of the path that the controllers follow: the form, the path of a round tip, or that of the
+            programmed form.
         inputs: input ports.
         table: table for `evaluate`.
-        doubts: warnings about the form's file, one line each.
+        doubts: warnings about the files of the form, one line each.
 
     Raises:
-        InputError: see `FormParameters.form`; the tip does not fit into the form; or a slide would have to restart.
+        InputError: as for `FormParameters.form`, or the tip does not fit the form, or a slide would have to restart.
     """
 
     def __init__(self, node: str, parameters: FormParameters) -> None:
-        form = parameters.form(node)
-        said = doubts(form) if isinstance(form, Measured) else []
-        self.doubts = [f"{node}.profile_file = {parameters.profile_file}: {doubt}" for doubt in said]
-        self.surface = self.profile = path = tabulated(form)
+        form, programmed = parameters.form(node), parameters.programmed_form(node)
+        files = (
+            ("profile_file", parameters.profile_file, form),
+            ("programmed_file", parameters.programmed_file, programmed),
+        )
+        self.doubts = [
+            f"{node}.{name} = {file}: {doubt}"
+            for name, file, read in files
+            if isinstance(read, Measured)
+            for doubt in doubts(read)
+        ]
+        self.surface = path = tabulated(form)
+        self.profile = path if programmed is None else tabulated(programmed)
         if parameters.tip_radius:
-            with about(node, "tip_radius"):
-                path = tabulated(TipPath(form, parameters.part_radius, parameters.tip_radius))
+            path = _tip_path(node, parameters, form)
             if parameters.tip_correction:
-                self.profile = path
+                self.profile = path if programmed is None else _tip_path(node, parameters, programmed)
         self.inputs = [Input("encoder", messages.ENCODER, ("angle", "angle_true"))]
         slides = parameters.height_from == "slide"
         self.table = FormTable(
@@ -209,6 +243,7 @@ class Form:
             feed=parameters.feed,
             start=parameters.start_height,
             part=parameters.part_revolutions,
+            told_heights=self.profile.heights,
         )
         if slides:
             self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))
@@ -218,7 +253,7 @@ class Form:
 
 @kernel
 def step(memory: FormTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Evaluate desired form and height of one block."""
+    """Evaluate the desired form and the height of one block."""
     reference, expected, height = outputs
     evaluate(memory, inputs, reference, expected, height)
     return height.size, DONE
@@ -246,10 +281,10 @@ class ProfileStage(Stage):
         )
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the form's file, one line each."""
+        """Return the warnings about the file of the form, one line each."""
         return self.form.doubts
 
     @property
     def memory(self) -> FormTable:
-        """Current memory of the step of the profile stage."""
+        """Current state of the profile stage's step function."""
         return self.form.table

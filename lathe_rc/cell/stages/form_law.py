@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common part of laws with a known form of the part, fed forward through the inverse of the drive.
+"""Common part of laws that know the form of the part and feed it forward through the inverse of the drive.
 
     u = r(φ⁺) + a1·Ω⁺·r'(φ⁺) + a2·(Ω⁺²·r''(φ⁺) + (dΩ/dt)·r'(φ⁺)),    φ⁺ = φ(t + τ), Ω⁺ = Ω(t + τ)
 
@@ -32,23 +32,28 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
 
-#: counts per sample at which the error is 2 to 8 times that beside them; at others it is less, see docs/robust.md
+#: counts per sample at which the error is 2 to 8 times as large as nearby; other ratios matter less, see docs/robust.md
 _BAD = frozenset(Fraction(p, m) for p in (1, 2, 3) for m in (1, 2, 3))
-_CLEAR = _BAD | {Fraction(n) for n in (4, 5)} | {Fraction(1, n) for n in (4, 5)}  # a named sample rate is at none of
-#: [Hz] whole kHz whose step is a whole number of ns
+_CLEAR = _BAD | {Fraction(n) for n in (4, 5)} | {Fraction(1, n) for n in (4, 5)}  # a suggested sample rate avoids these
+#: sample rates in whole kHz whose step is a whole number of ns [Hz]
 _RATES = [1000 * kilo for kilo in range(1, 1001) if 1_000_000 % kilo == 0]
+_TICKS = 4  # of the edges' clock in a sample and in a count, from which their rounding does no harm; by simulation
+_CLOCKS = [1e-6, 1e-7, 1e-8]  # [s] resolutions of edge times that a warning may name
 
 
 class FormLawParameters(LawParameters, FormParameters):
-    """Form, encoder and drive model of the law; values not given are those of the cell."""
+    """Form, encoder and drive model of the law; values that are not given are those of the cell."""
 
-    asks: ClassVar[tuple[frozenset[str], ...]] = (FORM, frozenset({"encoder_counts"}))
+    asks: ClassVar[tuple[frozenset[str], ...]] = (FORM, frozenset({"encoder_counts", "encoder_edge_clock"}))
 
     feedback_delay: Annotated[int, Ge(1), Le(2**16)] = parameter(
         64, "samples from a measured position or error to when it is visible; at least a block", "sample"
     )
     encoder_counts: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
         0, "counts of the encoder per revolution; 0: an ideal one; not given in a scenario: those of the spindle"
+    )
+    encoder_edge_clock: Annotated[float, Ge(0), Le(1)] = parameter(
+        0.0, "resolution of the times of its edges; 0: they have none; goes with encoder_counts", "s"
     )
     expected_deviation: Annotated[float, Gt(0), Le(1)] = parameter(
         0.1, "amplitude of the speed deviations that the angle filter expects, relative to the nominal speed", "1"
@@ -61,7 +66,7 @@ class FormLawParameters(LawParameters, FormParameters):
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     def known(self) -> Mapping[str, Value]:
-        """Empty mapping: the law asks for the form instead of providing it."""
+        """Empty mapping, since the law asks for the form instead of providing it."""
         return {}
 
     @property
@@ -82,7 +87,7 @@ class ForwardTable(NamedTuple):
         spindle: filter of the spindle angle.
         form: form of the part.
         a1, a2, ahead: coefficients and lead time of the model [s, s², s].
-        late: delay of the error [sample].
+        late: delay of the error [samples].
     """
 
     spindle: AngleFilterTable
@@ -101,7 +106,7 @@ class FormLaw(Law):
         form: form that the drive must follow.
 
     Raises:
-        InputError: the height along the part is that of a slide, which cannot be previewed.
+        InputError: a slide determines the height along the part, which therefore cannot be previewed.
     """
 
     parameters: FormLawParameters
@@ -120,49 +125,66 @@ class FormLaw(Law):
         super().__init__(name, parameters)
 
     def make_filter(self) -> AngleFilterTable:
-        """Return the filter of the spindle angle before sample 0."""
-        return self._filter(self.parameters.step, self.parameters.encoder_counts)
-
-    def _filter(self, step: float, counts: int) -> AngleFilterTable:
+        """Return the filter of the spindle angle in its initial state, before sample 0."""
         parameters = self.parameters
-        return angle_filter(
-            step, counts, parameters.nominal_speed, parameters.expected_deviation, parameters.expected_frequency
-        )
+        return self._filter(parameters.step, parameters.encoder_counts, parameters.encoder_edge_clock)
 
-    def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
-        """Return a warning about encoder counts per sample near a ratio of small numbers."""
-        rate = self.parameters.sample_rate
-        spindle = self._filter(1.0 / rate, counts)
+    def _filter(self, step: float, counts: int, edge_clock: float = 0.0) -> AngleFilterTable:
+        parameters = self.parameters
+        deviation, frequency = parameters.expected_deviation, parameters.expected_frequency
+        return angle_filter(step, counts, parameters.nominal_speed, deviation, frequency, edge_clock)
+
+    def _resolves(self, clock: float, counts: int, high: float) -> bool:
+        """Return whether a clock [s] resolves the edges: their rounding to its ticks then does no harm."""
+        return _TICKS * clock <= min(self.parameters.step, 2.0 * math.pi / (counts * high))
+
+    def encoder_warnings(self, low: float, high: float, counts: int, edge_clock: float = 0.0) -> list[str]:
+        """Return a warning about counts per sample near a ratio of small integers, or about coarse times of edges."""
+        step = self.parameters.step
+        spindle = self._filter(step, counts)
         ratio = followed_ratio(spindle, low, high, _BAD)
-        if ratio is None:
+        if not counts or (edge_clock and self._resolves(edge_clock, counts, high)):
             return []
-        # Nearest rates first, and higher before lower ones, which read the encoder less often.
+        if ratio is not None:
+            what = (
+                f"counts per sample c = counts·rpm/(60·sample_rate) = {_passed(spindle, low, high)}, near {ratio}: the "
+                "encoder's rounding repeats slowly there, the angle filter follows it, and the form error is 2 to 8 "
+                "times as large"
+            )
+            cures = [self._clear_rate(low, high, counts)]
+        elif step / _TICKS < edge_clock < 2.0 * math.pi / (counts * low):
+            what = (
+                f"times of edges to {edge_clock:.3g} s, more than 1/{_TICKS} of a sample: the angle filter follows "
+                "their rounding, and the form error is up to twice that without such times"
+            )
+            cures = []
+        else:  # between two ticks there are counts: the angle is that of an encoder without times
+            return []
+        if clock := next((each for each in _CLOCKS if self._resolves(each, counts, high)), 0.0):
+            cures.append(f"times of edges (edge_clock = {clock:g})")
+        return [f"{self.name}: {what}; cure: {', or '.join(cures)}"]
+
+    def _clear_rate(self, low: float, high: float, counts: int) -> str:
+        """Return the nearest sample rate that is near no ratio, or else more counts, in words."""
+        rate = self.parameters.sample_rate
+        # Nearest rates first, and higher rates before lower ones, which read the encoder less often.
         near = [each for each in _RATES if rate / 2 <= each <= rate * 2]
-        rates = sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate))))
-        cure = next(
-            (each for each in rates if not followed_ratio(self._filter(1.0 / each, counts), low, high, _CLEAR)), 0
-        )
-        if cure:
-            told = f"sample_rate = {cure} ({_passed(self._filter(1.0 / cure, counts), low, high)})"
-        else:
-            finer = math.ceil(1.1 * max(_BAD) * counts / counts_per_sample(spindle, low))
-            told = f"{finer} counts per revolution or more: no sample rate up to {2 * rate} keeps clear of such ratios"
-        what = (
-            f"{self.name}: counts per sample c = counts·rpm/(60·sample_rate) = {_passed(spindle, low, high)}, near "
-            f"{ratio}: the encoder's rounding repeats slowly there, the angle filter follows it, and the form error "
-            f"is 2 to 8 times as large; cure: {told}"
-        )
-        return [what]
+        for cure in sorted(near, key=lambda each: (each < rate, abs(math.log(each / rate)))):
+            spindle = self._filter(1.0 / cure, counts)
+            if not followed_ratio(spindle, low, high, _CLEAR):
+                return f"sample_rate = {cure} ({_passed(spindle, low, high)})"
+        finer = math.ceil(1.1 * max(_BAD) * counts / counts_per_sample(self._filter(1.0 / rate, counts), low))
+        return f"{finer} counts per revolution or more: no sample rate up to {2 * rate} keeps clear of such ratios"
 
     def make_forward(self) -> ForwardTable:
-        """Return the feed-forward before sample 0."""
+        """Return the feed-forward in its initial state, before sample 0."""
         parameters = self.parameters
         return ForwardTable(
             self.make_filter(), self.form, *parameters.inverse, parameters.model_delay, parameters.feedback_delay
         )
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:
-        """Return the largest delay, half a revolution [sample], since delayed and learned errors must not meet."""
+        """Return the largest delay, half a revolution [samples], since delayed and learned errors must not meet."""
         return int(np.pi / (speed * self.parameters.step))
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Array, Complex, Response, supremum
+from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import LawParameters, Learner
 from lathe_rc.cell.stages.obedience import OBEY, OUT_OF_REACH, Listener, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.sampled import Sampled, checked
-from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined
 from lathe_rc.messages import Samples, Signals
@@ -220,18 +219,11 @@ class Law(Sampled, Learner):
         """Return the highest waves per revolution checked by `contraction`, at ``speed`` [rad/s]: the Nyquist limit."""
         return float(np.pi / (self.parameters.step * speed))
 
-    def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
-        """Return the largest magnitude of `contraction`, and the waves per revolution where it occurs."""
+    def factors(self, drive: Response, waves: Array, speed: float) -> Complex | None:
+        """Return the `contraction`, shape (1, n)."""
         with code_of_others(f"{self.name}: contraction"):
-            if self.contraction(drive, np.zeros(1), speed) is None:
-                return None
-            highest = float(self.highest_waves(speed))
-        if not 0.0 < highest < np.inf:
-            raise InputError(f"{self.name}: highest_waves gives {highest:g} at {speed:.4g} rad/s; allowed: above 0")
-        return supremum(lambda waves: self._told(drive, waves, speed), highest)
-
-    def _told(self, drive: Response, waves: Array, speed: float) -> Complex:
-        return checked(f"{self.name}: contraction", lambda: self.contraction(drive, waves, speed), waves)
+            told = self.contraction(drive, waves, speed)
+        return None if told is None else checked(f"{self.name}: contraction", told, waves)[None]
 
     def perform(self, action: str) -> None:
         """Clear the memory, or enable or disable learning."""

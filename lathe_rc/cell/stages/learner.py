@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response, drive_margin, supremum
 from lathe_rc.cell.parameters import (
     NonNegative,
     ObedientParameters,
@@ -26,6 +26,7 @@ from lathe_rc.cell.stages.obedience import Obedience, Obedient
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.errors import DivergedError, InputError
+from lathe_rc.extensions import code_of_others
 
 _SAFE = 0.98  # largest factor of a cycle after a remedy
 _BANDS = np.geomspace(60_000.0, 500.0, 32)  # [rad/s] candidate band edges of a flat Q
@@ -65,16 +66,51 @@ class Learner(Obedient):
     remedy: ClassVar[str] = "change the law"  #: for a loop that diverges where none of its `cures` helps, in words
 
     @abstractmethod
-    def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
-        """Return the largest magnitude of the error factor per cycle, and the waves per revolution where it occurs.
+    def factors(self, drive: Response, waves: Array, speed: float) -> Complex | None:
+        """Return the factors of the error by a cycle; learning converges if the magnitude of each is below 1.
 
         Args:
             drive: response of the drive's position to its command.
+            waves: waves per revolution, shape (n,).
             speed: speed of the spindle [rad/s].
 
         Returns:
-            None if the controller does not provide it.
+            Factors of shape (k, n); None if the controller does not provide them.
         """
+
+    @abstractmethod
+    def highest_waves(self, speed: float) -> float:
+        """Return the highest waves per revolution of the factors, at ``speed`` [rad/s]."""
+
+    def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
+        """Return the largest magnitude of `factors`, and the waves per revolution where it occurs."""
+        if (highest := self._highest(drive, speed)) is None:
+            return None
+        return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest)
+
+    def drive_margin(self, drive: Response, speed: float) -> DriveMargin | None:
+        """Return the smallest error of the drive's response with which learning diverges; None if unknown."""
+        if (highest := self._highest(drive, speed)) is None:
+            return None
+
+        def factors(waves: Array, scale: float) -> Complex:
+            return self._known(lambda frequency: np.asarray(scale * drive(frequency)), waves, speed)
+
+        return drive_margin(factors, highest, speed)
+
+    def _highest(self, drive: Response, speed: float) -> float | None:
+        if self.factors(drive, np.zeros(1), speed) is None:
+            return None
+        with code_of_others(f"{self.name}: highest_waves"):
+            highest = float(self.highest_waves(speed))
+        if not 0.0 < highest < np.inf:
+            raise InputError(f"{self.name}: highest_waves gives {highest:g} at {speed:.4g} rad/s; allowed: above 0")
+        return highest
+
+    def _known(self, drive: Response, waves: Array, speed: float) -> Complex:
+        factors = self.factors(drive, waves, speed)
+        assert factors is not None, "checked by _highest"
+        return factors
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
         """Return the speeds [rad/s] at which `worst` is evaluated, for a spindle between two speeds."""
@@ -92,13 +128,14 @@ class Learner(Obedient):
         """Return the parameters that decide whether learning converges, in words."""
         return "its parameters"
 
-    def encoder_warnings(self, low: float, high: float, counts: int) -> list[str]:
+    def encoder_warnings(self, low: float, high: float, counts: int, edge_clock: float = 0.0) -> list[str]:
         """Return causes of an avoidable form error, with remedies, one line each; none of them is an error.
 
         Args:
             low: lowest speed of the spindle [rad/s].
             high: highest speed of the spindle [rad/s].
             counts: encoder counts per revolution; 0 for an ideal encoder.
+            edge_clock: resolution of the time of the encoder's last edge [s]; 0: it is not known.
         """
         return []
 
@@ -124,7 +161,8 @@ class Learner(Obedient):
         low, high = cell.speed_range
         self._check_delay(cell, high)
         self._check_convergence(cell, self.checked_speeds(low, high), cures=cures)
-        cell.warnings += self.encoder_warnings(low, high, cell.master.parameters.counts_per_revolution)
+        encoder = cell.master.parameters
+        cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
         """Return the commanded drives and their responses."""
@@ -163,7 +201,7 @@ class Learner(Obedient):
         for name in unknown:
             cell.leave_open(f"whether {self.name} converges with {name}", name)
         learned, untold = self.learned(cell.stages.values()), list[str]()
-        loop = Loop(self, [response for response, _ in learned], speeds)
+        loop = cell.loops[self.name] = Loop(self, [response for response, _ in learned], speeds)
         for response, drive in learned:
             self._check_reach(drive)
             told = [(worst, speed) for speed in dict.fromkeys(speeds) if (worst := self.worst(response, speed))]
@@ -256,6 +294,11 @@ class Loop(NamedTuple):
             return np.inf
         told = [stage.worst(response, speed) for response in self.responses for speed in self.speeds]
         return max((np.inf if worst is None or np.isnan(worst[0]) else worst[0] for worst in told), default=np.inf)
+
+    def drive_margin(self) -> DriveMargin | None:
+        """Return the smallest error of a drive with which learning diverges, over all drives and speeds."""
+        each = [self.stage.drive_margin(response, speed) for response in self.responses for speed in self.speeds]
+        return min(filter(None, each), default=None)
 
     def first(self, candidates: Iterable[Mapping[str, Value]], allowed: float = _SAFE) -> Mapping[str, Value] | None:
         """Return the first parameters with all factors within the allowed value; None if there are none."""

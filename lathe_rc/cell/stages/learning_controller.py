@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import LearningLoop, Response
+from lathe_rc.analysis.learning import Array, Complex, LearningLoop, Response, highest_waves
 from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
 from lathe_rc.cell.stages.learner import Learner
@@ -131,9 +131,17 @@ class LearningController(Learner):
             step=parameters.step,
         )
 
+    def factors(self, drive: Response, waves: Array, speed: float) -> Complex:
+        """Return Q - γZ, shape (1, n)."""
+        return self.loop(drive).operator(waves, speed)[None]
+
+    def highest_waves(self, speed: float) -> float:
+        """Return the Nyquist limit of grid and sampling [waves per revolution]."""
+        return highest_waves(self.parameters.points_per_revolution, self.parameters.step, speed)
+
     def worst(self, drive: Response, speed: float) -> tuple[float, float]:
         """Return sup|Q - γZ|, and the waves per revolution where it occurs."""
-        return self.loop(drive).worst(speed)
+        return self.loop(drive).worst(speed)  # cached for equal loops
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
         """Return the speeds at which convergence is checked [rad/s]; only one for a memory over time."""

@@ -18,7 +18,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 
 _LEAD_LAWS = {law.name.lower(): law for law in LeadLaw}
-#: by name, ours and those of other packages; each is made of its width in grid points and the grid points of a cycle
+#: built-in and third-party filters, by name; each is made from its width in grid points and the grid points of a cycle
 Q_FILTERS: Registry[QFilter] = Registry(
     "Q filter",
     QFilter,
@@ -30,7 +30,7 @@ _CORRECTIONS = {law.name.lower(): law for law in CorrectionLaw}
 
 @lru_cache(maxsize=64)
 def _own_q(make: Callable[..., QFilter], *numbers: float) -> QFilter:
-    """Return a built-in Q filter, shared by equal arguments since it has no memory; its loops are shared as well."""
+    """Return a built-in Q filter, shared for equal arguments since it has no state; its loops are shared as well."""
     return make(*numbers)
 
 
@@ -136,12 +136,12 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     @property
     def _point_time(self) -> float:
-        """Time in which the spindle passes a grid point at nominal speed [s]."""
+        """Time from one grid point to the next at nominal speed [s]."""
         return float(1.0 / (self.nominal_speed * (self.points_per_revolution / (2 * np.pi))))
 
     @property
     def _q_width(self) -> float:
-        """Width ``q_time`` at nominal speed [grid points]; the order of multiplication determines the last bits."""
+        """Width ``q_time`` at nominal speed [grid points]; the order of the operations determines the last bits."""
         return float(self.q_time * self.nominal_speed * (self.points_per_revolution / (2 * np.pi)))
 
     def _own_q(self) -> QFilter:
@@ -153,8 +153,8 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         return _own_q(make, self._q_width, self.cycle_points)
 
     def _q_that_fits(self) -> str:
-        """Return nearby parameters of a Q filter that fits into the memory, in words."""
-        highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # [rad/s] highest frequency on the grid
+        """Describe nearby parameters of a Q filter that fits into the memory, for an error message."""
+        highest = float(f"{0.99 * np.pi / self._point_time:.3g}")  # highest frequency on the grid [rad/s]
         tried: list[dict[str, float]] = []
         for k in range(1, 60):
             if self.q_filter != "fir":
@@ -177,7 +177,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         """Return the correction of a node with its given model.
 
         Raises:
-            InputError: a lead-lag term without a lag.
+            InputError: a lead-lag term has no lag.
         """
         with about(node, "lead_lag_lag"):
             return Correction(
@@ -190,12 +190,12 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     @property
     def preview_time(self) -> float:
-        """Time compensated by the lead law [s]: T0, or only the model's delay with the exact correction."""
+        """Time compensated by the lead law [s]: T0, or only the delay of the model with the exact correction."""
         return self.model_delay if self.correction == "exact" else self.lead_time
 
     @property
     def constant_lead(self) -> float:
-        """Lead angle independent of the speed [rad]: of Wk2, which has constant parameters in the angle."""
+        """Speed-independent lead angle [rad]: that of Wk2, whose parameters are constant in the angle domain."""
         return (self.lead_time - self.preview_time) * self.nominal_speed
 
     def make_preview(self, node: str) -> Preview:
@@ -214,7 +214,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         )
 
     def largest_lead(self, speed: float, acceleration: float) -> float:
-        """Return the largest lead angle [rad] at a largest measured ``speed`` [rad/s] and ``acceleration`` [rad/s²]."""
+        """Return the largest lead angle [rad] up to a measured ``speed`` [rad/s] and an ``acceleration`` [rad/s²]."""
         time = self.preview_time
         if self.lead_law == "constant_angle":
             return time * self.nominal_speed + self.constant_lead

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Step of the learning controller."""
+"""Step function of the learning controller."""
 
 from typing import NamedTuple
 
@@ -16,13 +16,13 @@ from lathe_rc.jit import inlined, kernel
 from lathe_rc.messages import Samples
 from lathe_rc.safety.state_machine import Reaction
 
-# Indices into the state of a step: whether it is inside a segment of a block, start and end of that, and whether the
-# angle is lost, and since which sample, if not reported yet.
+# Indices into the state of the step function: whether it is inside a segment of a block, start and end of the segment,
+# whether the angle is lost, and the sample at which it was lost, if not yet reported.
 _INSIDE, _BEGIN, _END, _LOST, LOST_AT = range(5)
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the learning controller.
+    """State of the learning controller's step function.
 
     Attributes:
         control: repetitive memory of the channel.
@@ -33,10 +33,10 @@ class Memory(NamedTuple):
         period: sampling step [s].
         by_time: whether time replaces the angle.
         falls_back: whether the lead angle of the nominal speed is used when the supervisor requests a fallback.
-        rates: whether the correction needs the rates of the lead.
+        rates: whether the correction needs the time derivatives of the read angle.
         finer: number of finer drives included in the error.
-        margin: stability margin of the newest cycle, shape (1,).
-        state: state of the step, indexed by the module constants.
+        margin: stability margin of the latest cycle, shape (1,).
+        state: integer state, indexed by the module's constants.
     """
 
     control: AngleMemory
@@ -56,7 +56,7 @@ class Memory(NamedTuple):
 
 @inlined
 def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
-    """Return the angle of the memory [rad], ``late`` samples before the samples starting at ``first``."""
+    """Return the angle that indexes the memory [rad], ``late`` samples before the samples starting at ``first``."""
     if not memory.by_time:
         return measured
     angle = np.empty(measured.size)
@@ -70,7 +70,7 @@ def _angle(memory: Memory, first: int, late: int, measured: Samples) -> Samples:
 
 @inlined
 def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) -> None:
-    """Preview a segment of a block, and record its errors."""
+    """Compute the lead of a segment of a block, and store the errors of the segment."""
     control, samples = memory.control, stop - start
     speed, error = inputs[1][start:stop], inputs[3][start:stop]
     if memory.by_time or (memory.falls_back and obeyed(memory.who) >= Reaction.FALL_BACK.value):
@@ -90,7 +90,7 @@ def _begin(memory: Memory, first: int, start: int, stop: int, inputs: Fields) ->
 
 @inlined
 def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
-    """Hold the command from sample ``start`` of a block, after a loss of the angle."""
+    """Hold the command from sample ``start`` of a block on, after a loss of the angle."""
     command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.who.obedience.takeover.given[1]
 
 
@@ -99,7 +99,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     """Compute the command of one block from the repetitive memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
-    # A step that has stopped within a segment resumes with the segment still open, possibly at its end.
+    # If it stopped within a segment, the step function resumes with this segment still open, possibly at its end.
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
             stop = piece(who, start, n, flags[0])
@@ -123,7 +123,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 _lose(memory, reached, stop, command)
                 reached, reason = stop, DONE
             elif memory.identifies:
-                # Before `accumulate`: a segment may be longer than the delay.
+                # Before `accumulate`, since a segment may be longer than the delay.
                 command_sent(memory.identifier, first, start, reached, command)
                 accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
         for published in range(1, len(outputs)):

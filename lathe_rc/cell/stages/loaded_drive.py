@@ -261,13 +261,14 @@ class LoadedDriveStage(CutStage, CoupledDrive):
         self._equip(coarse, fine)
         if isinstance(parameters, LoadedSeriesParameters):
             piezo = piezo_on_carriage(name, parameters.fine, parameters.mass_ratio, parameters.fine.preload or np.inf)
-        with about(name, "coarse_bandwidth" if coil else "mass_ratio", "sample_rate"):
+        with about(name, *(("coarse_loop", "coarse_bandwidth") if coil else ("mass_ratio",)), "sample_rate"):
             self.drive = tool_drive(
                 coarse,
                 parameters,
                 radial=parameters.radial_ratio,
                 coil=coil,
                 piezo=piezo,
+                modes=coarse.modes(name, "coarse_"),
                 kept=messages.MAX_BLOCK if coil else 1,
             )
         if coil:

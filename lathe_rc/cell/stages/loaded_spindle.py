@@ -19,7 +19,7 @@ from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
 
 _TORQUE = "torque"  # source of limit events
-_MOST_LAG = 0.9 * 2.0 * np.pi  # [rad] largest extension of a run beyond its speed law
+_MOST_LAG = 0.9 * 2.0 * np.pi  # largest extension of a run beyond its speed law [rad]
 
 
 class LoadedSpindleParameters(SpindleEncoderParameters):
@@ -42,7 +42,7 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
     )
 
     def spindle(self, node: str) -> LoadedSpindle:
-        """Return the spindle machine of a node.
+        """Return the simulated spindle of a node.
 
         Raises:
             InputError: the speed loop oscillates.
@@ -61,11 +61,11 @@ class LoadedSpindleParameters(SpindleEncoderParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the loaded spindle.
+    """State of the loaded spindle's step function.
 
     Attributes:
         encoder: encoder with the speed law.
-        spindle: machine of the spindle.
+        spindle: simulated spindle.
         room: scratch array for the torque.
     """
 
@@ -90,7 +90,7 @@ class LoadedSpindleStage(SpindleEncoder):
     """Spindle with motor, belt and speed loop, slowed by the cut (see `lathe_rc.plants.spindle`).
 
     Attributes:
-        spindle: machine of the spindle.
+        spindle: simulated spindle.
     """
 
     kind = "loaded_spindle"
@@ -100,7 +100,7 @@ class LoadedSpindleStage(SpindleEncoder):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LoadedSpindleParameters) -> None:
-        # Before the base class, whose constructor uses loads and lag.
+        # Before the base class, whose constructor uses the loads and the lag.
         self.spindle = parameters.spindle(name)
         self._largest = parameters.largest_deviation * parameters.nominal_speed
         self._delay = parameters.load_delay
@@ -114,7 +114,7 @@ class LoadedSpindleStage(SpindleEncoder):
         return [Input("cut", messages.CUT, ("force",), self._delay)]
 
     def _lag(self) -> float:
-        """Angle needed by the integral of the speed loop for the largest load [rad]; less than a revolution."""
+        """Angle that the speed loop's integral needs for the largest load [rad]; less than a revolution."""
         table = self.spindle.table
         return min(table.largest_load / table.integral, _MOST_LAG) if table.radius else 0.0
 
@@ -124,12 +124,12 @@ class LoadedSpindleStage(SpindleEncoder):
         return low - self._largest, high + self._largest
 
     def largest_acceleration(self) -> float:
-        """Upper bound of the magnitude of dΩ/dt in the run [rad/s²]."""
+        """Upper bound on the magnitude of dΩ/dt in the run [rad/s²]."""
         return super().largest_acceleration() + self._push
 
     @property
     def memory(self) -> tuple[Any, ...]:
-        """Current memory of the step of the loaded spindle."""
+        """Current state of the loaded spindle's step function."""
         return Memory(self._encoder.table, self.spindle.table, self.room)
 
     def serve(
@@ -144,7 +144,7 @@ class LoadedSpindleStage(SpindleEncoder):
         raise failure(reason, self.spindle.table, angle, force)
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return the events of the samples that the step has computed last."""
+        """Return the events of the last computed samples."""
         return self._clipping.tell(first, end)
 
     def finish(self, index: int) -> list[Sparse]:

@@ -18,12 +18,12 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 
-OUT_OF_REACH = "out of reach"  #: event of a takeover that could not begin where the command was
-OBEY = 100  #: why a step stops: a reaction has to be obeyed
+OUT_OF_REACH = "out of reach"  #: event: a takeover could not begin at the command's position
+OBEY = 100  #: stop reason of a step function: a reaction must be obeyed
 
 
 def listens(parameters: ObedientParameters) -> list[Input]:
-    """Return the input with the reactions of the supervisor, if the node obeys it."""
+    """Return the input with the supervisor's reactions, or no input if the node does not obey the supervisor."""
     delay = parameters.reaction_delay
     return [Input("safety", messages.SAFETY, ("reaction",), delay)] if delay else []
 
@@ -43,13 +43,13 @@ class FeedObedientParameters(ObedientParameters):
     def obedience(self, name: str, *, speed: bool, limit: float, settled: int) -> "Obedience":
         """Return the obedience for a feed command.
 
-        The slide stops: a speed command goes to 0, a position command is held. The tool is not retracted from the
-        part along the slide.
+        The slide stops: a speed command goes to 0, and a position command is held. The slide does not retract the tool
+        from the part.
 
         Args:
             name: name of the node.
             speed: whether the command represents a speed.
-            limit: largest magnitude of the command, in its unit; 0: none.
+            limit: largest magnitude of the command, in its unit; 0 for no limit.
             settled: see `Obedience`.
 
         Raises:
@@ -77,7 +77,7 @@ class ObedienceTable(NamedTuple):
     """Table of an `Obedience` for kernels.
 
     Attributes:
-        whole: the reaction in force, and whether learning is requested.
+        whole: reaction in force, and whether learning is requested.
         forbidden: number of samples until learning is permitted, shape (1,).
         takeover: takeover of the command.
     """
@@ -101,9 +101,9 @@ class Listener(NamedTuple):
 
 @kernel
 def piece(who: Listener, start: int, end: int, reaction: Samples) -> int:
-    """Return the end of the segment that starts at sample ``start`` with a constant reaction; ``end`` at most.
+    """Return the end of the segment with constant reaction that starts at sample ``start``; at most ``end``.
 
-    The result is ``start`` itself where a new reaction must be obeyed first (`OBEY`).
+    The result is ``start`` itself if a new reaction must be obeyed first (`OBEY`).
     """
     if not who.listens:
         return end
@@ -130,7 +130,7 @@ def obeyed(who: Listener) -> int:
 
 @kernel
 def apply(who: Listener, command: Samples) -> None:
-    """Convert the controller's command of a segment into the drive's command, in place, in its unit."""
+    """Convert the controller's command of a segment into the drive's command in place, in the unit of the command."""
     if who.listens:
         take_over(who.obedience.takeover, command)
         who.obedience.forbidden[0] = max(who.obedience.forbidden[0] - command.size, 0.0)
@@ -138,7 +138,7 @@ def apply(who: Listener, command: Samples) -> None:
 
 NOBODY = ObedienceTable(
     np.zeros(2, np.int64), np.zeros(1), TakeoverTable(np.zeros(0), np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
-)  #: of a node without a supervisor
+)  #: obedience table of a node without a supervisor
 
 
 class Obedience:
@@ -148,8 +148,8 @@ class Obedience:
         name: name of the node.
         takeover: takeover of the command.
         settled: number of samples after the return of control until errors may be learned.
-        hold: takeover action for the reaction hold.
-        retract: takeover action for the reactions retract and stop.
+        hold: takeover mode for the reaction hold.
+        retract: takeover mode for the reactions retract and stop.
     """
 
     def __init__(
@@ -175,14 +175,14 @@ class Obedience:
         self._whole[_WANTS] = wanted
 
     def obey(self, reaction: Reaction, index: int) -> list[Sparse]:
-        """Obey a reaction starting at sample ``index``, the next one; return the resulting messages."""
+        """Obey a reaction from the next sample, ``index``, on; return the resulting messages."""
         self._whole[_REACTION] = reaction
         following = self._hold if reaction == Reaction.HOLD else Mode.FOLLOW
         self._takeover.change(self._retract if reaction >= Reaction.RETRACT else following)
         if reaction >= Reaction.FREEZE:
             self._forbidden[0] = math.inf
         elif self._forbidden[0]:
-            # The delayed errors of the return motion must not be learned.
+            # Delayed errors from the return motion must not be learned.
             self._forbidden[0] = self._takeover.remaining + self._settled
         skipped, self._takeover.skipped = self._takeover.skipped, 0.0
         if not skipped:
@@ -191,7 +191,7 @@ class Obedience:
 
 
 class Obedient(Stage):
-    """Stage that obeys the supervisor, whose reactions are its last input; a subclass sets its obedience, if any."""
+    """Stage that may obey the supervisor, whose reactions are its last input; a subclass sets the obedience, if any."""
 
     _obedience: Obedience | None = None
 
@@ -204,7 +204,7 @@ class Obedient(Stage):
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
-        """Obey a new reaction for which the step has stopped (`OBEY`)."""
+        """Obey a new reaction for which the step function has stopped (`OBEY`)."""
         if reason != OBEY or self._obedience is None:
             return []
         return self._obedience.obey(Reaction(inputs[self.own_inputs - 1]["reaction"][reached]), first + reached)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fine piezo tool drive, and its set point from a learned command, the reference, and compensated displacements."""
+"""Fine piezo drive of the tool; its set point combines learned command, reference and compensated displacements."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -32,7 +32,7 @@ from lathe_rc.signals.noise import Sensor, SensorTable, measure
 
 
 class SetPointParameters(NodeParameters):
-    """Composition of the set point: command + reference - compensated displacements, each selectable."""
+    """Composition of the set point: command + reference - compensated displacements, each of which is optional."""
 
     use_command: bool = parameter(default=True, doc="the set point has the learned command in it")
     use_reference: bool = parameter(
@@ -46,12 +46,12 @@ class SetPointParameters(NodeParameters):
 
 
 class SetPoint:
-    """Set point as the sum of the terms selected in a table.
+    """Set point as the sum of the terms selected in a parameter table.
 
     Args:
         node: name of the node.
         table: parameters of the set point.
-        inside: compensated displacements known inside the drive, without a topic.
+        inside: compensated displacements that the drive knows without a topic.
         prefix: prefix of the parameters in a composed table.
 
     Attributes:
@@ -85,7 +85,7 @@ class SetPoint:
 
 @kernel
 def sum_up(signs: Samples, inputs: tuple[Samples, ...], begin: int, samples: int) -> Samples:
-    """Return the set point [m], shape (n,), from the inputs of a `SetPoint`, starting at input number ``begin``."""
+    """Return the set point [m], shape (n,), from the inputs of a `SetPoint`, starting at input ``begin``."""
     set_point = np.zeros(samples)
     for place in range(signs.size):
         part = inputs[begin + place]
@@ -157,7 +157,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
     def _identified(
         self, named: _Named, real: PrandtlIshlinskii | BoucWen | None
     ) -> PrandtlIshlinskii | BoucWen | None:
-        """Return the hysteresis model of the linearisation, for the ``real`` hysteresis."""
+        """Return the hysteresis model used to linearise the ``real`` hysteresis."""
         if not self.identified_weights:
             with named("identified_weights"):
                 if self.identified_thresholds or self.identified_proportional:
@@ -171,7 +171,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
             )
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of the drive that controllers may know; the amplifier's lag is omitted."""
+        """Quantities of the drive that controllers may know, without the lag of the amplifier."""
         known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": 0.0}
         return {"fine/command": known}
 
@@ -179,7 +179,7 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
         """Return amplifier and ceramics of a node, at rest; ``prefix`` precedes the parameters in a composed table.
 
         Raises:
-            InputError: the hysteresis has no inverse, or a lag is far shorter than the step.
+            InputError: the hysteresis has no inverse, or a lag is much shorter than the step.
         """
 
         def named(*names: str) -> AbstractContextManager[None]:
@@ -204,14 +204,14 @@ class PiezoActuatorParameters(SetPointParameters, LimitedParameters):
 
 @lru_cache(maxsize=64)
 def _plays(thresholds: tuple[float, ...], weights: tuple[float, ...], proportional: float) -> PrandtlIshlinskii:
-    """Return a copy of weighted plays at rest, since a `Stack` has a state of its own."""
+    """Return a copy of weighted plays at rest, since each `Stack` has a state of its own."""
     return PrandtlIshlinskii(
         np.array(thresholds) if thresholds else THRESHOLDS, np.array(weights) if weights else WEIGHTS, proportional
     )
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the piezo drive."""
+    """State of the piezo drive's step function."""
 
     signs: Samples
     limits: LimiterTable
@@ -221,7 +221,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Move the piezo through one block, within its limits."""
+    """Move the piezo drive through one block, within its limits."""
     position, velocity, effort, measured_position = outputs
     set_point = sum_up(memory.signs, inputs, 0, position.size)
     advance_fine(memory.drive, limited(memory.limits, first, set_point), position, velocity, effort)
@@ -234,7 +234,7 @@ class PiezoActuator(Drive):
 
     Attributes:
         parameters: parameter table of the node.
-        drive: machine of the drive.
+        drive: simulated drive.
         set_point: set point of the drive.
     """
 
@@ -256,10 +256,10 @@ class PiezoActuator(Drive):
         )
 
     def responses(self) -> Mapping[str, Response]:
-        """Response of the position to the command, by topic."""
+        """Response from the command to the position, by topic."""
         return {"fine/command": self.drive.linear.response}
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the piezo drive."""
+        """Current state of the piezo drive's step function."""
         return Memory(self.set_point.signs, self._commands[0].table, self.drive.table, self._sensors[0].table)

@@ -161,4 +161,6 @@ class Plant(Sampled, SingleDrive):
         return {"coarse/command": self._told}
 
     def _told(self, frequency: Array) -> Complex:
-        return checked(f"{self.name}: response", lambda: self.response(frequency), frequency)
+        with code_of_others(f"{self.name}: response"):
+            told = self.response(frequency)
+        return checked(f"{self.name}: response", told, frequency)

@@ -77,17 +77,17 @@ class PositionControllerParameters(ServoParameters):
 
 
 _NO_PATH = PathTable(np.empty(0), np.empty(0), np.zeros(1, np.int64))
-_PERIODS = 64  # capacity of the log until it is read
-_TOLD = 1  # stop reason of the step: the log is full
+_PERIODS = 64  # rows of the log until it is read
+_TOLD = 1  # stop reason of the step function: the log is full
 
 
 class Wanted(NamedTuple):
-    """Controlled quantity, for the steps of all laws.
+    """Controlled quantity, for the step functions of all laws.
 
     Attributes:
-        course: course of the set point.
-        path: path subtracted from the set point; without heights there is none.
-        edge, height: numbers of the inputs with the deflection of the edge and with the height; 0: none.
+        course: samples of the set point.
+        path: path subtracted from the set point; without heights, there is no path.
+        edge, height: indices of the inputs with the deflection of the edge and with the height; 0 if there is none.
         who: obedience to the supervisor, if any.
     """
 
@@ -99,7 +99,7 @@ class Wanted(NamedTuple):
 
 
 class PidMemory(NamedTuple):
-    """Memory of the step of the PID."""
+    """State of the PID's step function."""
 
     wanted: Wanted
     pid: PidTable
@@ -107,22 +107,22 @@ class PidMemory(NamedTuple):
 
 
 class LinkMemory(NamedTuple):
-    """Memory of the step of the sampled link."""
+    """State of the sampled link's step function."""
 
     wanted: Wanted
     link: HeldLink
 
 
 class PeriodicMemory(NamedTuple):
-    """Memory of the step of the periodic law.
+    """State of the periodic law's step function.
 
     Attributes:
         wanted: controlled quantity.
         law, state: table and state of the law.
         unit: displacement that corresponds to 1 in the law [m].
-        divisor: computing interval [sample].
+        divisor: number of samples between two computations.
         held: held command, and largest error in the period [m].
-        log: for each period the sample after it, the largest error, and the results of `periodic.achieved`.
+        log: for each period, the sample after it, the largest error, and the results of `periodic.achieved`.
         logged: number of rows in the log, shape (1,).
     """
 
@@ -141,7 +141,7 @@ def _look(wanted: Wanted, first: int, start: int, inputs: Fields, set_point: Sam
     """Return the controlled position [m]; fill set point and error at the start of a block."""
     position = inputs[1]
     if wanted.edge:
-        # The slide is positive into the part, the deflection out of it.
+        # The slide is positive into the part, the deflection out of the part.
         position = position - inputs[wanted.edge]
     if start == 0:
         follow(wanted.course, first, set_point)
@@ -182,7 +182,7 @@ def _repeat(
     memory: PeriodicMemory, first: int, start: int, stop: int, set_point: Samples, position: Samples,
     error: Samples, command: Samples,
 ) -> int:  # fmt: skip
-    """Step the periodic law through a segment; return the sample reached, which is its end unless the log is full."""
+    """Step the periodic law through a segment; return the sample reached, the end unless the log is full."""
     held, divisor, unit = memory.held, memory.divisor, memory.unit
     period = memory.law.samples * divisor
     for k in range(start, stop):
@@ -192,7 +192,7 @@ def _repeat(
         command[k] = held[0]
         held[1] = max(held[1], abs(error[k]))
         if (n + 1) % period == 0:
-            # A log, since a kernel cannot publish; the step stops when it is full.
+            # A log, since a kernel cannot publish; the step function stops when the log is full.
             row = memory.log[memory.logged[0]]
             row[0], row[1] = n + 1, held[1]
             periodic.achieved(memory.state, row[2:])
@@ -242,7 +242,7 @@ class PositionController(Servo):
         self._path = None
         axis, delay = parameters.axis, parameters.feedback_delay
         inputs = [
-            # The angle itself is not used: the spindle's blocks determine which samples are due.
+            # The angle itself is not used; the spindle's blocks determine which samples are due.
             Input("encoder", messages.ENCODER, ("angle",)),
             Input(f"{axis}/state", messages.STATE, ("measured_position",), delay),
         ]
@@ -279,13 +279,13 @@ class PositionController(Servo):
 
     @property
     def step(self) -> Step:  # type: ignore[override]
-        """Step of the law selected in the table."""
+        """Step function of the law selected in the parameter table."""
         steps: dict[str, Step] = {"pid": pid_step, "sampled_link": link_step, "periodic_hyperstable": periodic_step}
         return steps[self.parameters.law]
 
     @property
     def memory(self) -> PidMemory | LinkMemory | PeriodicMemory:
-        """Current memory of the step of the position controller."""
+        """Current state of the position controller's step function."""
         path = self._path.table if self._path else _NO_PATH
         edge = 2 if self.parameters.measures == "edge" else 0
         height = (3 if edge else 2) if self._path else 0
@@ -320,5 +320,5 @@ class PositionController(Servo):
             "popov_bound": bound,
             "hyperstable": clearance >= 0.0,
         }
-        # The last sample of the period, as the next one may not be computed yet.
+        # The last sample of the period, since the next one may not be computed yet.
         return Sparse(f"{self.parameters.axis}/periodic", messages.PERIODIC, index - 1, status)

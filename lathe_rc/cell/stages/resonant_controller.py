@@ -4,9 +4,9 @@
     u = u_form + Σ_k a_k·cos kφ + b_k·sin kφ,    k = 0 … K
     da_k/dt = 2g·e·cos(kφ + θ_k)/|Wi(jkΩ)|,  db_k/dt = 2g·e·sin(kφ + θ_k)/|Wi(jkΩ)|,    θ_k = arg Wi(jkΩ)
 
-with the error e of ``feedback_delay`` samples ago and the angle of that sample. In the angle each order is an internal
-model of its own that is valid at any speed. u_form is the form through the inverse of the drive, as
-defined in `lathe_rc.cell.stages.form_law`.
+with the error e of ``feedback_delay`` samples ago and the angle of that sample. In the angle domain, each order is an
+internal model of its own that is valid at any speed. u_form is the form fed forward through the inverse of the drive,
+as defined in `lathe_rc.cell.stages.form_law`.
 
 Source: Guo, Bodson (doi 10.1002/acs.1117): equivalence with an internal model at any rate of change of the frequency.
 """
@@ -33,10 +33,10 @@ class ResonantControllerParameters(FormLawParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the resonant law.
+    """State and constants of the resonant law.
 
     Attributes:
-        forward: feed-forward of the form through the inverse of the drive.
+        forward: feed-forward of the part profile, computed with the drive's inverse.
         step: sampling step [s].
         gain: 2g·step.
         amplitudes: a and b by order, shape (2, K + 1) [m].
@@ -50,14 +50,14 @@ class Memory(NamedTuple):
 
 @kernel
 def sample(memory: Memory, now: Now) -> float:
-    """Return the command of the law at one sample [m]."""
+    """Return the law's command at one sample [m]."""
     forward, amplitudes = memory.forward, memory.amplitudes
     command = fed_forward(forward, now.angle)
     spindle, a1, a2 = forward.spindle, forward.a1, forward.a2
     if now.sample >= forward.late and now.learning:
         past, turning, _ = at(spindle, -forward.late * memory.step)
         amplitudes[0, 0] += 0.5 * memory.gain * now.error
-        # cos and sin of k·(φ - Ωτ) by rotation; 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} has the rest of the phase.
+        # cos and sin of k·(φ - Ωτ) by rotation; 1/Wi = (1 + a1·p + a2·p²)·e^{pτ} contributes the rest of the phase.
         one, two = np.cos(past - turning * forward.ahead), np.sin(past - turning * forward.ahead)
         cosine, sine = one, two
         for k in range(1, amplitudes.shape[1]):
@@ -75,7 +75,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class ResonantController(FormLaw):
-    """Law that cancels the harmonics of the error, order by order.
+    """Law that cancels the harmonics of the error order by order.
 
     Attributes:
         parameters: parameter table of the node.
@@ -87,7 +87,7 @@ class ResonantController(FormLaw):
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
 
     def start(self) -> Memory:
-        """Return the memory of the law before the first sample."""
+        """Return the initial state of the law, before the first sample."""
         parameters = self.parameters
         return Memory(
             self.make_forward(),

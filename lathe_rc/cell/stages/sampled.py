@@ -53,19 +53,19 @@ class Sampled(Stage):
             return self.start()
 
 
-def checked(what: str, ask: Callable[[], Complex | None], at: Array) -> Complex:
+def checked(what: str, told: object, at: Array) -> Complex:
     """Return the response provided by a third-party law or drive, checked, shape (n,).
 
     Args:
         what: description of the response.
-        ask: function that returns the response.
+        told: the response.
         at: waves or frequencies of the response, shape (n,).
 
     Raises:
-        InputError: ``ask`` raises an exception, or the shape is wrong.
+        InputError: the response is not numeric, or its shape is wrong.
     """
     with code_of_others(what):
-        told = np.asarray(ask(), np.complex128)
-    if told.shape != at.shape:
-        raise InputError(f"{what} gives the shape {told.shape} for {at.shape}; allowed: a number for each")
-    return told
+        found = np.asarray(told, np.complex128)
+    if found.shape != at.shape:
+        raise InputError(f"{what} gives the shape {found.shape} for {at.shape}; allowed: a number for each")
+    return found

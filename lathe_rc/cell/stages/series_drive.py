@@ -153,7 +153,7 @@ class SeriesDriveStage(CoupledDrive):
         coarse, fine = parameters.coarse, parameters.fine
         piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):
-            self.drive = tool_drive(coarse, parameters, piezo=piezo)
+            self.drive = tool_drive(coarse, parameters, piezo=piezo, modes=coarse.modes(name, "coarse_"))
         self._equip(coarse, fine)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common part of servo controllers: a PID, converters, and a feedback edge."""
+"""Common part of servo controllers: a PID, converters, and a feedback edge of the cell."""
 
 from typing import Annotated, Literal
 
@@ -54,7 +54,7 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         """Return the obedience of a node to the supervisor; None without a supervisor input.
 
         Raises:
-            InputError: a command may be out of reach, see `FeedObedientParameters.obedience`.
+            InputError: a command may be out of reach (see `FeedObedientParameters.obedience`).
         """
         if not self.reaction_delay:
             return None
@@ -62,10 +62,10 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         return self.obedience(name, speed=speed, limit=limit, settled=self.feedback_delay)
 
     def pid(self, node: str) -> Pid:
-        """Return the PID of a node whose table has gains.
+        """Return the PID of a node whose parameter table has gains.
 
         Raises:
-            InputError: see `lathe_rc.control.pid`.
+            InputError: as for `lathe_rc.control.pid.Pid`.
         """
         with about(node, "proportional", "integral", "derivative", "derivative_filter"):
             gains, limit = made_of(PidGains, self, "derivative_"), self.command_limit
@@ -106,7 +106,7 @@ def pid_along(
     measured: Samples,
     command: Samples,
 ) -> tuple[int, int]:
-    """Step a PID through a block from sample ``start`` (see `lathe_rc.cell.stage`); arrays of shape (n,)."""
+    """Step a PID through a block from sample ``start`` on (see `lathe_rc.cell.stage`); arrays of shape (n,)."""
     while start < command.size:
         stop = piece(who, start, command.size, reaction)
         if stop == start:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the spindle's speed law, for the spindle and for laws that know the speed in advance."""
+"""Parameters of the spindle's speed law, for the spindle and for control laws that know the speed in advance."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -17,7 +17,7 @@ from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.signals import speed, tachogram
 from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
 
-#: by name, those of other packages: ours are the parameters below
+#: third-party speed laws, by name; the parameters below define the built-in law
 SPEED_LAWS: Registry[DeviationLaw] = Registry("speed law", DeviationLaw, {}, "lathe_rc.speed_laws")
 
 
@@ -53,7 +53,7 @@ class SpeedLawParameters(NodeParameters):
     )
 
     def speed_law(self, node: str) -> speed.SpeedLaw:
-        """Return the sum of all deviations, for a node.
+        """Return the speed law of a node, the sum of all deviations.
 
         Raises:
             InputError: lists differ in length, a tachogram or a band is out of order, a file or third-party law
@@ -71,7 +71,7 @@ class SpeedLawParameters(NodeParameters):
             return law + made_of(speed.band_limited_random, self, "random_", nominal=nominal)
 
     def _tachogram(self, node: str) -> speed.SpeedLaw | None:
-        """Return the tachogram of the lists, the file, or a third-party law, if there is one."""
+        """Return the tachogram from the lists, the file or a third-party law; None if there is none."""
         lists = bool(self.tachogram_time or self.tachogram_deviation)
         given = {"deviation_law": self.deviation_law, "tachogram_file": self.tachogram_file, "tachogram_time": lists}
         named = [name for name, value in given.items() if value]
@@ -102,6 +102,6 @@ class SpeedLawParameters(NodeParameters):
 def _harmonic(
     nominal: float, amplitude: tuple[float, ...], frequency: tuple[float, ...], phase: tuple[float, ...], start: float
 ) -> speed.SpeedLaw:
-    """Return the harmonic deviations, created once for all nodes that use them."""
+    """Return the harmonic deviations, created only once for all nodes that use them."""
     phases = np.array(phase) if phase else np.zeros(len(amplitude))
     return speed.harmonic(nominal, np.array(amplitude), np.array(frequency), phases, start)

@@ -25,6 +25,9 @@ _SHORT = 0.01  # largest fraction of a run not covered by its tachogram
 class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     """Speed law, encoder, and, for the time master of a cell, length and pace of the run."""
 
+    reads_per_sample: Annotated[int, Ge(1), Le(65536)] = parameter(
+        1, "readings of the counter per sample; several give the time of an edge, as edge_clock; not with it"
+    )
     disc_eccentricity: Annotated[float, Ge(0), Le(0.5)] = parameter(
         0.0, "encoder: eccentricity of its disc over the radius of its track; error once a revolution; 0: none", "rad"
     )
@@ -36,6 +39,20 @@ class SpindleEncoderParameters(TimeMasterParameters, SpeedLawParameters):
     signal_sine_offset: float = parameter(0.0, "encoder: the same of the sine signal")
     signal_mismatch: float = parameter(0.0, "encoder: by how much the sine is larger than the cosine, as a part of it")
     signal_skew: float = parameter(0.0, "encoder: what the two signals lack of a right angle", "rad")
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Reject two sources of the edges' times."""
+        super().model_post_init(context)
+        if self.edge_clock and self.reads_per_sample > 1:
+            raise InputError(
+                f"reads_per_sample = {self.reads_per_sample} with edge_clock = {self.edge_clock:g} s; allowed: one of "
+                "them (1, or 0), since each gives the times of the edges"
+            )
+
+    @property
+    def edge_resolution(self) -> float:
+        """Resolution of the time of the encoder's last edge [s]; 0: it is not known."""
+        return self.step / self.reads_per_sample if self.reads_per_sample > 1 else self.edge_clock
 
     def errors(self, node: str) -> EncoderErrors:
         """Return the encoder errors of a node.
@@ -80,7 +97,8 @@ class SpindleEncoder(TimeMaster):
         self._check_end()
         self.place_triggers()
         counts, window = parameters.counts_per_revolution, parameters.speed_window
-        self._encoder = Encoder(self._law, parameters.step, counts, window, parameters.errors(name))
+        errors, clock = parameters.errors(name), parameters.edge_resolution
+        self._encoder = Encoder(self._law, parameters.step, counts, window, errors, clock)
         loads = self._loads()
         outputs = [Output("encoder", messages.ENCODER, Joint("angle", "speed"))]
         self.declare(inputs=loads, outputs=outputs, tells=bool(loads))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Supervisor of the cell: monitors and requested reactions, which nodes read as feedback with a declared delay."""
+"""Supervisor of the cell: monitors, and requested reactions, which nodes read as feedback with a declared delay."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,12 +40,12 @@ from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 Asked = Literal["warn", "freeze", "fall_back", "hold", "retract", "stop"]
 
-#: by name, those of other packages: ours have thresholds of their own
+#: third-party monitors, by name; built-in monitors have thresholds of their own
 MONITORS: Registry[PlainMonitor] = Registry("monitor", PlainMonitor, {}, "lathe_rc.monitors")
 
 
 class SupervisorParameters(NodeParameters):
-    """Thresholds of the monitors, 0 for a monitor that is off, and the reactions requested above them."""
+    """Thresholds of the monitors (0 disables a monitor), and the reactions requested when a threshold is violated."""
 
     drives: list[str] = parameter(
         [], "drives of the tool that are watched, by the names of their topics; the first takes the tool out"
@@ -116,8 +116,8 @@ class SupervisorParameters(NodeParameters):
     clear_time: NonNegative = parameter(1e-3, "for so long", "s")
 
 
-MEMBERS_LOST = "members_lost"  #: stands for a monitor where the host says that members of the cell are lost
-RESET_REFUSED = "reset refused"  #: the same: while the tool is on its way out, or after a stop
+MEMBERS_LOST = "members_lost"  #: name in place of a monitor's: the host reports that members of the cell are lost
+RESET_REFUSED = "reset refused"  #: likewise: a reset is refused during a retraction or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 _WATCHED = {
     "encoder": messages.ENCODER,
@@ -128,18 +128,18 @@ _WATCHED = {
     "margin": messages.MARGIN,
 }  # topic types by the last component of their names
 
-_STATE, _REACTION, _TOLD = range(3)  # indices into the state of a step
+_STATE, _REACTION, _TOLD = range(3)  # indices into the state of the step function
 _ANSWER = 1  # stop reason: the state changes within the block, or a message is due
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the supervisor.
+    """State of the supervisor's step function.
 
     Attributes:
-        watch: the monitors.
-        clearance: see `lathe_rc.safety.monitors.Clearance`.
-        out: number of the input with the position for the clearance; below 0: none.
-        state: state of the cell, reaction in force, whether there is something to publish.
+        watch: table of the monitors.
+        clearance: state of the `lathe_rc.safety.monitors.Clearance`.
+        out: index of the signal with the position for the clearance check; negative if there is none.
+        state: state of the cell, reaction in force, and whether there is something to publish.
     """
 
     watch: Watch
@@ -150,7 +150,7 @@ class Memory(NamedTuple):
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Monitor one block; with `_ANSWER` the step stops at the end of the block."""
+    """Monitor one block; with `_ANSWER`, the step function stops at the end of the block."""
     state, reaction = outputs
     n = state.size
     if start == n:
@@ -191,7 +191,7 @@ class Supervisor(Stage):
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Watcher] = []
         self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)
-        self._told: list[str] = []  # state changes not caused by monitors since the last sample
+        self._told: list[str] = []  # state changes since the last sample that were not caused by monitors
         self._out = self._reads(f"{parameters.drives[0]}/state", messages.STATE, _SENSOR) if parameters.drives else None
         self._clearance = Clearance(parameters.clear_position, self._samples(parameters.clear_time))
         self._watch_spindle()
@@ -211,7 +211,7 @@ class Supervisor(Stage):
     # ---- monitors -----------------------------------------------------------------------------------
 
     def _reads(self, topic: str, msgtype: str, fields: tuple[str, ...]) -> int:
-        """Return the index of an input, added if missing."""
+        """Return the index of an input, which is added if missing."""
         for place, port in enumerate(self._inputs):
             if port.topic == topic:
                 return place
@@ -222,14 +222,14 @@ class Supervisor(Stage):
         return max(1, round(seconds * self.shared.sample_rate))
 
     def _each(self, name: str, of: Sequence[str]) -> list[tuple[str, float]]:
-        """Return the monitored signals with their limits, for a list of limits that are on."""
+        """Return the monitored signals with their limits, from a list parameter whose zeros disable monitors."""
         limits: list[float] = getattr(self.parameters, name)
         if limits and len(limits) != len(of):
             raise InputError(f"{self.name}.{name} = {limits}; allowed: one for each of {', '.join(of) or 'none'}")
         return [(subject, limit) for subject, limit in zip(of, limits or [0.0] * len(of), strict=True) if limit]
 
     def _reaction(self, name: str, text: str = "") -> Reaction:
-        """Return the reaction that a parameter, or one of its strings, requests."""
+        """Return the reaction requested by a parameter or by one of its strings."""
         asked = Reaction[(text or getattr(self.parameters, name)).upper()]
         if asked >= Reaction.RETRACT and not self.parameters.drives:
             raise InputError(
@@ -241,7 +241,7 @@ class Supervisor(Stage):
     def _watch(
         self, name: str, subject: str, limit: float, rule: Rule, asked: str, signal: Place, other: Place | None = None
     ) -> None:
-        """Add a monitor; ``asked`` is the first word of the parameter with its reaction."""
+        """Add a monitor; ``asked`` is the first word in the name of the parameter with its reaction."""
         reaction = self._reaction(f"{asked}_reaction")
         self.monitors.append(Monitor(name, subject, limit, reaction, rule=rule, signal=signal, other=other))
 
@@ -319,7 +319,7 @@ class Supervisor(Stage):
                 self.monitors.append(Plain(name, subject, limit, reaction, signals=places, make=make))
 
     def _field(self, name: str, text: str) -> tuple[int, str]:
-        """Return the input and field indices for a parameter with TOPIC.FIELD; the input is added or extended."""
+        """Return the input index and the field for a TOPIC.FIELD parameter, adding or extending the input if needed."""
         topic, _, field = text.rpartition(".")
         msgtype = _WATCHED.get(topic.rpartition("/")[2], "")
         known = messages.sample_fields(msgtype) if msgtype else {}
@@ -336,9 +336,9 @@ class Supervisor(Stage):
     # ---- samples ------------------------------------------------------------------------------------
 
     def perform(self, action: str) -> None:
-        """Reset the state; a persistent fault raises its alarm again."""
+        """Reset the state of the cell; a persistent fault raises its alarm again."""
         if self.reaction is Reaction.NONE:
-            return  # no findings since the start or the last reset
+            return  # no alarm since the start or the last reset
         to = state_machine.after(self.state, action)
         if to is not None and self.reaction is not Reaction.STOP:
             self._state[:2] = to, Reaction.NONE
@@ -350,7 +350,7 @@ class Supervisor(Stage):
             self._told.append(RESET_REFUSED)
 
     def go_safe(self) -> None:
-        """Raise an alarm that cannot be reset, after a loss of cell members."""
+        """Raise an alarm that cannot be reset, because cell members are lost."""
         self._told.append(MEMBERS_LOST)
         self._ask_for(Reaction.STOP)
 
@@ -370,13 +370,13 @@ class Supervisor(Stage):
 
     @property
     def reaction(self) -> Reaction:
-        """Supervisor reaction in force."""
+        """Reaction in force."""
         return Reaction(self._state[_REACTION])
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the supervisor."""
-        # Monitors in Python need each block, so the step stops in each.
+        """Current state of the supervisor's step function."""
+        # Monitors in Python need every block, so the step function stops in each of them.
         self._state[_TOLD] = bool(self._told or self._plain)
         return Memory(self._lookout.watch, self._clearance.memory, self._out_number, self._state)
 
@@ -397,7 +397,7 @@ class Supervisor(Stage):
         return sparse
 
     def _found(self, first: int, reached: int, inputs: Sequence[Signals]) -> Sequence[tuple[Watcher, Alarm]]:
-        """Return the alarms in the samples up to ``reached``, by sample."""
+        """Return the alarms in the samples up to ``reached``, in sample order."""
         found: list[tuple[Watcher, Alarm]] = [*self._lookout.found()]
         piece = cut(inputs, 0, reached) if self._plain else ()
         for monitor in self._plain:
@@ -409,7 +409,7 @@ class Supervisor(Stage):
     def _fill(
         self, safety: Signals, inputs: Sequence[Signals], first: int, start: int, stop: int, sparse: list[Sparse]
     ) -> None:
-        """Fill state and reaction of samples without an alarm, and detect the clearance of the tool."""
+        """Fill the state and reaction of samples without an alarm, and detect when the tool has cleared the part."""
         state, reaction = safety["state"][start:stop], safety["reaction"][start:stop]
         if self.state is State.RETRACTING and self._out is not None:
             place = self._clearance.first(inputs[self._out]["measured_position"][start:stop])
@@ -435,7 +435,7 @@ class Supervisor(Stage):
     # ---- checks before a start ----------------------------------------------------------------------
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Check that the tool clears the part wherever a retraction can be requested."""
+        """Check that a requested retraction would clear the part."""
         super().check_cell(cell, cures=cures)
         if self.parameters.drives:
             self._check_obedience(cell)
@@ -478,7 +478,7 @@ class Supervisor(Stage):
         """Check that the requested clearance is within the stroke of the drive."""
         clear = self.parameters.clear_position
         node = cell.node_of(remapped(self.shared, f"{self.parameters.drives[0]}/state"))
-        drive = cell.stages.get(node or "")  # unknown members are already reported for the retraction
+        drive = cell.stages.get(node or "")  # the check of the retraction has already reported unknown members
         for limits in drive.limits().values() if isinstance(drive, Drive) else ():
             if limits.stroke <= clear:
                 raise InputError(

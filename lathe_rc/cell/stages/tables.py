@@ -12,12 +12,12 @@ from lathe_rc.plants.linear import Discretisation
 R = TypeVar("R")
 T = TypeVar("T", bound=NodeParameters)
 
-_DERIVED = ("step", "step_ns", "nominal_speed")  # of every table
+_DERIVED = ("step", "step_ns", "nominal_speed")  # arguments that every table provides
 
 
 @cache
 def _sources(make: Callable[..., Any], table: type[NodeParameters], prefixes: tuple[str, ...]) -> dict[str, str]:
-    """Return the parameter for each argument of ``make`` that the table has."""
+    """Return the name of the parameter for each argument of ``make`` that the table provides."""
     sources = {}
     for name in inspect.signature(make).parameters:
         known = [prefix + name for prefix in (*prefixes, "") if prefix + name in table.model_fields]
@@ -27,7 +27,7 @@ def _sources(make: Callable[..., Any], table: type[NodeParameters], prefixes: tu
 
 
 def made_of(make: Callable[..., R], table: NodeParameters, *prefixes: str, **beside: Any) -> R:
-    """Construct an object whose arguments are parameters of a table, matched by name.
+    """Construct an object from the parameters of a table, matched to arguments by name.
 
     Args:
         make: class of the object, or a factory function.
@@ -40,7 +40,7 @@ def made_of(make: Callable[..., R], table: NodeParameters, *prefixes: str, **bes
 
 
 class ComposedParameters(NodeParameters):
-    """Parameters composed of the tables of several elements, with shared common parameters."""
+    """Parameters combined from the tables of several elements; parameters in common appear only once."""
 
     discretisation: Discretisation = parameter("foh", "foh: exact for commands linear between samples; or tustin")
 

@@ -4,7 +4,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -16,6 +16,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.signals.speed import SpeedLaw
 
 _LEAST_SAMPLES = 4  # per revolution
+_LEAST_CLOCK = 1e-12  # [s]
 
 
 class TimeMasterParameters(NodeParameters):
@@ -23,6 +24,12 @@ class TimeMasterParameters(NodeParameters):
 
     counts_per_revolution: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
         0, "encoder counts per revolution after quadrature; 0: an ideal encoder"
+    )
+    edge_clock: Annotated[float, Ge(0), Le(1)] = parameter(
+        0.0,
+        "resolution of the time stamp of the encoder's last edge, for the angle between two counts; 0: none; not "
+        "used by an ideal encoder",
+        "s",
     )
     speed_window: Annotated[int, Ge(1), Le(65536)] = parameter(
         64, "the measured speed is the angle's difference over so many samples; not used by an ideal encoder", "sample"
@@ -46,9 +53,20 @@ class TimeMasterParameters(NodeParameters):
         [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
     )
 
+    def model_post_init(self, context: Any, /) -> None:
+        """Reject a clock that no time of a run resolves."""
+        super().model_post_init(context)
+        if 0.0 < self.edge_clock < _LEAST_CLOCK:
+            raise InputError(f"edge_clock = {self.edge_clock:g} s; allowed: 0, or from {_LEAST_CLOCK:g} s up to 1 s")
+
+    @property
+    def edge_resolution(self) -> float:
+        """Resolution of the time of the encoder's last edge [s]; 0: it is not known."""
+        return self.edge_clock
+
     def known(self) -> Mapping[str, Value]:
-        """Counts of the encoder, for laws that filter its angle."""
-        return {"encoder_counts": self.counts_per_revolution}
+        """Counts of the encoder and resolution of their edges' times, for laws that filter its angle."""
+        return {"encoder_counts": self.counts_per_revolution, "encoder_edge_clock": self.edge_resolution}
 
 
 class TimeMaster(Stage):

@@ -13,6 +13,7 @@ from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
 from lathe_rc.cell.stages.drive import Drive, Limits
 from lathe_rc.cell.stages.form import Form, FormParameters, FormTable, ProfileStage, evaluate
+from lathe_rc.cell.stages.gauge import Gauge
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
@@ -51,18 +52,18 @@ class ToolParameters(FormParameters):
     judging = frozenset({"tolerance"})
 
     def known(self) -> Mapping[str, Value]:
-        """Form of the part for laws, unless a profile node provides it."""
+        """Form of the part for control laws, unless a profile node provides it."""
         return super().known() if self.reference == "own" else {}
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the tool.
+    """State of the tool's step function.
 
     Attributes:
         form: form of the part; without a table if a profile node provides it.
-        begin: number of the first input of the drives.
+        begin: index of the first input of the drives.
         drives: number of drives, each with a true and a measured position.
-        cross_slide, deflects: whether cross slide and edge deflection follow the drives.
+        cross_slide, deflects: whether inputs of the cross slide and the edge's deflection follow those of the drives.
     """
 
     form: FormTable
@@ -83,7 +84,7 @@ def add_drive(
     known: Samples,
     error: Samples,
 ) -> None:
-    """Add a drive's motion; all [m] and of shape (n,). The first drive, marked by ``begins``, starts the sum.
+    """Add the motion of a drive; all arrays in m, shape (n,). The first drive (``begins``) starts the sum.
 
     The error is Xd - X of the true signals (paper 000, Fig. 1); the known error is the expected form at the measured
     angle minus the measured motions.
@@ -96,7 +97,7 @@ def add_drive(
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
-    """Sum the motions of one block, and compare them with the form."""
+    """Sum the motions of one block, and compare the sum with the form."""
     reference, displacement, error, known, height = outputs
     if memory.form.heights.size:
         evaluate(memory.form, inputs, reference, known, height)
@@ -121,7 +122,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 _ELSEWHERE = FormTable(
-    np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), alike=True, slide=0, feed=0.0, start=0.0, part=0
+    heights=np.empty(0),
+    table=np.empty((0, 0, 0)),
+    told=np.empty((0, 0, 0)),
+    alike=True,
+    slide=0,
+    feed=0.0,
+    start=0.0,
+    part=0,
+    told_heights=np.empty(0),
 )
 
 
@@ -156,7 +165,7 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the form's file, one line each."""
+        """Return the warnings about the file of the form, one line each."""
         return self.form.doubts if self.form else []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
@@ -165,6 +174,9 @@ class Tool(Stage):
         owner = self._form_owner(cell)
         topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
         source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
+        if isinstance(source, Gauge):
+            topic = remapped(source.shared, source.drive_topic)
+            source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
         if owner is None or owner.form is None:
             return
         if isinstance(source, Drive):
@@ -187,10 +199,10 @@ class Tool(Stage):
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the tool stage."""
+        """Current state of the tool's step function."""
         parameters = self.parameters
         form = self.form.table if self.form else _ELSEWHERE
-        # A form has two fields in each of its inputs; a profile node has three.
+        # Each input of a form has two fields; that of a profile node has three.
         begin = 3 if self.form is None else 2 * len(self.form.inputs)
         return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
 

@@ -35,7 +35,7 @@ class Course(NamedTuple):
 
     Attributes:
         values: samples computed in advance.
-        span: sample indices of the first value, and after the last.
+        span: index of the first sample, and of the one after the last.
     """
 
     values: Samples
@@ -88,7 +88,7 @@ class Trajectory:
         self.course = Course(np.empty(MAX_BLOCK), np.zeros(2, np.int64))
 
     def doubts(self, seconds: float) -> list[str]:
-        """Return a one-line warning about a file that begins after the end of a run of ``seconds``."""
+        """Return a one-line warning if a file begins after the end of a run of ``seconds``."""
         if self._kind != "csv" or self._times[0] < seconds:
             return []
         start = f"trajectory_file begins at {self._times[0]:.10g} s, after the end of the run at {seconds:.5g} s"
@@ -107,7 +107,7 @@ class Trajectory:
             fill_reference(first, self._step, set_point)
             return
         if self._kind == "steps" and first * self._step >= self._times[-1]:
-            set_point.fill(self._values[-1])  # the last value, for the rest of the run
+            set_point.fill(self._values[-1])  # the last value, held for the rest of the run
             return
         time = self._step * np.arange(first, first + set_point.size)
         if self._kind == "csv":

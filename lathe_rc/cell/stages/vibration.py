@@ -33,7 +33,7 @@ class VibrationParameters(NodeParameters):
 
 
 class Memory(NamedTuple):
-    """Memory of the step of the vibration source."""
+    """State of the vibration source's step function."""
 
     lines: Samples
     period: float
@@ -65,7 +65,7 @@ class Vibration(Stage):
     def __init__(self, name: str, parameters: VibrationParameters) -> None:
         super().__init__(name, parameters)
         self.parameters = parameters
-        # Random seeds of vibrations differ by their names; the 1 separates each from its own sensor.
+        # The name makes the random seeds of vibrations differ; the 1 makes each differ from that of its own sensor.
         random = np.random.default_rng(np.random.SeedSequence([parameters.seed, zlib.crc32(name.encode()), 1]))
         phase = parameters.line_phase or [0.0] * len(parameters.line_amplitude)
         with about(name, "line_amplitude", "line_frequency", "line_phase"):
@@ -84,12 +84,12 @@ class Vibration(Stage):
                 )
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
-            # The angle itself is not used: the spindle's blocks determine which samples are due.
+            # The angle itself is not used; the spindle's blocks determine which samples are due.
             inputs=[Input("encoder", messages.ENCODER, ("angle",))],
             outputs=[Output("vibration/state", messages.STATE, Joint("position", "velocity"))],
         )
 
     @property
     def memory(self) -> Memory:
-        """Current memory of the step of the vibration source."""
+        """Current state of the vibration source's step function."""
         return Memory(self.lines, self.parameters.step, self._sensors[0].table)

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Design of the learning law of a cell for a drive that is known within a set: laws and filters compared.
+
+For each law, settings on a grid are reduced to those whose drive margin (`lathe_rc.analysis.learning.drive_margin`) is
+large enough with the nominal drive, with the lead that has the largest margin. An even choice of these runs with the
+nominal drive. The setting with the smallest error that keeps the margin with every drive of the set then runs with each
+of them.
+"""
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.analysis.learning import DriveMargin, Response
+from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell import batch
+from lathe_rc.cell.parameters import SharedParameters, Value
+from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import Learner, Loop, lag
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
+from lathe_rc.messages import Signals
+
+Values = Mapping[str, Value]
+
+_LEADS = np.linspace(0.5, 1.3, 9)  # over the lag that the correction leaves
+_GAINS = (1.0, 0.5)
+_BANDS = np.geomspace(1000.0, 20_000.0, 18)  # [rad/s] of a flat Q
+_SHAPES = ((2.5, 1e-4), (1.7, 1e-4), (1.4, 1e-3))  # begin of its stop band over the end of its pass band, and ripple
+_WIDTHS = np.geomspace(20e-6, 1e-3, 10)  # [s] q_time of the other ones
+_WAVES = (5.0, 8.0, 12.0, 20.0, 35.0, 60.0)  # of the disturbance law
+_LEARNING, _OBSERVERS = (1000.0, 3000.0, 8000.0), (0.0, 500.0, 2000.0, 4000.0)  # [rad/s]
+_RUNS = 12  # settings of a law that are run
+#: parameters of the replaced controller that its law keeps
+_COMMON = {"feedback_delay", "reaction_delay", "retract_velocity", "retract_acceleration", "retract_jerk"}
+
+
+@dataclass(frozen=True)
+class Law:
+    """Law with a filter.
+
+    Attributes:
+        kind: kind of the controller.
+        fixed: parameters that distinguish the law.
+        filters: parameters of its filter, each a choice between robustness and error.
+        leads: whether it has a lead and a gain.
+        inverts: whether its correction removes the lag of the drive's model but for the delay.
+    """
+
+    kind: str
+    fixed: Values
+    filters: Sequence[Values]
+    leads: bool = True
+    inverts: bool = False
+
+    def settings(self, lag: float, delay: float) -> Iterator[Sequence[Values]]:
+        """Yield settings that differ in the lead alone, for a drive of a ``lag`` and ``delay`` [s]."""
+        if not self.leads:
+            yield from ([each] for each in self.filters)
+            return
+        leads = (_LEADS * (max(delay, 0.1 * lag) if self.inverts else lag)).tolist()
+        for each, gain in product(self.filters, _GAINS):
+            yield [{**each, "learning_gain": gain, "lead_time": lead} for lead in leads]
+
+
+_FLAT: list[Values] = [
+    {"q_pass": float(band), "q_stop": float(stop * band), "q_ripple": ripple}
+    for band, (stop, ripple) in product(_BANDS, _SHAPES)
+]
+_SMOOTH: list[Values] = [{"q_time": float(width)} for width in _WIDTHS]
+_INVERSE: Values = {"correction": "second_order_inverse"}
+#: laws by name
+LAWS: Mapping[str, Law] = {
+    "lead, exponential Q": Law("learning_controller", {"q_filter": "exponential"}, _SMOOTH),
+    "lead, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian"}, _SMOOTH),
+    "lead, flat Q": Law("learning_controller", {"q_filter": "fir"}, _FLAT),
+    "inverse, Gaussian Q": Law(
+        "learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, inverts=True
+    ),
+    "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, inverts=True),
+    "disturbance": Law(
+        "disturbance_controller",
+        {"identify": False},
+        [
+            {"learned_waves": waves, "learning_bandwidth": bandwidth, "observer_bandwidth": observer}
+            for waves, bandwidth, observer in product(_WAVES, _LEARNING, _OBSERVERS)
+        ],
+        leads=False,
+    ),
+}  # fmt: skip
+
+
+class Found(NamedTuple):
+    """Result of a run.
+
+    Attributes:
+        largest: largest magnitude of the form error in the last ten revolutions [m]; inf if the run failed.
+        settled: first revolution from which on the error is in tolerance; inf if never.
+        effort: RMS of the effort of the drive [N, V or A].
+    """
+
+    largest: float
+    settled: float
+    effort: float
+
+
+_FAILED = Found(np.inf, np.inf, np.nan)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Law with its best settings.
+
+    Attributes:
+        law: name of the law, see `LAWS`.
+        values: its parameters that differ from the defaults.
+        scenario: the cell with the law; None if no setting has the margin.
+        margin: smallest drive margin over the set of drives; None if no setting has one.
+        nominal: run with the nominal drive.
+        worst: worst of the runs with all drives.
+    """
+
+    law: str
+    values: Values
+    scenario: Scenario | None
+    margin: DriveMargin | None
+    nominal: Found
+    worst: Found
+
+
+def _rank(candidate: Candidate) -> tuple[bool, float, float]:
+    out = not candidate.worst.settled < np.inf
+    margin = 0.0 if out or candidate.margin is None else min(candidate.margin.error, 1.0)
+    return out, -round(margin, 2), candidate.worst.largest
+
+
+class _Keep:
+    """Keeper of form error and effort (see `lathe_rc.cell.batch.Keeper`)."""
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        self._errors = batch.Errors(cell, samples)
+        self._effort = next(topic for topic, source in cell.dense.items() if source.type == messages.STATE)
+        self.heard: Collection[str] = [*self._errors.heard, f"{self._effort}.effort"]
+        self._square, self._samples = 0.0, samples
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Process a chunk of the run, as a sink of the engine."""
+        self._errors.chunk(first, samples, dense, sparse)
+        self._square += float(np.sum(dense[self._effort]["effort"] ** 2))
+
+    def kept(self) -> tuple[FormErrors, float]:
+        """Return the form error of each revolution, and the RMS of the effort."""
+        return self._errors.kept(), math.sqrt(self._square / self._samples)
+
+
+class Design:
+    """Design of the learning law of a cell.
+
+    Args:
+        scenario: cell with form, speeds, sensors, tolerance, and a learning controller that is replaced.
+        drives: parameters of each drive by the names of ``electrodynamic_actuator``; the first drive is the nominal
+            one.
+        margin: drive margin that each drive of the set must leave.
+
+    Attributes:
+        node: name of the learning controller.
+        drives: parameters of each drive, by ``NODE.PARAM``.
+
+    Raises:
+        InputError: the scenario has no tool with a tolerance, or not one learning controller and one drive.
+    """
+
+    def __init__(self, scenario: Scenario, drives: Sequence[Values], margin: float) -> None:
+        self._margin = margin
+        cell = Cell(scenario.nodes)
+        learners = [stage for stage in cell.stages.values() if isinstance(stage, Learner)]
+        if len(learners) != 1:
+            raise InputError(
+                f"design of {scenario.name}: {len(learners)} learning controllers; allowed: a scenario with one"
+            )
+        self.node = learners[0].name
+        learned = learners[0].learned(cell.stages.values())
+        if len(learned) != 1:
+            raise InputError(f"design of {scenario.name}: {self.node} commands {len(learned)} drives; allowed: one")
+        self._drive = learned[0][1]
+        self._tolerance = max(
+            getattr(scenario.nodes[name], "tolerance", 0.0) for name in [*scenario.of_kind("tool"), self.node]
+        )
+        if not self._tolerance:
+            raise InputError(f"design of {scenario.name}: no tolerance; allowed: tool.tolerance above 0")
+        self._scenario = scenario
+        fields = type(self._drive.shared).model_fields
+        prefix = f"{self._drive.name}.{'coarse_' if 'coarse_damping' in fields else ''}"
+        self.drives: list[Values] = [{prefix + name: value for name, value in each.items()} for each in drives]
+        self._nominal = scenario.varied(self.drives[0])
+
+    def candidates(self, watch: Callable[[str], None] = lambda _: None) -> list[Candidate]:
+        """Return each law with its best settings, the best law first; ``watch`` is called with the name of each.
+
+        The best law is in tolerance with every drive and has the largest drive margin. If none is in tolerance, it is
+        the one with the smallest error.
+        """
+        found = []
+        for name in LAWS:
+            watch(name)
+            found.append(self._candidate(name))
+        return sorted(found, key=_rank)
+
+    def _with(self, base: Scenario, law: Law, values: Values) -> Scenario:
+        """Return a scenario with a law in place of its learning controller."""
+        before, table = base.nodes[self.node], TABLES[law.kind]
+        common = table.model_fields.keys() & before.model_fields_set & (_COMMON | SharedParameters.model_fields.keys())
+        kept = {name: getattr(before, name) for name in common}
+        return base.with_node(self.node, table.read(self.node, {**kept, "stage": law.kind, **law.fixed, **values}))
+
+    def _responses(self, drives: Sequence[Values]) -> list[Response]:
+        found: list[Response] = []
+        for values in drives:
+            drive = Cell(self._scenario.varied(values).nodes).stages[self._drive.name]
+            assert isinstance(drive, Drive), "as before"
+            found += drive.responses().values()
+        return found
+
+    def _candidate(self, name: str) -> Candidate:
+        law = LAWS[name]
+        settings = self._settings(law)
+        runs = [(values, self._with(self._nominal, law, values)) for values in settings]
+        results = self._run([scenario for _, scenario in runs])
+        order = sorted(range(len(runs)), key=lambda k: results[k].largest)
+        whole = self._responses(self.drives)
+        for k in order:
+            values, scenario = runs[k]
+            margin = self._loop(scenario, whole).drive_margin()
+            if margin is not None and margin.error >= self._margin:
+                # The law keeps the model of the nominal drive.
+                fixed = scenario.with_models_given()
+                each = self._run([fixed.varied(drive) for drive in self.drives])
+                worst = Found(
+                    max(run.largest for run in each), max(run.settled for run in each), max(run.effort for run in each)
+                )
+                return Candidate(name, {**law.fixed, **values}, scenario, margin, results[k], worst)
+        return Candidate(name, {}, None, None, _FAILED, _FAILED)
+
+    def _settings(self, law: Law) -> list[Values]:
+        """Return the settings to run: an even choice of those with the margin, with the best lead of each."""
+        (response,) = self._responses(self.drives[:1])
+        delay = next((float(value) for name, value in self.drives[0].items() if name.endswith("delay")), 0.0)  # type: ignore[arg-type]
+        kept: list[Values] = []
+        for alike in law.settings(lag(response), delay):
+            tried = [(self._margin_of(law, values, response), values) for values in alike]
+            margin, best = max(tried, key=lambda pair: pair[0])
+            kept += [best] if margin >= self._margin else []
+        chosen = sorted({round(k) for k in np.linspace(0, len(kept) - 1, _RUNS)}) if kept else []
+        return [kept[k] for k in chosen]
+
+    def _margin_of(self, law: Law, values: Values, response: Response) -> float:
+        try:
+            margin = self._loop(self._with(self._nominal, law, values), [response]).drive_margin()
+        except InputError:  # the filter does not fit into the memory
+            return 0.0
+        return margin.error if margin else 0.0
+
+    def _loop(self, scenario: Scenario, responses: Collection[Response]) -> Loop:
+        cell = Cell(scenario.nodes)
+        stage = cell.stages[self.node]
+        assert isinstance(stage, Learner), "a law has taken its place"
+        return Loop(stage, responses, stage.checked_speeds(*cell.speed_range))
+
+    def _run(self, scenarios: Sequence[Scenario]) -> list[Found]:
+        found = []
+        outcomes: Iterator[batch.Outcome[tuple[FormErrors, float]]] = batch.run_many(scenarios, _Keep)
+        for outcome in outcomes:
+            if outcome.kept is None:
+                found.append(_FAILED)
+                continue
+            errors, effort = outcome.kept
+            out = np.flatnonzero(errors.largest > self._tolerance)
+            settled = float(out[-1] + 2) if out.size else 1.0
+            settled = settled if settled <= errors.largest.size else np.inf
+            found.append(Found(float(errors.largest[-LAST:].max()), settled, effort))
+        return found

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command ``lathe design``: learning law for a measured drive, by its margin and the form error of its runs."""
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lathe_rc.commands import options
+from lathe_rc.errors import InputError, LatheError
+
+if TYPE_CHECKING:
+    from lathe_rc.cell.design import Candidate, Values
+
+
+@click.command()
+@options.scenario
+@click.option(
+    "--drive",
+    "measured",
+    type=options.PATH,
+    help="parameters of the drive as lathe fit drive writes them, with the set beside it (FILE.drives.csv)",
+)
+@click.option("--margin", type=click.FloatRange(0, 1), default=0.3, show_default=True, help="least drive margin [1]")
+@options.overrides
+@options.length
+@click.option("-o", "--output", type=options.PATH, help="scenario with the best law; default: SCENARIO-designed.yaml")
+@options.allow_code
+@options.as_json
+def design(
+    scenario: str,
+    measured: Path | None,
+    margin: float,
+    overrides: tuple[str, ...],
+    revolutions: float | None,
+    output: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Find the learning law of a SCENARIO for a measured drive (docs/learning.md).
+
+    Each law runs offline with settings that keep the margin with every drive of the set, in place of the scenario's
+    learning controller.
+    """
+    from lathe_rc import files
+    from lathe_rc.cell.design import Design
+    from lathe_rc.commands import scenario as scenarios
+
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
+    place = output or Path(f"{loaded.name}-designed.yaml")
+    files.check_place("--output", place)
+    drives = _drives(measured) if measured else [{}]
+    made = Design(loaded, drives, margin)
+    found = made.candidates(lambda law: click.echo(law, err=True) if not as_json else None)
+    best = found[0]
+    if best.scenario is not None:
+        with files.replacing(place) as file:
+            file.write(best.scenario.to_yaml(given=True).encode())
+    if as_json:
+        rows = [_summary(each) for each in found]
+        click.echo(json.dumps({"drives": len(drives), "laws": rows, "scenario": str(place) if best.scenario else None}))
+    else:
+        _show(found, len(drives), place, made.node)
+    if best.scenario is None:
+        raise LatheError(f"no law keeps a drive margin of {margin:g}; allowed: a smaller --margin, or another drive")
+
+
+def _drives(path: Path) -> list["Values"]:
+    """Return the parameters of the nominal drive and of each drive of the set.
+
+    Raises:
+        InputError: a file cannot be read, or describes no electrodynamic drive.
+    """
+    from lathe_rc.cell import ros_yaml
+    from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
+    from lathe_rc.sweep import space
+
+    nominal: list[Any] = [values for values in ros_yaml.read(path).values() if values]
+    if len(nominal) != 1:
+        raise InputError(f"{path}: {len(nominal)} nodes; allowed: the one that lathe fit drive writes")
+    beside = path.with_suffix(".drives.csv")
+    found: list[Any] = list(nominal)
+    if beside.exists():
+        of_set = [{target.rpartition(".")[2]: each[target] for target in each} for each in space.given(beside)]
+        found += [each for each in of_set if each != nominal[0]]
+    for values in found:
+        if unknown := sorted(values.keys() - ElectrodynamicActuatorParameters.model_fields.keys()):
+            raise InputError(f"{path}: {unknown[0]}; allowed: parameters of electrodynamic_actuator")
+    return found
+
+
+def _summary(candidate: "Candidate") -> dict[str, Any]:
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    nominal, worst = candidate.nominal, candidate.worst
+    return {
+        "law": candidate.law,
+        "parameters": dict(candidate.values),
+        "drive_margin": candidate.margin._asdict() if candidate.margin else None,
+        "largest_um": {"nominal": finite(nominal.largest * 1e6), "worst": finite(worst.largest * 1e6)},
+        "in_tolerance_from": {"nominal": finite(nominal.settled), "worst": finite(worst.settled)},
+        "effort": {"nominal": finite(nominal.effort), "worst": finite(worst.effort)},
+    }
+
+
+def _show(found: list["Candidate"], drives: int, place: Path, node: str) -> None:
+    from lathe_rc.commands.tables import console, table
+
+    out = console()
+    rows = table("law", "margin", "error [µm]", "worst [µm]", "good from", "effort", left=1)
+    for each in found:
+        if each.margin is None:
+            rows.add_row(each.law, *("-",) * 5)
+            continue
+        rows.add_row(
+            each.law,
+            f"{each.margin.error:.3g}",
+            f"{each.nominal.largest * 1e6:.3g}",
+            f"{each.worst.largest * 1e6:.3g}",
+            f"{each.worst.settled:.0f}" if math.isfinite(each.worst.settled) else "-",
+            f"{each.worst.effort:.3g}",
+        )
+    out.print(rows)
+    out.print(
+        f"error: largest of the last 10 revolutions; margin, worst, good from and effort: worst of {drives} drives"
+    )
+    best = found[0]
+    if best.scenario is not None:
+        for name, value in best.values.items():
+            out.print(f"{node}.{name}: {value:.4g}" if isinstance(value, float) else f"{node}.{name}: {value}")
+        out.print(f"scenario: {place}; lathe run {place}", soft_wrap=True)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Design of the learning law for a measured drive: margins, errors, and the scenario that is written."""
+
+import json
+
+import pytest
+from cells import config
+from click.testing import CliRunner
+
+import lathe_rc
+from lathe_rc.cell import design
+from lathe_rc.cell.design import Design
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.cli import main
+from lathe_rc.errors import InputError
+
+DRIVE = {
+    "natural_frequency": 1036.7, "damping": 0.7, "delay": 0.2e-3,
+    "mode_frequency": [5654.9, 10053.1], "mode_damping": [0.02, 0.02], "mode_participation": [0.02, 0.01],
+}  # fmt: skip
+OTHER = {**DRIVE, "natural_frequency": 1080.0, "mode_frequency": [5400.0, 10300.0], "mode_participation": [0.03, 0.01]}
+FAST = ["nominal_rpm=3000.0", "spindle_encoder.revolutions=30", "learning_controller.feedback_delay=640"]
+FAST += ["spindle_encoder.deviation_amplitude=[0.0]", "electrodynamic_actuator.max_acceleration=1000.0"]
+FAST += ["electrodynamic_actuator.noise_rms=50e-9", "spindle_encoder.counts_per_revolution=4096"]
+
+
+@pytest.fixture
+def few(monkeypatch):
+    laws = {name: design.LAWS[name] for name in ("lead, Gaussian Q", "inverse, Gaussian Q", "disturbance")}
+    laws["disturbance"] = design.Law(
+        "disturbance_controller",
+        {"identify": False},
+        [{"learned_waves": waves, "observer_bandwidth": 0.0} for waves in (8.0, 60.0)],
+        leads=False,
+    )
+    monkeypatch.setattr(design, "LAWS", laws)
+
+
+@pytest.mark.usefixtures("few")
+def test_the_best_law_keeps_the_margin_with_every_drive_and_its_runs_give_the_error_shown():
+    asked = Design(config("piston", *FAST), [DRIVE, OTHER], 0.3)
+    best, second, last = asked.candidates()
+    assert (best.law, second.law, last.law) == ("disturbance", "lead, Gaussian Q", "inverse, Gaussian Q")
+    assert best.worst.largest < second.worst.largest
+    assert last.scenario is None
+    for each in (best, second):
+        found = []
+        for drive in asked.drives:
+            scenario = each.scenario.with_models_given().varied(drive)
+            cell = Cell(scenario.nodes)
+            cell.check()
+            (margin,) = cell.drive_margins.values()
+            assert margin.error >= 0.3
+            found.append((margin.error, lathe_rc.run(scenario).errors.largest[-10:].max()))
+        assert min(found)[0] == pytest.approx(each.margin.error, rel=1e-6)
+        assert max(largest for _, largest in found) == each.worst.largest
+        assert found[0][1] == each.nominal.largest
+
+
+@pytest.mark.usefixtures("few")
+def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    values = "\n".join(f"    {name}: {value}" for name, value in DRIVE.items())
+    (tmp_path / "drive.yaml").write_text(f"/electrodynamic_actuator:\n  ros__parameters:\n{values}\n")
+    names = ",".join(f"electrodynamic_actuator.{name}" for name in OTHER)
+    (tmp_path / "drive.drives.csv").write_text(names + "\n" + ",".join(f'"{value}"' for value in OTHER.values()) + "\n")
+    words = ["design", "piston", "--drive", "drive.yaml", "-o", "mine.yaml", "--json"]
+    done = CliRunner().invoke(main, [*words, *(word for each in FAST for word in ("--set", each))])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert (found["drives"], found["laws"][0]["law"]) == (2, "disturbance")
+    run = lathe_rc.run(lathe_rc.load(tmp_path / "mine.yaml"))
+    assert run.errors.largest[-10:].max() * 1e6 == pytest.approx(found["laws"][0]["largest_um"]["nominal"], rel=1e-12)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(main, ["design", "piston", "--margin", "1", "--revolutions", "2"])
+    assert done.exit_code == 1
+    assert "lathe: no law keeps a drive margin of 1; allowed: a smaller --margin" in done.output
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        (("two_channel",), "design of two_channel: 2 learning controllers; allowed: a scenario with one"),
+        (("piston", "tool.tolerance=0.0"), "design of piston: no tolerance; allowed: tool.tolerance above 0"),
+    ],
+)
+def test_a_cell_that_cannot_be_designed_is_refused(cell, said):
+    with pytest.raises(InputError) as refusal:
+        Design(config(*cell), [{}], 0.3)
+    assert str(refusal.value) == said
+
+
+def test_a_file_of_no_drive_is_refused(tmp_path):
+    path = tmp_path / "drive.yaml"
+    path.write_text("/drive:\n  ros__parameters:\n    stiffness: 1.0\n")
+    done = CliRunner().invoke(main, ["design", "piston", "--drive", str(path)])
+    assert done.exit_code == 2
+    assert f"lathe: {path}: stiffness; allowed: parameters of electrodynamic_actuator" in done.output
