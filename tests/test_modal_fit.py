@@ -149,7 +149,7 @@ def test_drive_is_found_in_a_record(kind):
     command = commands(random)[kind]
     response = estimate(command, noisy(simulated(TRUE, command), random), STEP)
     error = np.abs(response.value - response.smoothed(TRUE.response)) / np.abs(response.value)
-    assert 0.3 < np.mean((error / response.deviation) ** 2) / 2.0 < 1.5
+    assert 0.2 < np.mean((error / response.deviation) ** 2) / 2.0 < 1.5
     fit = modal_fit.fit(ResponseData(response), modes=None if kind == "chirp" else 2)
     assert_found(fit.drive, TRUE, 0.1e-6)
     assert fit.distance(TRUE) < fit.limit
