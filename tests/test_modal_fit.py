@@ -130,6 +130,21 @@ def test_drives_are_found_in_frequency_responses():
     assert drives == fit.drives(32, seed=0) != fit.drives(32, seed=1)
 
 
+def test_modes_are_found_beside_what_the_model_lacks():
+    """A gain 2 % too large, a further lag and noise of 0.5 % at logarithmic frequencies without uncertainty."""
+    random = np.random.default_rng(5)
+    frequency = TURN * np.geomspace(2.0, 3000.0, 400)
+    modes = (TURN * 410.0, TURN * 900.0, TURN * 1600.0), (0.03, 0.02, 0.015), (0.02, 0.012, -0.01)
+    true = ModalDrive(TURN * 165.0, 0.7, 0.32e-3, *modes)
+    value = 1.02 * true.response(frequency) / (1.0 + 1j * frequency / 3e4)
+    value *= 1.0 + 5e-3 * (random.normal(size=400) + 1j * random.normal(size=400))
+    fit = modal_fit.fit(ResponseData(FrequencyResponse(frequency, value)))
+    assert_allclose(fit.drive.mode_frequency, true.mode_frequency, rtol=5e-3)
+    assert_allclose(fit.drive.mode_damping, true.mode_damping, rtol=0.1)
+    assert_allclose(fit.drive.delay, true.delay + 1.0 / 3e4, atol=5e-6)
+    assert fit.model_error == pytest.approx(0.017, rel=0.2)
+
+
 def commands(random):
     """Return a command of each kind by name."""
     time = np.arange(60_000) * STEP

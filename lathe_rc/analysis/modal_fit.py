@@ -30,9 +30,10 @@ COVERED = 0.95  #: confidence of the set of drives
 
 _LONGEST_DELAY = 0.1  # [s], as the drive's parameter allows
 _DAMPINGS = (1e-4, 20.0)
+_MODE_DAMPINGS = (1e-4, 0.3)  # beyond: no resonance, but a substitute for something else that the model lacks
 _LARGEST_SHARE = 10.0  # of a mode
 _PAYS = 10.0  # least gain of BIC for a further mode: strong evidence (Kass and Raftery 1995)
-_AHEAD = 2  # modes beyond the best number that are tried: with one of two missing, a fit may be worse than with none
+_AHEAD = 5  # modes beyond the best number that are tried: with some missing, a fit may be worse than with none
 _COARSE, _FINE = 0.03, 1e-4  # ε while modes are looked for: at first, and at least
 _NEAR, _NEAR_LAG = (0.05, 0.1), 0.05  # of a held drive: logarithms of ω1 and ζ1, and delay over 1/ω1
 _BEYOND = 20.0  # times the highest frequency: place of the mode that stands for those that are still missing
@@ -345,7 +346,7 @@ def _search(
     low, high = data.band
     count = len(start.mode_frequency)
     own = (np.log([low / 3.0, high * 3.0]), np.log(_DAMPINGS), (0.0, _LONGEST_DELAY / MILLI))
-    mode = (np.log([low, high]), np.log(_DAMPINGS), (-_LARGEST_SHARE, _LARGEST_SHARE))
+    mode = (np.log([low, high]), np.log(_MODE_DAMPINGS), (-_LARGEST_SHARE, _LARGEST_SHARE))
     bounds = np.array([*own, *(mode * count)], dtype=np.float64)
     if rest:
         bounds[-EACH : -EACH + 2] = np.log([[0.5 * _BEYOND * high, 2.0 * _BEYOND * high], [0.5, 2.0]])
@@ -510,13 +511,27 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
             (_polish(points, _without_rest(drive)) for drive in tracks.values()), key=lambda pair: pair[1]
         )
         bic.append(_bic(points, further, further_error))
-        pays = bic[-1] < min(bic[:-1]) - _PAYS and data.resolved(further)
+        pays = bic[-1] < min(bic[:-1]) - _PAYS and _certain(points, further, further_error)
         if modes is not None or pays:
             chosen, error = further, further_error
         elif error < _COARSE or count - len(chosen.mode_frequency) >= _AHEAD:
             break
     chosen, error = _polish(data, chosen)
     return ModalFit(chosen, _covariance(data, chosen, error), error, tuple(bic))
+
+
+def _certain(data: Data, drive: ModalDrive, model_error: float) -> bool:
+    """Return whether the points determine each mode: its width, and its participation to a third.
+
+    A mode at the lower end of the band or with the largest damping is a substitute for something else.
+    """
+    try:
+        covariance = _covariance(data, drive, model_error)
+    except InputError:
+        return False
+    uncertain = np.sqrt(np.diag(covariance))[BASE + EACH - 1 :: EACH]
+    inside = all(w > 1.05 * data.band[0] and damping < 0.95 * _MODE_DAMPINGS[1] for w, damping, _ in drive.modes)
+    return inside and data.resolved(drive) and bool(np.all(uncertain < np.abs(drive.mode_participation) / 3.0))
 
 
 def _covariance(data: Data, drive: ModalDrive, model_error: float) -> Array:
