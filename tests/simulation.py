@@ -121,8 +121,8 @@ class Network:
     def forget(self, process: str) -> None:
         """Remove an ended process: its messages in transit may be lost, since they are not repeated."""
         self._history = {key: queue for key, queue in self._history.items() if key[0] != process}
-        gone = {key for key in self._matched if process in key[:2]}
-        self._matched -= {key for key in gone if key[1] == process or self._cell.random.random() < 0.5}
+        gone = sorted(key for key in self._matched if process in key[:2])  # the order of a set differs by process
+        self._matched.difference_update(key for key in gone if key[1] == process or self._cell.random.random() < 0.5)
 
 
 class Process:
@@ -288,7 +288,8 @@ class Process:
         if self.alive and not self.stopped and self.listens and not self.protocol.done:
             self.look()
         if self.alive:
-            self.cell.at(self.cell.now + (0.1 if self.protocol.ready else 0.02), self.tick)
+            rests = self.protocol.ready and self.design.name != self.cell.master
+            self.cell.at(self.cell.now + (0.1 if rests else 0.02), self.tick)
 
     def _step(self) -> None:
         self._perform_all()
@@ -699,6 +700,9 @@ class Schedule:
     def _slow(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
             process.cost = min(seconds, 0.02)
+            messages_per_report = (len(design.inputs) + 1) * process.protocol.progress_step
+            if self.cell.stalls == "safe" and process.cost * messages_per_report > 0.2:
+                self.cell.culprits.add(design.name)  # it reports nothing for longer than ``stall_time``
 
     def _pause(self, design: Design, seconds: float, other: Design) -> None:
         """Deactivate a node, and activate it again."""
@@ -752,11 +756,12 @@ class Schedule:
 
     def _shutdown(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
-            if process.protocol.phase in (None, 0):
-                return
             self._blame(design)
             process.protocol.shut_down(self.cell.now)
             process._step()
+            if not self._running():
+                self.cell.killed[design.name] = self.cell.now
+                self.cell.at(self.cell.now + 1.2 + min(seconds, 0.5), partial(self._launch, design))
 
     def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
@@ -815,13 +820,14 @@ def violations(cell: Simulation) -> list[str]:
 
 
 def _waits_for_another(process: Process) -> bool:
-    """Return True if a process has lost its time master, or is a second node of one name, which no cell waits for.
+    """Return True if a process has lost its time master, or is a second node of one name, or waits for such a master.
 
     Such a process reports this; an operator ends it, or starts another time master.
     """
-    master = process.protocol.master
+    master, cell = process.protocol.master, process.cell
     named = master is not None and process.design.name in master.members
-    return process.namesake or not (named or process.cell.process_of(process.cell.master))
+    masters = [each for each in cell.processes.values() if each.design.name == cell.master]
+    return process.namesake or (all(each.namesake for each in masters) if masters else not named)
 
 
 def play(seed: int) -> tuple[Simulation, list[str]]:

@@ -120,6 +120,7 @@ class MemberProtocol:
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))
         else:
+            self._leave_before_the_run()
             self._leave_due = now + _LAST_ANSWER
         self.active = False
 
@@ -127,10 +128,14 @@ class MemberProtocol:
         """Handle a signal that ends the node's process."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
-        elif self._started and not (self.over or self.failure or self.done):
+        elif not (self.over or self.failure or self.done):
+            self._leave_before_the_run()
+            self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
+
+    def _leave_before_the_run(self) -> None:
+        """Announce that the cell must not begin without this member."""
+        if not (self.over or self.failure or self.done):
             self.clean_up()
-            if self.master is not None:
-                self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
 
     # ---- announcements ------------------------------------------------------------------------------
 
@@ -173,7 +178,7 @@ class MemberProtocol:
         if member.name == self.own.name:
             self._meet_namesake(member)
             return
-        self.members[member.name] = member
+        known, self.members[member.name] = self.members.get(member.name), member
         if member.members:
             self._hear_master(member, now)
         self.actions.append(do.Follow(member, bool(member.members or self.own.members)))
@@ -182,6 +187,8 @@ class MemberProtocol:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
         if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
             self.member_failed(member, now)
+        elif known and known.process == member.process and known.state > member.state == MemberState.JOINING:
+            self.member_left(member, now)
         self.actions.append(do.MembersChanged())
         self.members_changed(now)
 
@@ -250,7 +257,8 @@ class MemberProtocol:
         if self.failure or self.done:
             return
         if self.ready or (other.state not in established and self.own.process < other.process):
-            self.announce()
+            if other.state not in established:  # an established namesake would answer in turn, without end
+                self.announce()
             why = f"this node, process {self.own.pid}, has that name"
             raise ForeignMessage("members", other.name, other.run_id, why)
         place = f"process {other.pid}" + ("" if other.host == self.own.host else " of another machine")
@@ -265,6 +273,9 @@ class MemberProtocol:
         """Handle the failure of a member; once the cell may be running, the time master decides on the reaction."""
         if not self.ready:
             self.abandon(member)
+
+    def member_left(self, member: Announcement, now: float) -> None:
+        """Handle a member that was ready and is not any more; only a time master does."""
 
     def abandon(self, member: Announcement) -> None:
         """Fail because another member has failed."""
@@ -416,7 +427,9 @@ class MemberProtocol:
     # ---- time ---------------------------------------------------------------------------------------
 
     def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
-        """Do the periodic work; called at least ten times a second, and when a member becomes silent.
+        """Do the periodic work; called ten times a second, by a time master more often than `SILENCE`.
+
+        A member that becomes silent is a reason for a further call.
 
         Args:
             now: monotonic time [s].
