@@ -49,13 +49,13 @@ HOSTS = {
 def test_host_block_size_window_pace_and_grouping_change_no_bit(offline, mode, overrides, groups):
     result = harness.run(piston(*overrides), mode=mode, groups=groups)
     assert result.digest == offline
-    assert "spindle_encoder.speed_factor=1.0" not in overrides or result.real_time_factor <= 1.0
+    paced = "spindle_encoder.speed_factor=1.0" in overrides
+    assert (result.lateness is not None) == paced
+    assert not paced or result.real_time_factor <= 1.0
 
 
-# The largest window is longer than the run: nobody waits, and still the stopped one is named before the end.
-@pytest.mark.parametrize(("nodes", "window"), [(["tool", "recorder", "spindle_encoder"], 64), (["tool"], 4096)])
-def test_a_stopped_process_changes_no_bit(offline, nodes, window, tmp_path):
-    stopped = piston("spindle_encoder.speed_factor=0.2", f"window={window}")
+def test_a_stopped_process_changes_no_bit(offline, tmp_path):
+    nodes, stopped = ["tool", "recorder", "spindle_encoder"], piston("spindle_encoder.speed_factor=0.2")
     cell = harness.with_recorder(stopped, tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         seen = Seen(processes)

@@ -14,7 +14,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from cells import STEP, Seen, block, held, scenario
 from diagnostic_msgs.msg import DiagnosticArray
-from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, SafetyStatus, ToolBlock
+from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
 from mcap.reader import make_reader
 from rclpy.executors import SingleThreadedExecutor
 from rosbags.highlevel import AnyReader
@@ -202,15 +202,23 @@ def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishe
 
 
 @pytest.mark.parametrize(
-    ("bad", "words"),
+    ("topic", "bad", "words"),
     [
-        (block(messages.TOOL, 0, "/tool", "test", step=20_000), "/tool: /tool has a step of 20000 ns; expected 15625"),
-        (uneven(messages.TOOL, "/tool", "test"), r"/tool: /tool sends arrays of \[1, 64\] samples in one block"),
+        (
+            "/tool",
+            uneven(messages.TOOL, "/tool", "test"),
+            r"/tool: /tool sends arrays of \[1, 64\] samples in one block",
+        ),
+        (
+            "/progress",
+            Progress(run_id="test", name="/tool", blocks=2**40),
+            rf"/tool claims {2**40} blocks; \d+ were sent",
+        ),
     ],
 )
-def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, bad, words):
+def test_a_member_that_goes_wrong_makes_the_cell_safe(ghost, domain, tmp_path, topic, bad, words):
     cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
-    publisher = ghost.create_publisher(ToolBlock, "/tool", latched_qos(10))
+    publisher = ghost.create_publisher(ToolBlock if topic == "/tool" else Progress, topic, latched_qos(10))
 
     def watch(event):
         if event["event"] == "cycle" and not sent:
@@ -229,25 +237,3 @@ def test_nobody_listens_for_lost_messages():
     events = CellNode.subscription_events(SimpleNamespace(), "/encoder")
     assert events.incompatible_qos is not None
     assert events.message_lost is None
-
-
-def test_who_comes_late_learns_the_state_of_the_cell_and_its_members(ghost, domain, tmp_path):
-    """A late node receives the state of the cell and the announcements of its members."""
-    watched = {"error_limit": 1e-12, "error_after": 0.0, "error_reaction": "warn"}
-    slow = scenario(spindle_encoder={"revolutions": 1000.0, "speed_factor": 0.1}, supervisor=watched)
-    cell = harness.with_recorder(slow, tmp_path / "bag", keep=True)
-    heard = {}
-    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
-        processes.wait_for("progress")
-        ghost.create_subscription(CellState, "/cell_state", lambda told: heard.update(state=told), latched_qos(1))
-        ghost.create_subscription(Member, "/members", lambda told: heard.update({told.name: told}), latched_qos(256))
-        ghost.create_subscription(SafetyStatus, "/safety/status", lambda told: heard.update(alarm=told), latched_qos(1))
-        executor = SingleThreadedExecutor()
-        executor.add_node(ghost)
-        while len(heard) < 2 + len(cell.nodes):
-            executor.spin_once(timeout_sec=1.0)
-        executor.shutdown()
-    assert (heard["state"].run_id, heard["state"].state) == ("test", CellState.RUNNING)
-    assert (heard["alarm"].source, heard["alarm"].monitor, heard["alarm"].subject) == ("/supervisor", "error", "tool")
-    assert {name for name in heard if name not in ("state", "alarm")} == {f"/{name}" for name in cell.nodes}
-    assert all(heard[f"/{name}"].state == Member.READY for name in cell.nodes)

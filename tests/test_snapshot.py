@@ -7,6 +7,7 @@ import os
 import signal
 from pathlib import Path
 
+import leading
 import numpy as np
 import pytest
 import rclpy
@@ -32,6 +33,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import START_NS
+from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.view.report import losses
 from lathe_rc.view.report_gather import gather
 
@@ -244,11 +246,12 @@ def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(ghost, domai
     assert span(left, 0, last) == span(expected, found["first_sample"], last)
 
 
-def test_service_says_why_there_is_no_snapshot(ghost, domain, tmp_path):
-    complete = harness.with_recorder(cell([], 0.0, 1.0), tmp_path / "bag", keep=True)
-    with harness.Processes(complete, [list(complete.nodes)], domain=domain) as processes:
-        processes.wait_for("cycle")
-        assert ask(ghost) == (False, "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both")
+def test_service_says_why_there_is_no_snapshot(tmp_path):
+    with leading.configured("recorder", RecorderRole, bag=str(tmp_path / "bag")) as node:
+        found = node.role._on_snapshot(Trigger.Request(), Trigger.Response())
+        node.role.clean_up()
+    assert not found.success
+    assert found.message == "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both"
 
 
 @pytest.mark.parametrize("node", ["tool", "recorder"])
