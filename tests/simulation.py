@@ -32,6 +32,7 @@ from lathe_rc.protocol import (
 SIZE = 4  # samples in a block
 HOST = "here"
 LEASE = 0.08  # [s] of DDS's liveliness
+RESTART_TIME = 1.0  # [s] that the cell waits for another process of a member
 HORIZON = 60.0  # [s] of simulated wall time after which a member that is still there hangs
 
 
@@ -172,7 +173,7 @@ class Process:
         masters = ("spindle_encoder",)
         self.protocol: MemberProtocol
         if is_master:
-            reactions = Reactions(cell.stalls, 0.5, 1.0, cell.safe_blocks * SIZE, SIZE)
+            reactions = Reactions(cell.stalls, 0.5, RESTART_TIME, cell.safe_blocks * SIZE, SIZE)
             self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters)
             self.protocol.know_end(cell.length * SIZE)
         else:
@@ -806,6 +807,7 @@ def violations(cell: Simulation) -> list[str]:
     to_blame = cell.culprits | cell.killed.keys()
     if not lost <= to_blame:
         found.append(f"lost {sorted(lost)}; {sorted(to_blame)} are to blame")
+    found += [f"{name} was not waited for" for name in _lost_too_early(cell)]
     if not cell.culprits and not lost:
         found += [f"{p.identity}: {p.protocol.failure}" for p in everyone if p.protocol.exit_code]
         recorders = [p for p in everyone if p.design.records and p.blocks == cell.length]
@@ -817,6 +819,22 @@ def violations(cell: Simulation) -> list[str]:
     if causes and not any(name in text for name in to_blame for text in causes):
         found.append(f"none of {causes} names {sorted(to_blame)}")
     return found
+
+
+def _lost_too_early(cell: Simulation) -> Iterator[str]:
+    """Yield the members that were lost alone and dead, although another process of them could still come."""
+    died: dict[str, float] = {}
+    lost: set[str] = set()
+    for time, _, event, values in cell.reports:
+        if event == "dead" and values["restarts"]:
+            died[values["member"]] = time
+        if event == "safe":
+            new, lost = set(values["lost"]) - lost, set(values["lost"])
+            yield from (
+                name
+                for name in new
+                if len(new) == 1 and f"{name} died" in values["why"] and time - died.get(name, -1.0) < RESTART_TIME
+            )
 
 
 def _waits_for_another(process: Process) -> bool:

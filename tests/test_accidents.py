@@ -64,7 +64,7 @@ def refuses(event, text):
 
 
 def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_path):
-    """A default publisher, a namesake, a second spindle, a late recorder and a deaf listener that dies change no bit.
+    """Listeners, deaf ones too, a default publisher, a namesake, a late recorder and a second spindle change no bit.
 
     The newcomers refuse themselves in one line; a late reader learns the state of the cell and its members.
     """
@@ -73,16 +73,19 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
     full = 2 * signal_depth(cell.shared) * cell.shared.block_size  # more samples than a queue holds
     manager, heard = Manager(ghost), {}
-    deaf = [sys.executable, "-c", DEAF]
+    deaf, blocks = [sys.executable, "-c", DEAF], []
+    ear = ghost.create_subscription(ToolBlock, "/tool", blocks.append, 10)
     with held(recorded, domain) as (processes, begin), subprocess.Popen(deaf, stdout=subprocess.PIPE) as listener:
         manager.processes, seen = processes, Seen(processes)
         assert listener.stdout.readline() == b"matched\n"
+        while not ear.get_publisher_count():
+            pass
         assert not manager.change("electrodynamic_actuator", Transition.TRANSITION_ACTIVATE), "from now on it answers"
         begin()
         seen.until(lambda events: any(each.get("samples", 0) > full for each in events if each["event"] == "progress"))
         listener.kill()
         assert manager.change("electrodynamic_actuator", Transition.TRANSITION_DEACTIVATE)  # the cell waits for it
-        ghost.create_publisher(ToolBlock, "/tool", 10)
+        ghost.create_publisher(ToolBlock, "/tool", 10)  # as ``ros2 topic pub`` does
         newcomers = beside(recorded, tmp_path / "late")
         with harness.Processes(newcomers, [[name] for name in REFUSED], domain=domain) as others:
             said, events = {}, others.events(60.0)
@@ -96,7 +99,7 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
         ghost.create_subscription(SafetyStatus, "/safety/status", lambda told: heard.update(alarm=told), latched_qos(1))
         executor = SingleThreadedExecutor()
         executor.add_node(ghost)
-        while not heard.keys() >= {"state", "alarm", *(f"/{name}" for name in recorded.nodes)}:
+        while not (blocks and heard.keys() >= {"state", "alarm", *(f"/{name}" for name in recorded.nodes)}):
             executor.spin_once(timeout_sec=1.0)
         executor.shutdown()
         assert manager.change("electrodynamic_actuator", Transition.TRANSITION_ACTIVATE)

@@ -4,23 +4,26 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import told_until_all_have_ended
+import rclpy
+from cells import refusals, told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, messages, process_launcher
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import process
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.report import Reporter
 
 CONFIG = Path(__file__).parents[1] / "config"
 PISTON = CONFIG / "piston.yaml"
@@ -221,59 +224,49 @@ def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
         assert not closed["complete"]
 
 
-@pytest.mark.parametrize(
-    ("node", "arguments", "expected"),
-    [
-        ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
-        ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
-        ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
-        ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
-        ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
-        ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
-        (
-            "tool",
-            ["-p", "tool:profile:=polygon", "--params-file", str(PISTON)],
-            "does not reach /tool, which has 'csv'",
-        ),
-    ],
+BAD = (  #: node, ROS arguments, and what is said of them
+    ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
+    ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
+    ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
+    ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
+    ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
+    ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
+    ("tool", ["-p", "tool:profile:=polygon", "--params-file", PISTON], "does not reach /tool, which has 'csv'"),
 )
-def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expected, domain, tmp_path):
-    log = tmp_path / "said"
-    ours, theirs = socket.socketpair()
-    with ours, theirs, log.open("wb") as file:
-        child = process_launcher.server().start(
-            [node, "--ros-args", *arguments],
-            environment=os.environ | {"ROS_LOG_DIR": str(tmp_path)},
-            report=theirs,
-            log=file.fileno(),
-        )
-        code = child.wait(60.0)
-    said = log.read_text(encoding="utf-8")
-    assert code == 2, said
-    assert expected in said
-    assert "Traceback" not in said
 
 
-def test_the_command_ends_with_the_exit_code_of_its_node(domain, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "lathe_rc", "node", "tool", "--ros-args", "-p", "feed:=-1.0"],
-        env=os.environ | {"ROS_LOG_DIR": str(tmp_path)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2, done.stderr
-    assert "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_node_alone_refuses_bad_parameters_in_one_line(domain, monkeypatch, tmp_path):
+    """And its command ends with exit code 2."""
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    told = refusals(*(["node", node, "--ros-args", *arguments] for node, arguments, _ in BAD))
+    for (code, said), (node, arguments, expected) in zip(told, BAD, strict=True):
+        assert code == 2, (node, arguments, said)
+        assert expected in said
+        assert "Traceback" not in said
 
 
-def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
-    """The time master makes the checks before the start with the announced parameters.
-
-    Without the harness's check, as under ros2 launch: the time master checks what its members announce.
-    """
-    scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
-    cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
-    diverges = pytest.raises(InputError, match=r"learning diverges with electrodynamic_actuator: sup\|Q - Z\|")
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes, diverges:
-        processes.wait_for_end()
+def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(domain, tmp_path):
+    """The time master makes the checks before the start with the announced parameters: also without the harness."""
+    cell = harness.with_recorder(load(PISTON, ["learning_controller.q_time=10e-6"]), tmp_path / "bag", keep=True)
+    file = tmp_path / "cell.yaml"
+    file.write_text(cell.to_yaml(), encoding="utf-8")
+    rclpy.init(args=["test", "--ros-args", "--params-file", str(file)])
+    try:
+        nodes = {name: process._make(name, cell.kind(name), Reporter(), Exchange()) for name in NODES}
+        for node in nodes.values():
+            node.trigger_configure()
+        spindle = nodes["spindle_encoder"]
+        spindle.trigger_activate()
+        for name in NODES[1:]:
+            spindle.protocol.hear_member(nodes[name].protocol.own, 0.0)
+        spindle.attempt(spindle.role._check_cell)
+        nodes["recorder"].role.clean_up()
+        for node in nodes.values():
+            node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert isinstance(spindle.protocol.failure, InputError)
+    assert "learning diverges with electrodynamic_actuator: sup|Q - Z|" in str(spindle.protocol.failure)
 
 
 def test_an_existing_bag_is_refused_before_anything_starts(tmp_path):

@@ -389,12 +389,17 @@ def test_what_cannot_work_is_refused(tmp_path, kind, mode):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("mode", ["offline", "composed"])
-def test_existing_snapshots_are_never_overwritten(tmp_path, mode):
+@pytest.mark.parametrize("is_node", [False, True])
+def test_existing_snapshots_are_never_overwritten(tmp_path, is_node):
     (tmp_path / "bag_snapshots").mkdir()
     (tmp_path / "bag_snapshots" / "precious").write_text("data")
-    with pytest.raises(InputError, match="bag_snapshots exists; a bag is never overwritten"):
-        harness.run(cell(mode="snapshot"), mode=mode, bag=tmp_path / "bag")
+    why = "bag_snapshots exists; a bag is never overwritten"
+    if is_node:
+        with leading.configured("recorder", RecorderRole, bag=str(tmp_path / "bag"), mode="snapshot") as node:
+            assert why in str(node.protocol.failure)
+    else:
+        with pytest.raises(InputError, match=why):
+            harness.run(cell(mode="snapshot"), bag=tmp_path / "bag")
     assert [path.name for path in (tmp_path / "bag_snapshots").iterdir()] == ["precious"]
 
 
