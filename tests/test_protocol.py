@@ -2,6 +2,7 @@
 """The protocol of a cell without ROS: simulated cells under thousands of schedules, and single rules."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -257,6 +258,17 @@ def test_the_newcomer_of_two_namesakes_gives_up_and_names_the_other(tool):
     assert tool.done
     announced = [action.member.state for action in tool.actions if isinstance(action, actions.Announce)]
     assert MemberState.FAILED not in announced  # the others would take it for the failure of the established one
+
+
+def test_a_newcomer_in_a_running_cell_waits_for_its_namesake_to_be_heard(tool):
+    """It cannot go on in mid-run in any case: after a second it says that, and names nobody."""
+    for name in ("/drive", "/recorder"):
+        tool.hear_member(member(name, MemberState.READY), 100.0)
+    tool.hear_member(replace(SPINDLE, state=MemberState.READY), 100.0)
+    tool.hear_cell_state(CellState("", Phase.RUNNING, 0), 100.0)
+    for now, wants in ((100.9, False), (101.1, True)):
+        tool.look(now, {}, ())
+        assert tool.wants_match == wants
 
 
 def test_an_established_member_refuses_its_namesake(tool):

@@ -21,6 +21,7 @@ SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node co
 GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
 PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
+_NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
 _MOST_MEMBERS = 256  # largest number of announced names
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
@@ -84,8 +85,8 @@ class MemberProtocol:
         self._reported_blocks = 0
         self._moved = 0.0  # time of the last block that this member completed
         self._master_stalls = False
-        self._repeat_due = 0.0
-        self._leave_due = self._wait_report_due = math.inf
+        self._repeat_due = self._time = 0.0
+        self._join_due = self._leave_due = self._wait_report_due = math.inf
         self._wait_report_after: Iterator[float] = iter(())
 
     # ---- lifecycle ----------------------------------------------------------------------------------
@@ -313,6 +314,8 @@ class MemberProtocol:
             return False
         if self.phase is None:  # the cell may be running already
             return False
+        if self.phase != Phase.WAITING and self._time < self._join_due:
+            return False
         assert self.master is not None, "the cell is complete"
         return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
 
@@ -403,6 +406,9 @@ class MemberProtocol:
             self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
+        if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
+            # A member that cannot resume gives up, and names its established namesake if there is one.
+            self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
         if self.failure:
             self._leave_with_the_cell()
         elif self.phase == Phase.ENDED and self.over and not self.done:
@@ -436,7 +442,7 @@ class MemberProtocol:
             silent: time since which each silent or stopped member has been so [s].
             ended: members whose process on this machine has ended.
         """
-        self.silent, self.ended, self.look_due = silent, ended, math.inf
+        self.silent, self.ended, self.look_due, self._time = silent, ended, math.inf, now
         if now >= self._leave_due:
             self.leave()
         if not self._started or self.done:
