@@ -2,10 +2,11 @@
 """Package metadata; colcon, pip and the ament index all read it from here."""
 
 import re
+import sys
 from collections import defaultdict
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
 
 # colcon's --symlink-install runs a link to this file from its build folder
 HERE = Path(__file__).resolve().parent
@@ -15,6 +16,39 @@ NODES = [*STAGES, "recorder"]
 PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
 STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
 ALONE = ["container", "replayer", "rerun_bridge", "topic_recorder"]
+EXECUTABLES = {
+    **{name: f"lathe_rc.nodes.executables:{name}" for name in (*NODES, *ALONE)},
+    "launch_plan": "lathe_rc.harness.launch_plan:main",
+}
+#: colcon calls these commands, for which setup.cfg has the folder of the scripts
+OF_COLCON = {"install", "develop"} & {*sys.argv}
+# pip puts scripts on the PATH, where names like `tool` and `profile` do not belong. In lib/lathe_rc, where `ros2 run`
+# finds them, pip writes no first line with the path of its Python: it is beside bin/ of the same environment.
+SCRIPT = """#!/bin/sh
+python="$(dirname "$(readlink -f "$0")")/../../bin/python3"
+[ -x "$python" ] || python=python3
+exec "$python" -c '
+import sys
+sys.argv[0], sys.path[:] = "{name}", filter(None, sys.path)  # not the current folder
+from {module} import {function}
+{function}()
+' "$@"
+"""
+
+
+class InstallData(Distribution().get_command_class("install_data")):
+    """Installation of the data files of a wheel, with the executables of ``ros2 run``."""
+
+    def run(self) -> None:
+        """Install the files, and write the executables."""
+        super().run()
+        folder = Path(self.install_dir) / "lib" / "lathe_rc"
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, place in EXECUTABLES.items():
+            module, _, function = place.partition(":")
+            file = folder / name
+            file.write_text(SCRIPT.format(module=module, function=function, name=name), encoding="utf-8")
+            file.chmod(0o755)
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
@@ -64,16 +98,18 @@ setup(
     python_requires=">=3.10",
     install_requires=requirements("runtime"),
     extras_require={
-        **{name: requirements(name) for name in ("formats", "notebook", "sweep", "view")},
+        # `colcon test` runs pytest if the extra `test` asks for it, and else no test at all
+        **{name: requirements(name) for name in ("formats", "notebook", "sweep", "test", "view")},
         # pip builds the messages from their sdist, see msg_defs/pyproject.toml
         "ros": [*requirements("ros"), f"lathe_rc_msgs=={VERSION}"],
     },
     entry_points={
         "console_scripts": [
             "lathe = lathe_rc.cli:main",
-            *(f"{node} = lathe_rc.nodes.executables:{node}" for node in (*NODES, *ALONE)),
+            *(f"{name} = {place}" for name, place in EXECUTABLES.items() if OF_COLCON),
         ],
         "lathe_rc.studies": [f"{study.replace('_', '-')} = lathe_papers.{study}:STUDY" for study in STUDIES],
     },
+    cmdclass={} if OF_COLCON else {"install_data": InstallData},
     zip_safe=False,
 )

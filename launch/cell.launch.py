@@ -6,12 +6,18 @@
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
 others, and the launch fails.
+
+This file imports launch and launch_ros alone, since ``ros2`` runs the system's Python: the executable ``launch_plan``
+of lathe_rc checks the scenario and says which processes it has.
 """
 
 import atexit
+import json
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
@@ -19,30 +25,25 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-
-from lathe_rc import allowed_code, harness, resources
-from lathe_rc.bag.writing.writer import refuse_existing
-from lathe_rc.cell import ros_yaml
-from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError
-from lathe_rc.names import absolute, checked_namespace
+from launch_ros.substitutions import ExecutableInPackage
+from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 ARGUMENTS = {
     "scenario": (
-        str(resources.find(Path("piston.yaml"))),
+        "piston.yaml",
         "ROS 2 parameter file of the cell; NODE.PARAM:=VALUE, or PARAM:=VALUE if shared, replaces one of its values",
     ),
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
-    "namespace": ("/", "of the nodes; two cells in one domain need one each"),
+    "namespace": ("", "of the nodes, in the one that an including file has pushed; two cells in one domain need two"),
     "allow_code": ("", "package of the current folder that the scenario names code of"),
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
+PUSHED = "ros_namespace"  # configuration in which launch_ros keeps what PushRosNamespace has set
 PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
-MOST_NAMES = 3  # in the label of a process, which stands before each line that it writes
+
+
+class CellError(RuntimeError):
+    """Reason why the launch fails."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -55,41 +56,54 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """Make the nodes of the scenario that the launch arguments name.
+    """Make the processes of the scenario that the launch arguments name.
 
     Raises:
-        InputError: the scenario cannot work, the bag's folder exists, or there is no such argument.
+        CellError: the scenario cannot work, the bag's folder exists, or there is no such argument.
     """
-    refuse_unknown(given_to_this_file(context))
-    if package := LaunchConfiguration("allow_code").perform(context):
-        allowed_code.allow(package)
-    path = resources.find(Path(LaunchConfiguration("scenario").perform(context)))
-    scenario = replaced(scenarios.load(path), context.launch_configurations.items())
-    Cell(scenario.nodes).check()
-    namespace = checked_namespace(LaunchConfiguration("namespace").perform(context))
-    bag = place(scenario, LaunchConfiguration("bag").perform(context))
-    refuse_existing(bag)
-    complete = harness.with_recorder(scenario, bag, keep=True)
-    file = Path(tempfile.mkdtemp(prefix="lathe_")) / "scenario.yaml"
-    file.write_text(complete.to_yaml(), encoding="utf-8")
-    atexit.register(shutil.rmtree, file.parent, ignore_errors=True)
-    groups = complete.processes()
-    restartable = any(getattr(table, "restart_file", "") for table in complete.nodes.values())
-    ends = Ends(len(groups), replaced=restartable)
+    folder = tempfile.mkdtemp(prefix="lathe_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    found = plan(context, folder)
+    ends = Ends(len(found["processes"]), replaced=found["restarts"])
     return [
         Node(
             package="lathe_rc",
             executable="container",
-            exec_name=label(group),
-            namespace=namespace,
-            arguments=[*allowed_code.arguments(), *(f"{name}:{complete.kind(name)}" for name in group)],
-            parameters=[str(file)],
-            ros_arguments=["--enclave", absolute(namespace, group[0])],
+            exec_name=process["label"],
+            namespace=found["namespace"],
+            arguments=process["arguments"],
+            parameters=[found["file"]],
+            ros_arguments=["--enclave", process["enclave"]],
             output="screen",
             on_exit=ends,
         )
-        for group in groups
+        for process in found["processes"]
     ]
+
+
+def plan(context: LaunchContext, folder: str) -> dict:
+    """Ask lathe_rc for the processes of the scenario.
+
+    Raises:
+        CellError: see `nodes`.
+    """
+    asked = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    configurations = dict(context.launch_configurations)
+    asked["namespace"] = make_namespace_absolute(
+        prefix_namespace(configurations.get(PUSHED), asked["namespace"] or None) or "/"
+    )
+    asked |= {
+        "arguments": configurations,
+        "given": given_to_this_file(context),
+        "own": [*ARGUMENTS, *OF_LAUNCH, PUSHED],
+        "folder": folder,
+    }
+    program = ExecutableInPackage("launch_plan", package="lathe_rc").perform(context)
+    done = subprocess.run([program, json.dumps(asked)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise CellError(done.stderr.strip().removeprefix("lathe: ") or how_it_ended(program, done.returncode))
+    sys.stderr.write(done.stderr)
+    return json.loads(done.stdout)
 
 
 def given_to_this_file(context: LaunchContext) -> list[str]:
@@ -106,45 +120,13 @@ def given_to_this_file(context: LaunchContext) -> list[str]:
     return []
 
 
-def replaces(argument: str) -> bool:
-    """Whether an argument stands for a value of the scenario."""
-    return "." in argument or argument in SharedParameters.model_fields
-
-
-def refuse_unknown(arguments: Iterable[str]) -> None:
-    """Refuse what launch would pass over.
-
-    Raises:
-        InputError: there is no such argument.
-    """
-    for name in arguments:
-        if not (name in ARGUMENTS or name in OF_LAUNCH or replaces(name)):
-            shared = ", ".join(SharedParameters.model_fields)
-            raise InputError(
-                f"no launch argument {name!r}; allowed: {', '.join(ARGUMENTS)}, NODE.PARAM for a value of the "
-                f"scenario, or a shared one: {shared}"
-            )
-
-
-def replaced(scenario: Scenario, arguments: Iterable[tuple[str, str]]) -> Scenario:
-    """The scenario with the values that launch arguments say.
-
-    Raises:
-        InputError: no such node or parameter, or a value that it does not take.
-    """
-    return scenario.varied({name: ros_yaml.parse_value(text, name) for name, text in arguments if replaces(name)})
-
-
-def place(scenario: Scenario, argument: str) -> Path:
-    """Choose the bag's folder: the launch argument, the scenario's own, or one named after the run."""
-    recorders = [table for table in scenario.nodes.values() if isinstance(table, RecorderParameters)]
-    return Path(argument or next((table.bag for table in recorders if table.bag), f"bag_{scenario.shared.run_id}"))
-
-
-def label(group: Sequence[str]) -> str:
-    """What launch calls a process: the nodes in it, the first ones of many."""
-    shown = group if len(group) <= MOST_NAMES else [*group[: MOST_NAMES - 1], f"{len(group) - MOST_NAMES + 1}_more"]
-    return "+".join(shown)
+def how_it_ended(process: str, code: int) -> str:
+    """Describe the end of a process by its return code."""
+    return (
+        f"{process} was killed by {signal.Signals(-code).name}"
+        if code < 0
+        else f"{process} ended with exit code {code}"
+    )
 
 
 class Ends:
@@ -166,11 +148,11 @@ class Ends:
         has begun the others wait for the killed one: they get some time.
 
         Raises:
-            LatheError: see `fail`.
+            CellError: see `fail`.
         """
         self._running -= 1
         if event.returncode and not context.is_shutdown:
-            self._failed.append(harness.how_it_ended({"node": event.process_name, "code": event.returncode}))
+            self._failed.append(how_it_ended(event.process_name, event.returncode))
             if event.returncode > 0:
                 self.fail()
             if self._running and not self._replaced:
@@ -183,9 +165,9 @@ class Ends:
         """Name those that have failed, once.
 
         Raises:
-            LatheError: some have. For launch that is the reason to end the others and to return 1; with a
+            CellError: some have. For launch that is the reason to end the others and to return 1; with a
                 `launch.actions.Shutdown` it would return 0.
         """
         told, self._failed = "; ".join(self._failed), []
         if told:
-            raise LatheError(told)
+            raise CellError(told)

@@ -53,6 +53,13 @@ def test_without_ros_an_executable_says_how_to_get_it(name):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("name", ["tool", "replayer", "topic_recorder"])
+def test_a_namespace_without_its_slash_is_refused(monkeypatch, capsys, name):
+    """The message of rcl is about lexemes."""
+    code, _, said = run(monkeypatch, capsys, name, "--ros-args", "-r", "__ns:=left")
+    assert (code, said) == (2, "lathe: -r __ns:=left: no absolute namespace; write -r __ns:=/left\n")
+
+
 @pytest.mark.parametrize("name", ["tool", *ALONE])
 @pytest.mark.parametrize("words", [["-p", "feed:=1.0"], ["feed:=1.0"], ["recorder", "--ros-args", "-p", "feed:=1.0"]])
 def test_what_ros_would_pass_over_is_refused(monkeypatch, capsys, name, words):
@@ -77,7 +84,15 @@ OWN, SHARED = "/tool: {ros__parameters: {feed: 1.0}}\n", "/**: {ros__parameters:
 
 
 def feed_of(folder, words, file):
-    """The parameters of the node ``tool``, and whether those that it does not get are refused."""
+    """The feed of the node ``tool``, and whether parameters that it does not get are refused."""
+    return with_tool(folder, words, file, lambda node, _: declare.overrides(node).get("feed"))
+
+
+def warning_of(folder, words, file):
+    return with_tool(folder, ["--params-file", "FILE", *words], file, declare.missing_entry)
+
+
+def with_tool(folder, words, file, ask):
     path = folder / "some.yaml"
     path.write_text(file)
     given = ["--ros-args", *(str(path) if word == "FILE" else word for word in words)]
@@ -93,7 +108,7 @@ def feed_of(folder, words, file):
             start_parameter_services=False,
         )
         declare.refuse_lost(node, given)
-        return declare.overrides(node).get("feed")
+        return ask(node, given)
     finally:
         context.try_shutdown()
 
@@ -135,6 +150,45 @@ def test_a_parameter_that_something_else_overrules_is_refused(domain, tmp_path, 
     """ROS keeps quiet about it."""
     with pytest.raises(InputError, match=r"^-p (tool:)?feed:=2\.0 does not reach (/left)?/tool, which " + said):
         feed_of(tmp_path, words, file)
+
+
+@pytest.mark.parametrize("shared", ["", SHARED])
+@pytest.mark.parametrize("place", ["-r __ns:=/left", ""])
+def test_the_values_of_a_later_file_win_or_are_refused(domain, tmp_path, shared, place):
+    """`Node(parameters=[FILE, {...}])` writes the dictionary under /**, which loses to an entry behind a /** above."""
+    later = tmp_path / "launch_params.yaml"
+    own = "/left/tool" if place else "/tool"
+    for entry, reaches in (("/**", not shared), (own, True)):
+        later.write_text(f"{entry}: {{ros__parameters: {{feed: 2.0}}}}\n")
+        words = ["--params-file", "FILE", "--params-file", str(later), *place.split()]
+        file = shared + OWN.replace("/tool", own)
+        if reaches:
+            assert feed_of(tmp_path, words, file) == 2.0
+        else:
+            said = rf"^feed = 2\.0 of {later} does not reach {own}, which has 1\.0 of an earlier file; write it under"
+            with pytest.raises(InputError, match=said):
+                feed_of(tmp_path, words, file)
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "said"),
+    [
+        (
+            OWN,
+            ["-r", "__ns:=/left"],
+            "no entry for /left/tool, which keeps its defaults; /tool: is another node; write",
+        ),
+        (OWN.replace("tool", "tol"), [], "no entry for /tool, which keeps its defaults; did you mean /tol?"),
+        (OWN.replace("/tool", "/**/tool"), ["-r", "__ns:=/left"], ""),
+        (OWN.replace("/tool", "/*/tool"), ["-r", "__ns:=/left"], ""),
+        (SHARED.replace("feed: 3.0", "seed: 3"), [], ""),
+        ("/tool: {ros__parameters: {seed: 3}}", [], ""),
+    ],
+)
+def test_a_node_without_an_entry_in_its_file_is_named(domain, tmp_path, file, words, said):
+    """ROS keeps quiet about that as well: the node would have its defaults."""
+    assert said in (warning := warning_of(tmp_path, words, file))
+    assert bool(warning) == bool(said)
 
 
 def test_a_process_whose_exit_hangs_ends_with_its_code():

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages are true: the reference page, links, the examples of the README, scenarios, the launch file."""
+"""The pages are true: the reference page, links, the examples of the README, scenarios."""
 
 import ast
-import contextlib
 import functools
 import pkgutil
 import re
-import runpy
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pages
@@ -18,19 +14,16 @@ import pytest
 from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
-from lathe_rc.cell import ros_yaml, scenario
 from lathe_rc.cell.host_topics import HOST_TOPICS, HostTopic
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.commands.run import run
-from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import PACKAGE, store
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
 FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
-LAUNCH = ROOT / "launch" / "cell.launch.py"
 
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)
@@ -199,180 +192,3 @@ def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.M
     """The Python of a page runs, all its examples one after the other, and prints what the page shows."""
     monkeypatch.chdir(tmp_path)
     pages.run_python(page, tmp_path)
-
-
-class Action(SimpleNamespace):
-    """An action of launch, replaced: it keeps what it is given."""
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        super().__init__(args=args, **kwargs)
-
-
-class Configuration(Action):
-    """LaunchConfiguration, replaced."""
-
-    def perform(self, context: SimpleNamespace) -> str:
-        return str(context.launch_configurations[self.args[0]])
-
-
-def stand_in(name: str) -> type:
-    """A class of launch by its name."""
-    return Configuration if name == "LaunchConfiguration" else type(name, (Action,), {})
-
-
-@pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The launch file, imported with stand-ins for launch and launch_ros."""
-    packages = ("launch", "launch.actions", "launch.events", "launch.events.process", "launch.substitutions")
-    for package in (*packages, "launch_ros", "launch_ros.actions"):
-        module = ModuleType(package)
-        vars(module).update(__getattr__=stand_in)
-        monkeypatch.setitem(sys.modules, package, module)
-    return SimpleNamespace(**runpy.run_path(str(LAUNCH)))
-
-
-class TestLaunch:
-    @pytest.fixture
-    def start(self, launch_file: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-        """The actions that `ros2 launch` makes of the description, for given arguments.
-
-        ``including``: a file that it was given instead, which includes ours and sets the arguments.
-        """
-        monkeypatch.chdir(tmp_path)
-
-        def run(including: str = "", **given: str) -> list[Any]:
-            *declared, last = launch_file.generate_launch_description().args[0]
-            source = SimpleNamespace(location=including or str(LAUNCH))
-            include = launch_file.IncludeLaunchDescription(
-                launch_description_source=source, launch_arguments=tuple(given.items())
-            )
-            event = SimpleNamespace(launch_description=SimpleNamespace(entities=[include]))
-            configurations = {argument.args[0]: argument.default_value for argument in declared}
-            return last.function(
-                SimpleNamespace(launch_configurations=configurations | given, locals=SimpleNamespace(event=event))
-            )
-
-        return run
-
-    def test_starts_the_five_nodes_with_one_file(self, start: Callable[..., Any], tmp_path: Path) -> None:
-        """Also in a namespace, where the enclaves are as well."""
-        nodes = start(namespace="/left")
-        assert {(tuple(node.arguments), node.namespace, *node.ros_arguments) for node in nodes} == {
-            ((f"{name}:{name}",), "/left", "--enclave", f"/left/{name}") for name in FIVE
-        }
-        assert all((node.package, node.executable) == ("lathe_rc", "container") for node in nodes)
-        assert {node.exec_name for node in nodes} == FIVE
-        (file,) = {parameter for node in nodes for parameter in node.parameters}
-        loaded = scenario.load(Path(file))
-        assert set(loaded.nodes["spindle_encoder"].members) == FIVE - {"spindle_encoder"}
-        assert loaded.nodes["recorder"].bag == str(tmp_path / f"bag_{loaded.shared.run_id}")
-
-    def test_takes_scenario_and_bag(self, start: Callable[..., Any], tmp_path: Path) -> None:
-        path = tmp_path / "cell.yaml"
-        path.write_text(
-            "/spindle: {ros__parameters: {stage: spindle_encoder, revolutions: 2}}\n"
-            + "".join(f"/{kind}: {{ros__parameters: {{}}}}\n" for kind in ("learning_controller", "tool"))
-            + "/electrodynamic_actuator: {ros__parameters: {delay: 0.36e-3}}\n",
-            encoding="utf-8",
-        )
-        nodes = start(scenario=str(path), bag=str(tmp_path / "elsewhere"))
-        assert ["spindle:spindle_encoder"] in [node.arguments for node in nodes]
-        values = ros_yaml.read(Path(nodes[0].parameters[0]))
-        assert values["recorder"]["bag"] == str(tmp_path / "elsewhere")
-
-    def test_groups_nodes_as_the_scenario_says(self, start: Callable[..., Any]) -> None:
-        (together,) = start(scenario="full_cell.yaml")
-        assert len(together.arguments) == 13
-        assert together.arguments[3:5] == ["fine_controller:learning_controller", "piezo_actuator:piezo_actuator"]
-        assert together.exec_name == "spindle_encoder+learning_controller+11_more"
-
-    def test_refuses_a_bag_that_exists(self, start: Callable[..., Any], tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="exists"):
-            start(bag=str(tmp_path))
-
-    def test_replaces_values_of_the_scenario(self, start: Callable[..., Any]) -> None:
-        given = {"block_size": "32", "learning_controller.events": "['revolution 2: freeze']"}
-        for including in ("", "/mine.launch.py"):
-            loaded = scenario.load(Path(start(including, **given)[0].parameters[0]))
-            assert loaded.shared.block_size == 32
-            assert loaded.nodes["learning_controller"].events == ["revolution 2: freeze"]
-
-    @pytest.mark.parametrize(
-        ("argument", "said"),
-        [
-            (
-                "revolutions",
-                "no launch argument 'revolutions'; allowed: scenario, bag, namespace, allow_code, NODE.* .*nominal_rpm",
-            ),
-            ("spindle.revolutions", "no node 'spindle' in the scenario; did you mean spindle_encoder?"),
-            ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; did you mean revolutions"),
-            ("tool.feed", "tool.feed = 'far'; allowed: a finite number"),
-        ],
-    )
-    def test_refuses_an_argument_that_there_is_not(self, start: Callable[..., Any], argument: str, said: str) -> None:
-        with pytest.raises(InputError, match=said):
-            start(**{argument: "far"})
-
-    def test_leaves_arguments_of_a_file_that_includes_it_alone(self, start: Callable[..., Any]) -> None:
-        assert len(start("/mine.launch.py", turns="2", sigterm_timeout="9")) == 5
-        assert len(start(sigterm_timeout="9")) == 5
-
-
-class TestEndsUnderLaunch:
-    """The answer of launch to ends of processes: an error means that it ends the others and returns 1."""
-
-    @pytest.fixture
-    def ended(self, launch_file: Any) -> Callable[..., Any]:
-        """Report that a process of a cell of three has ended."""
-        reacts = launch_file.Ends(3, replaced=False)
-
-        def report(name: str, code: int, *, told_to: bool = False) -> Any:
-            event = SimpleNamespace(process_name=name, returncode=code)
-            return reacts(event, SimpleNamespace(is_shutdown=told_to))
-
-        return report
-
-    @pytest.mark.parametrize(
-        ("before", "last", "error"),
-        [
-            pytest.param([("tool-1", 0), ("recorder-2", 0)], ("spindle-3", 0), "", id="in order"),
-            pytest.param([], ("tool-1", 2), "tool-1 ended with exit code 2$", id="a failure is named at once"),
-            pytest.param(
-                [("tool-1", -9), ("recorder-2", 0)],
-                ("spindle-3", 0),
-                "tool-1 was killed by SIGKILL$",
-                id="a killed one when the others have come to the safe state",
-            ),
-            pytest.param(
-                [("tool-1", -9)],
-                ("spindle-3", 1),
-                "tool-1 was killed by SIGKILL; spindle-3 ended with exit code 1$",
-                id="beside one that fails later",
-            ),
-        ],
-    )
-    def test_failed_and_killed_nodes_are_named(
-        self, ended: Callable[..., Any], before: list[tuple[str, int]], last: tuple[str, int], error: str
-    ) -> None:
-        for name, code in before:
-            assert bool(ended(name, code)) == (code < 0), "a timer ends those that wait for a killed one"
-        with pytest.raises(LatheError, match=f"^{error}") if error else contextlib.nullcontext():
-            assert not ended(*last)
-
-    def test_nodes_that_are_told_to_end_are_not_named(self, ended: Callable[..., Any]) -> None:
-        ended("tool-1", -11)
-        assert not ended("recorder-2", 1, told_to=True)
-        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGSEGV$"):
-            ended("spindle-3", -2, told_to=True)
-
-    def test_a_killed_node_is_not_waited_for_for_ever(self, ended: Callable[..., Any], launch_file: Any) -> None:
-        """Launch ends a cell that has not begun 30 s after a node was killed.
-
-        The cell has not begun, and the others do not know that they wait in vain.
-        """
-        (timer,) = ended("tool-1", -9)
-        with pytest.raises(LatheError, match=r"^tool-1 was killed by SIGKILL$"):
-            timer.actions[0].function(None)
-        killed = SimpleNamespace(process_name="learning_controller-1", returncode=-9)
-        answer = launch_file.Ends(3, replaced=True)(killed, SimpleNamespace(is_shutdown=False))
-        assert answer is None, "another one may come and go on from its restart_file"

@@ -5,6 +5,7 @@ import os
 import pickle
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
+from lathe_rc.nodes.restart import Restart
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -33,6 +35,7 @@ LAWS = {
     "inverse": ("piston", [f"{OWN}.correction=second_order_inverse", f"{OWN}.lead_time=0.36e-3"]),
     "fir": ("piston", [f"{OWN}.q_filter=fir", f"{OWN}.allow_unstable=true"]),
     "gaussian": ("piston", [f"{OWN}.q_filter=gaussian"]),
+    "tuned": ("piston", [f"{OWN}.events=['revolution 4: set lead_time 1.3e-3', 'revolution 6.5: set q_time 90e-6']"]),
 }
 
 
@@ -145,20 +148,6 @@ def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(g
     assert reader.read_bag(tmp_path / "bag").digests() == expected.digest
 
 
-def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):
-    path = tmp_path / "state"
-    cell = load(CONFIG / "piston.yaml", [f"{OWN}.restart_file={path}", "spindle_encoder.revolutions=40.0"])
-
-    class Vandal(Killer):
-        def __call__(self, event):
-            super().__call__(event)
-            if event["event"] == "exit":
-                path.write_bytes(b"nothing")
-
-    with pytest.raises(LatheError, match=f"{path}: not a state of this node"):
-        harness.run(cell, mode="processes", watch=Vandal(OWN, [30_000]))
-
-
 # ---- the file -------------------------------------------------------------------------------------------
 
 
@@ -237,3 +226,32 @@ def test_a_state_that_others_may_write_is_refused(tmp_path):
 def test_a_state_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(LatheError, match="cannot be read"):
         loaded(tmp_path / "none")
+
+
+def test_a_parameter_that_was_set_for_the_next_cycle_is_set_by_the_process_that_goes_on(tmp_path):
+    """The state file keeps events by their sample and by their revolution."""
+    cell = load(CONFIG / "piston.yaml", [])
+    master = SimpleNamespace(host="here", pid=1, members=[])
+
+    def role():
+        quiet = {
+            "get_name": lambda: OWN,
+            "get_logger": lambda: SimpleNamespace(info=print),
+            "reporter": lambda *_, **__: 0,
+        }
+        protocol = SimpleNamespace(master=master, resumed=print, members={})
+        node = SimpleNamespace(table=cell.nodes[OWN], full_name=f"/{OWN}", protocol=protocol, **quiet)
+        inputs = SimpleNamespace(buffers={}, queues={}, wire=print)
+        outputs = SimpleNamespace(framer=SimpleNamespace(companions=0))
+        stage = Cell(cell.nodes).stages[OWN]
+        return SimpleNamespace(
+            node=node, stage=stage, inputs=inputs, outputs=outputs, blocks=0, samples=0, started=True
+        )
+
+    first, second = role(), role()
+    kept = Restart(first, str(tmp_path / "state"))
+    kept.begin(joins=False)
+    kept.keep_event("set learning_gain 0.5", 3.0)
+    kept.keep_event("freeze", 9000)
+    Restart(second, str(tmp_path / "state")).begin(joins=True)
+    assert second.stage.waiting == ["revolution 3: set learning_gain 0.5", "sample 9000: freeze"]

@@ -9,6 +9,7 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.errors import InputError
 
 FAULT, REPAIR = "fault", "repair"  #: verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
+SET = "set"  #: verb of an event that changes a parameter of a stage: set PARAM VALUE
 SAFE = "safe"  #: event that only a host may ask for: members of the cell are lost
 NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
 

@@ -174,6 +174,14 @@ class Table(BaseModel):
             given = f"{values.get(name, cls.model_fields[name].default)!r:.200}"
             raise InputError(f"{node}.{name} = {given}; allowed: {cls.rows()[name].allowed()}") from None
 
+    @classmethod
+    def checked(cls, node: str, name: str, value: object) -> Any:
+        """Return the value of one parameter, converted to its type; raises as `read`."""
+        try:
+            return _check(cls, name)(value)
+        except (KeyError, InputError, ValidationError):
+            return getattr(cls.read(node, {name: value}), name)
+
     def changed(self: T, node: str, values: Mapping[str, object]) -> T:
         """Return a copy of the table with other values; raise the same errors as `read`."""
         kind = type(self)

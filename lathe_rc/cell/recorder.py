@@ -20,6 +20,9 @@ class RecorderParameters(NodeParameters):
     chunk_size: Annotated[int, Ge(4096), Le(2**26)] = parameter(
         2**20, "size of the bag's chunks: what a crash may lose", "B"
     )
+    split_duration: Annotated[float, Ge(0), Le(1e9)] = parameter(
+        0.0, "simulated time after which the bag goes on in another file; 0: one file", "s"
+    )
     mode: Literal["continuous", "snapshot", "both"] = parameter(
         "continuous", "what is recorded: the whole run in one bag, snapshots around triggers, or both"
     )

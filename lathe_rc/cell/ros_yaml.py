@@ -11,7 +11,7 @@ a string.
 import ctypes
 import errno
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -157,15 +157,37 @@ def read(path: Path) -> dict[str, dict[str, Value]]:
     Raises:
         InputError: the file is missing, larger than 1 MiB, or not a ROS 2 parameter file.
     """
+    return parse(_text(path), str(path))
+
+
+def _text(path: Path) -> str:
     try:
-        text = files.contents(path, _MAX_BYTES).decode()
+        return files.contents(path, _MAX_BYTES).decode()
     except OSError as error:
         if error.errno == errno.EFBIG:
             raise InputError(f"{path}: {_TOO_LARGE}") from None
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; allowed: YAML in UTF-8") from None
-    return parse(text, str(path))
+
+
+def entries(path: Path) -> dict[str, dict[str, Value]]:
+    """Read parameters by the full name of each entry as it is written, such as ``/left/tool`` or ``/**/tool``.
+
+    Raises:
+        InputError: see `read`.
+    """
+    found: dict[str, dict[str, Value]] = {}
+    for key, values, where in _entries(_text(path), str(path)):
+        _flatten(values, where, "", found.setdefault(key, {}))
+    return found
+
+
+def is_for(entry: str, node: str) -> bool:
+    """Return whether rcl applies an entry of a parameter file to a node, by its fully qualified name."""
+    wildcards = {"*": r"/\w+", "**": r"(/\w+)*"}
+    parts = entry.removeprefix("/").split("/")
+    return re.fullmatch("".join(wildcards.get(part, "/" + re.escape(part)) for part in parts), node) is not None
 
 
 def parse(text: str, source: str) -> dict[str, dict[str, Value]]:
@@ -174,17 +196,26 @@ def parse(text: str, source: str) -> dict[str, dict[str, Value]]:
     Raises:
         InputError: the string is larger than 1 MiB, or not a ROS 2 parameter file.
     """
+    nodes: dict[str, dict[str, Value]] = {}
+    for full_name, values, where in _entries(text, source):
+        _flatten(values, where, "", nodes.setdefault(_relative(full_name), {}))
+    return nodes
+
+
+def _relative(full_name: str) -> str:
+    return "/**" if full_name == "/**" else full_name.removeprefix("/**/").removeprefix("/")
+
+
+def _entries(text: str, source: str) -> Iterator[tuple[str, yaml.Node, str]]:
+    """Yield the full name of each entry, the node of its parameters, and the place for messages."""
     if len(text) > _MAX_BYTES:
         raise InputError(f"{source}: {_TOO_LARGE}")
     root = _compose(text, source)
     if not isinstance(root, yaml.MappingNode):
         raise InputError(f"{source}: no nodes; allowed: 'NODE: {{ros__parameters: ...}}'")
-    nodes: dict[str, dict[str, Value]] = {}
     for key, item in root.value:
         full_name = _name(key, source)
-        name = "/**" if full_name == "/**" else full_name.removeprefix("/**/").removeprefix("/")
-        entries = item.value if isinstance(item, yaml.MappingNode) else []
-        if [entry[0].value for entry in entries] != ["ros__parameters"]:
+        held = item.value if isinstance(item, yaml.MappingNode) else []
+        if [each[0].value for each in held] != ["ros__parameters"]:
             raise InputError(f"{source}:{key.start_mark.line + 1}: {full_name} does not hold ros__parameters alone")
-        _flatten(entries[0][1], f"{source}: {name}", "", nodes.setdefault(name, {}))
-    return nodes
+        yield full_name, held[0][1], f"{source}: {_relative(full_name)}"

@@ -15,7 +15,7 @@ one if there are none, and outputs are the arrays of all fields of all output po
 """
 
 from abc import ABC
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -23,7 +23,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell import events
+from lathe_rc.cell import events, ros_yaml
+from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
 from lathe_rc.compiled.step import CompiledStep, Step, is_compiled
 from lathe_rc.compiled.struct_view import explain_unfit
@@ -132,6 +133,8 @@ class Stage(ABC):
     Attributes:
         inputs, outputs: the ports, in the order of the arrays passed to `advance`.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
+        shared: parameter table at the start.
+        parameters_now: parameter table after the ``set`` events so far.
         unheard: sparse topics without a reader; their messages need not be created.
         foreign: type of each topic that the node receives from outside the cell, by name before remapping.
         tells: whether the stage generates events by itself, known only to `process`.
@@ -162,6 +165,7 @@ class Stage(ABC):
     kind: ClassVar[str]
     Parameters: ClassVar[type[NodeParameters]]
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
+    tunable: tuple[str, ...] = ()  #: parameters that the event ``set PARAM VALUE`` may change, all float
     announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves; up to a colon
     devices: ClassVar[tuple[str, ...]] = ()  #: what can break beside its ports; see `lathe_rc.safety.faults.Kind`
 
@@ -182,7 +186,7 @@ class Stage(ABC):
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
-        self.shared = parameters
+        self.shared = self.parameters_now = parameters
         self.sparse_topics: dict[str, str] = {}
         self.unheard: Collection[str] = ()
         self.foreign: dict[str, str] = {}
@@ -255,7 +259,7 @@ class Stage(ABC):
     @property
     def takes_events(self) -> bool:
         """Return whether the stage can receive events."""
-        return bool(self.actions) or self.shared.allow_faults
+        return bool(self.actions or self.tunable) or self.shared.allow_faults
 
     def check_action(self, action: str) -> None:
         """Check that an event can be carried out.
@@ -275,9 +279,46 @@ class Stage(ABC):
                 assert self._injection is not None, "there is one if faults are allowed"
                 self._injection.check_target(rest)
             return
+        if verb == events.SET:
+            if (parameter := rest.partition(" ")[0]) not in self.tunable:
+                known = instead(parameter, self.tunable)
+                raise InputError(f"{self.name}: event {action!r}: no PARAM of 'set PARAM VALUE'; {known}")
+            self.tuned(action)
+            return
         if action not in self.actions:
             known = instead(action, self.actions) if self.actions else f"allowed: none ({self.kind} has no events)"
             raise InputError(f"{self.name}: event {action!r}; {known}")
+
+    def tuned(self, *actions: str) -> "Stage":
+        """Return a new stage of this kind, with the parameters after all waiting ``set`` events and further ones.
+
+        Raises:
+            InputError: a value is invalid.
+        """
+        scheduled = [action for _, action in sorted(self._scheduled, key=lambda event: event[0])]
+        return self._after([*(trigger.action for trigger in self._triggers), *scheduled, *actions])
+
+    def variants(self) -> Iterator["Stage"]:
+        """Yield the stage as it is after each ``set`` event of its scenario, in their order, for checks."""
+        done: list[str] = []
+        for trigger in self._triggers:
+            done.append(trigger.action)
+            if trigger.action.startswith(f"{events.SET} "):
+                yield self._after(done)
+
+    def _after(self, actions: Sequence[str]) -> "Stage":
+        """Return a new stage of this kind without events, with the parameters after some actions."""
+        table = self._table_after(actions).model_copy(update={"events": [], "faults": []})
+        return type(self)(self.name, table)
+
+    def _table_after(self, actions: Sequence[str]) -> NodeParameters:
+        """Return the parameters after all ``set`` events among some actions."""
+        table = self.parameters_now
+        for verb, _, rest in (action.partition(" ") for action in actions):
+            if verb == events.SET:
+                parameter, _, value = rest.partition(" ")
+                table = table.changed(self.name, {parameter: ros_yaml.parse_value(value, f"{self.name}.{parameter}")})
+        return table
 
     def _check_allowed(self, what: str) -> None:
         if not self.shared.allow_faults:
@@ -296,6 +337,15 @@ class Stage(ABC):
         """
         self.check_action(action)
         self._scheduled.append((index, action))
+
+    def schedule_at_revolution(self, action: str, revolution: float) -> None:
+        """Schedule an event at the first sample whose measured spindle angle has reached ``revolution`` turns.
+
+        Raises:
+            InputError: the stage cannot carry it out.
+        """
+        self.check_action(action)
+        self._triggers.append(Trigger("revolution", revolution, action, "events"))
 
     def replay(self, action: str, index: int) -> None:
         """Schedule a recorded event at its original sample; events that the stage generates itself are skipped."""
@@ -452,6 +502,9 @@ class Stage(ABC):
             else:
                 assert self._injection is not None, "the fault has been checked"
                 self._injection.begin(fault, index)
+        elif verb == events.SET:
+            self.parameters_now = self._table_after([action])
+            self.tune(self.parameters_now)
         elif verb == events.REPAIR:
             assert self._injection is not None, "the event has been checked"
             target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None
@@ -460,6 +513,14 @@ class Stage(ABC):
                 self._remarks.append(f"{events.NOTHING_TO_REPAIR}: {target}")
         else:
             self.perform(action)
+
+    def tune(self, parameters: Any) -> None:
+        """Continue with changed ``tunable`` parameters from the next sample on; stages with such override this.
+
+        Args:
+            parameters: the whole table with the new values.
+        """
+        raise NotImplementedError(parameters)
 
     def go_safe(self) -> None:  # noqa: B027 - most stages move nothing, and go on as they are
         """Go to the safe state after a loss of cell members."""
@@ -561,7 +622,17 @@ class Stage(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the pickled state, without addresses and scratch arrays."""
-        return {**self.__dict__, "_native": None, "_room": None}
+        tuned = {name: getattr(self.parameters_now, name) for name in self.tunable}
+        return {**self.__dict__, "_native": None, "_room": None, "_tuned": tuned}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a pickled state; a state file gives all tables as they were at the start."""
+        tuned = state.pop("_tuned")
+        self.__dict__.update(state)
+        if any(getattr(self.parameters_now, name) != value for name, value in tuned.items()):
+            self.parameters_now = self.parameters_now.model_copy(update=tuned)
+            if "parameters" in state:  # not of every third-party stage
+                self.__dict__["parameters"] = self.parameters_now
 
     def prepare(self, first: int, samples: int) -> None:
         """Prepare the noise of the samples from ``first`` in the memory, as the step cannot generate it."""

@@ -304,7 +304,9 @@ class Cell:
             self.factors.clear()
             self.loops.clear()
             for stage in self.stages.values():
-                stage.check_cell(self, cures=cures)
+                for each in (stage, *stage.variants()):
+                    each.check_cell(self, cures=cures)
+            self.warnings, self.unchecked = list(dict.fromkeys(self.warnings)), list(dict.fromkeys(self.unchecked))
 
     @property
     def margins(self) -> dict[str, float | None]:

@@ -8,7 +8,7 @@ pass a zero-phase filter S over the angle; the components that S removes decay b
 Source: spec/robust.md; learning over the position for non-circular cutting: Nakano, 1996.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -86,8 +86,7 @@ def empty_memory(nominal: float, gain: float, waves: float, points: int, *, foll
     spread[0] = _UNKNOWN
     return MemoryTable(
         nominal=nominal,
-        learns=gain > 0.0,
-        drift=gain**2 / (1.0 - gain),
+        **_of_gain(gain),
         follows_speed=follows_speed,
         value=np.zeros(points),
         slope=np.zeros(points),
@@ -96,6 +95,16 @@ def empty_memory(nominal: float, gain: float, waves: float, points: int, *, foll
         speeds=np.zeros(points),
         smoothing=smoothing(waves, points),
     )
+
+
+def _of_gain(gain: float) -> dict[str, Any]:
+    """Return the members of a memory that a stationary gain of its Kalman filters determines."""
+    return {"learns": gain > 0.0, "drift": gain**2 / (1.0 - gain)}
+
+
+def with_gain(m: MemoryTable, gain: float) -> MemoryTable:
+    """Return a memory with another stationary gain, below 1, that shares what has been learned."""
+    return m._replace(**_of_gain(gain))
 
 
 def forget_all(m: MemoryTable) -> None:

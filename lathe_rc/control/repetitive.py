@@ -94,6 +94,7 @@ class RepetitiveController:
     ) -> None:
         self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
         self.preview = preview
+        room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
         whole, real = np.zeros(angle_memory.INTEGERS, dtype=np.int64), np.zeros(angle_memory.REALS)
         whole[angle_memory.LEARNS], whole[angle_memory.JOINED] = 1, np.isinf(join_below)
         real[angle_memory.PLACE] = np.nan
@@ -104,16 +105,12 @@ class RepetitiveController:
             gain=gain,
             ramp=soft_start * grid,
             join_below=join_below,
-            ratio=q.ratio,
-            reach=q.reach,
             law=int(correction.law),
             looks_ahead=correction.looks_ahead,
             settings=np.zeros(7),
-            # Includes the points of the previous cycle that Q needs; a power of two, so that a mask wraps the index.
-            memory=np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length()),
-            chunk=np.empty(q.chunk),
-            scratch=np.empty((2, q.chunk + 2 * q.reach)),
-            **{name: np.empty(shape) for name, shape in _ROOM.items()},
+            memory=self._room_for(q),
+            **self._smoother(q),
+            **room,
             sample=np.empty(angle_memory.PIECE, dtype=np.int64),
             work=np.empty((7, angle_memory.PIECE + 1)),
             whole=whole,
@@ -172,6 +169,47 @@ class RepetitiveController:
             decay = np.exp(-self._step / correction.lag)
             rest = (1.0 - decay) * correction.lag / self._step
             settings[3:] = decay, rest - decay, 1.0 - rest, correction.lead / correction.lag
+
+    def retune(self, q: QFilter, gain: float, preview: Preview) -> None:
+        """Continue from the next sample on with another Q, gain and lead; the memory is kept.
+
+        Args:
+            q: zero-phase Q over a cycle, of the same grid.
+            gain: learning gain γ.
+            preview: lead law whose lead time and constant angle replace the current ones.
+        """
+        lead = preview.table
+        self.preview.table = self.preview.table._replace(lead_time=lead.lead_time, constant=lead.constant)
+        self._q = q
+        table, end = self.table, int(self.table.whole[angle_memory.NEXT])
+        memory = self._room_for(q)
+        if memory.size > table.memory.size:
+            # A wider Q reads points that are no longer kept: those one cycle later are the nearest to them.
+            places = np.arange(end - memory.size, end)
+            missing = np.maximum(end - table.memory.size - places, 0)
+            kept = places + -(-missing // self._cycle) * self._cycle
+            memory[places & (memory.size - 1)] = table.memory[kept & (table.memory.size - 1)]
+        else:
+            memory = table.memory
+        self.table = table._replace(gain=gain, memory=memory, **self._smoother(q))
+        table.whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
+
+    def _room_for(self, q: QFilter) -> Array:
+        """Return an empty memory, shape (n,), which includes the points of the previous cycle that Q needs.
+
+        Its length is a power of two, for indices by a mask.
+        """
+        return np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length())
+
+    @staticmethod
+    def _smoother(q: QFilter) -> dict[str, Any]:
+        """Return the members of the table that belong to Q."""
+        return {
+            "ratio": q.ratio,
+            "reach": q.reach,
+            "chunk": np.empty(q.chunk),
+            "scratch": np.empty((2, q.chunk + 2 * q.reach)),
+        }
 
     def clear(self) -> None:
         """Clear the memory and restart learning, with the soft start if configured."""

@@ -157,6 +157,18 @@ def rules(words: Sequence[str]) -> Iterator[Rule]:
             yield Rule(following, node, parameter, value)
 
 
+def check_namespaces(words: Sequence[str]) -> None:
+    """Reject a namespace without a slash in front, for which rcl has a message about lexemes.
+
+    Raises:
+        InputError: a remapping rule gives such a namespace.
+    """
+    for rule in words:
+        place, assigns, namespace = rule.partition("__ns:=")
+        if assigns and not namespace.startswith("/"):
+            raise InputError(f"-r {rule}: no absolute namespace; write -r {place}__ns:=/{namespace}")
+
+
 def parameter_files(words: Sequence[str]) -> list[Path]:
     """Return the parameter files of a ROS command line."""
     return [Path(following) for word, following in pairwise([*words, ""]) if word == "--params-file"]

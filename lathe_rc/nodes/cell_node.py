@@ -9,7 +9,7 @@ import os
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -18,9 +18,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lathe_rc_msgs.msg import CellState as CellStateMessage
 from lathe_rc_msgs.msg import Member
 from lathe_rc_msgs.msg import Progress as ProgressMessage
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -28,7 +30,8 @@ from std_msgs.msg import Empty
 
 from lathe_rc import messages
 from lathe_rc.cell.host_topics import signal_depth
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value, remapped
+from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError, shown
@@ -44,29 +47,45 @@ _TICK = 0.02  # [s] between polls of the graph while members join
 _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
-_MOST_PUT_OFF = 8  # times the blocks in flight of each topic, while a node is deactivated
-_EARLY = 4  # times the blocks in flight of each topic, before a node is ready
+_MOST_DEFERRED = 8  # times the blocks in flight of each topic, until a node is ready and active
 
 T = TypeVar("T")
 
 
 class Role(Protocol):
-    """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up."""
+    """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up.
+
+    Roles derive from it, and leave out what they do not do.
+    """
+
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the names of the parameters that may change in a run."""
+
+    def tune(self, values: Mapping[str, Value]) -> str:
+        """Change tunable parameters; return from when on they hold, in words.
+
+        Raises:
+            InputError: the values cannot be used now; the message says why.
+        """
 
     def protocol(self, own: Announcement) -> MemberProtocol:
         """Return the protocol object of this kind of member."""
 
     def member_names(self) -> list[str]:
         """Return the fully qualified names of all members; only a time master knows them."""
+        return []
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """Return topic, message type and sparse flag (messages at chosen samples) of each published signal."""
+        return []
 
     def subscriptions(self) -> list[str]:
         """Return the fully qualified names of the signal topics that the node reads."""
 
     def relative_topics(self) -> list[str]:
         """Return the signal topics of the node's stage before remapping; empty without a stage."""
+        return []
 
     def activate(self) -> None:
         """Create the publishers, subscriptions and services of the node."""
@@ -136,6 +155,7 @@ class CellNode(LifecycleNode):
         given = declare.overrides(self)
         self.kind, self._make_role = kind, role
         self.autostart = bool(given.get("autostart", True))
+        self._starts = self.autostart  # the first configuration is its own: if that fails, the process ends
         self.table: NodeParameters = TABLES[self.kind]()
         self.reporter = reporter
         self.exchange = exchange
@@ -155,8 +175,7 @@ class CellNode(LifecycleNode):
         self.role: Role | None = None
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
-        self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received while deactivated
-        self._early: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received before the node was ready
+        self._deferred: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received too early
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -166,8 +185,10 @@ class CellNode(LifecycleNode):
     # ---- lifecycle ----------------------------------------------------------------------------------
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Validate the parameters and allocate the role."""
-        return self._transition(state, "inactive", self._configure)
+        """Validate the parameters and allocate the role; a client whose parameters are refused may set others."""
+        refuse = self.fail if self._starts else self._withdraw
+        self._starts = False
+        return self._transition(state, "inactive", self._configure, refuse)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Announce the node and start to exchange data, or resume after a deactivation."""
@@ -195,15 +216,18 @@ class CellNode(LifecycleNode):
         self.protocol.deactivate()
         return TransitionCallbackReturn.SUCCESS
 
-    def _transition(self, state: State, goal: str, step: Callable[[], None]) -> TransitionCallbackReturn:
+    def _transition(
+        self, state: State, goal: str, step: Callable[[], None], refuse: Callable[[LatheError], None] | None = None
+    ) -> TransitionCallbackReturn:
+        refuse = refuse or self.fail
         try:
             step()
         except LatheError as error:
-            self.fail(error)
+            refuse(error)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:  # noqa: BLE001 - rclpy would swallow it, and the cell wait for a node that is not there
             self.get_logger().error(traceback.format_exc())
-            self.fail(LatheError(f"{self.get_name()}: {type(error).__name__}: {shown(error)}"))
+            refuse(LatheError(f"{self.get_name()}: {type(error).__name__}: {shown(error)}"))
             return TransitionCallbackReturn.FAILURE
         self.get_logger().info(f"{state.label} -> {goal}")
         self._perform_actions()
@@ -227,6 +251,7 @@ class CellNode(LifecycleNode):
         if self.table.stage not in ("", self.kind):
             raise InputError(f"{self.get_name()}.stage = {self.table.stage!r}; this executable is a {self.kind}")
         self.role = self._make_role(self)
+        declare.release(self, self.role.tunable)
         topics = self.role.publications()
         own = Announcement(
             run_id=self.table.run_id,
@@ -244,6 +269,14 @@ class CellNode(LifecycleNode):
         )
         self.protocol = self.role.protocol(own)
 
+    def _withdraw(self, error: LatheError) -> None:
+        """Remain unconfigured, with parameters that can be set."""
+        self.get_logger().error(f"remains unconfigured: {error}")
+        if self.role is not None:
+            self.role.clean_up()
+        declare.release(self, self.table.rows())
+        self._forget()
+
     def _effective(self, role: Role) -> NodeParameters:
         """Return the parameters with the command line's remapping rules written into ``remap``."""
         rules = [f"{topic}:={self.topic(topic).removeprefix(self.namespace)}" for topic in role.relative_topics()]
@@ -257,7 +290,8 @@ class CellNode(LifecycleNode):
             self._begin_to_exchange()
             self.role.activate()
         self.protocol.activate(time.monotonic())
-        self._take_up(self._put_off)
+        if not self._is_early():
+            self._take_up()
         self._perform_actions()
         self.reporter("active", self.get_name(), pid=os.getpid())
 
@@ -287,6 +321,7 @@ class CellNode(LifecycleNode):
             self.watch.close()
         for before, now, destroy in zip(self._endpoints_of_rclpy, self._endpoints(), self._destroyers(), strict=True):
             self.discarded += [partial(destroy, endpoint) for endpoint in now - before]
+        declare.release(self, self.table.rows())
         self._forget()
 
     def _shut_down(self) -> None:
@@ -306,6 +341,57 @@ class CellNode(LifecycleNode):
 
     def _destroyers(self) -> list[Callable[[Any], object]]:
         return [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
+
+    # ---- parameters ---------------------------------------------------------------------------------
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters of an unconfigured node, or tune those of a configured one (extends `rclpy.node.Node`)."""
+        try:
+            parameters = [each if self._passes(each) else self._checked(each) for each in parameter_list]
+            own = {each.name: each.value for each in parameters if not self._passes(each)}
+            how = self.role.tune(own) if self.role is not None and own else ""
+        except LatheError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        result = super().set_parameters_atomically(parameters)
+        result.reason = result.reason or how
+        return result
+
+    def _passes(self, parameter: Parameter) -> bool:
+        """Return True if rclpy alone handles a change: of its own parameter, or the deletion of an unknown one."""
+        name = parameter.name
+        deleted = (
+            parameter.type_ == Parameter.Type.NOT_SET and name not in self.table.rows() and self.has_parameter(name)
+        )
+        return declare.is_of_rclpy(name) or deleted
+
+    def _checked(self, parameter: Parameter) -> Parameter:
+        checked = declare.checked(self.get_name(), type(self.table), parameter)
+        if self.role is not None and checked.name not in self.role.tunable:
+            raise InputError(f"{self.get_name()}.{checked.name} is read-only: {self._cure(checked.name)}")
+        return checked
+
+    def _cure(self, name: str) -> str:
+        """Return why a parameter is read-only, and what takes its place."""
+        assert self.role is not None, "the node is configured"
+        if name in ("events", "faults") and self.role.relative_topics():
+            return f"the service {self.full_name}/schedule schedules an event in a run"
+        before = f"before a run, 'ros2 lifecycle set {self.full_name} cleanup' lets it be set"
+        if name in SharedParameters.model_fields:
+            return f"it is the same in all nodes of the cell; {before} in each"
+        tunable = f"; allowed now: {', '.join(self.role.tunable)}" if self.role.tunable else ""
+        alike = self.kind not in (*MASTERS, RECORDER)
+        bag = f", 'lathe resim BAG --set {self.get_name()}.{name}=VALUE' shows its effect on a recorded run" * alike
+        return f"the node is configured with it{tunable}; {before}{bag}"
+
+    def show_parameters(self, table: NodeParameters, names: Sequence[str]) -> None:
+        """Let clients read the values that events have given to parameters."""
+        values = {name: getattr(table, name) for name in names}
+        changed = [Parameter(name, value=value) for name, value in values.items() if value != self._value(name)]
+        if changed:
+            super().set_parameters_atomically(changed)
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
 
     # ---- events of the protocol ---------------------------------------------------------------------
 
@@ -447,7 +533,7 @@ class CellNode(LifecycleNode):
             case actions.Begin(joins):
                 role.begin(joins=joins)
                 self.protocol.begun(time.monotonic())
-                self._take_up(self._early)
+                self._take_up()
             case actions.Lose(lost, first, end, again):
                 role.lose(lost, first, end, again=again)
             case _:
@@ -492,21 +578,17 @@ class CellNode(LifecycleNode):
         So no message is lost, and blocks from before a node joined do not count as missing. In a free-running cell
         the signals of a deactivated node are dropped instead, and counted like any missing blocks.
         """
-        most = _MOST_PUT_OFF * signal_depth(self.table)
 
         def call(message: Any) -> None:
-            if not self.protocol.active:
-                if self.table.window:
-                    self._put_off.append((callback, message))
-                if len(self._put_off) > most * (len(self.inlets) + 1):
-                    raise LatheError(f"{self.full_name}: {len(self._put_off)} messages wait until it is active again")
-            elif self._is_early():
-                self._early.append((callback, message))
-                if len(self._early) > _EARLY * signal_depth(self.table) * (len(self.inlets) + 1):
-                    self._early.popleft()  # a flood of foreign messages
-            else:
-                self._take_up(self._early)
+            if self.protocol.active and not self._is_early():
+                self._take_up()
                 callback(message)
+            elif self.protocol.active or self.table.window:
+                self._deferred.append((callback, message))
+                if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table) * (len(self.inlets) + 1):
+                    if self.protocol.ready:
+                        raise LatheError(f"{self.full_name}: {len(self._deferred)} messages wait until it is active")
+                    self._deferred.popleft()  # a flood of foreign messages
 
         return call
 
@@ -516,9 +598,9 @@ class CellNode(LifecycleNode):
             return not self.protocol.ready
         return bool(getattr(self.table, "restart_file", "")) and not self.protocol.alone
 
-    def _take_up(self, waiting: deque[tuple[Callable[[Any], object], Any]]) -> None:
-        while waiting:
-            callback, message = waiting.popleft()
+    def _take_up(self) -> None:
+        while self._deferred:
+            callback, message = self._deferred.popleft()
             self.guarded(callback)(message)
 
     def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:

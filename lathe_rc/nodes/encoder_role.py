@@ -55,10 +55,14 @@ class EncoderRole(SpindleRole):
 
     def finish(self) -> None:
         """Close the encoder's line (implements `Role`)."""
-        super().finish()
         if self._line is not None:
             self._line.close()
             self._line = None
+
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the parameters that may change in a run: not the pace of a live encoder (extends `SpindleRole`)."""
+        return () if self.stage.live else super().tunable
 
     def statistics(self) -> dict[str, object]:
         """Return the figures of spindle and encoder for the diagnostics (implements `Role`)."""

@@ -177,8 +177,10 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         Exit code: 0, or the code of the first node that failed or whose cell went to its safe state.
 
     Raises:
-        InputError: a parameter file in a bag names code that is not allowed, or files outside the bag.
+        InputError: a namespace is not absolute, or a parameter file in a bag names code that is not allowed, or files
+            outside the bag.
     """
+    arguments.check_namespaces(args)
     for file in arguments.parameter_files(args):
         if allowed_code.bag_around(file.parent) is not None:
             scenarios.load(file)  # bag data, rejected if it names code or files elsewhere
@@ -201,6 +203,8 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         for name, kind in members:
             nodes.append(_make(name, kind, reporter, exchange))
             declare.refuse_lost(nodes[-1], args)
+            if warning := declare.missing_entry(nodes[-1], args):
+                nodes[-1].get_logger().warning(warning)
         _start(nodes, exchange)
         gc.collect()
         gc.freeze()  # the collector skips existing objects: it would traverse them repeatedly between blocks

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -17,22 +18,22 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import Snapshot
 from lathe_rc.bag.writing.order import Merger
-from lathe_rc.bag.writing.record import bag_of
+from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
-from lathe_rc.errors import LatheError, LossyRunError
+from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.block_queue import BlockQueue
-from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
-from lathe_rc.protocol.actions import Action
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -49,7 +50,7 @@ class _Encoders(dict[tuple[str, str, str, int], Encoder]):
         return encoder
 
 
-class RecorderRole:
+class RecorderRole(Role):
     """Role of the recorder; subscribes to the topics of all members, or without a cell to all announced topics.
 
     Args:
@@ -85,13 +86,21 @@ class RecorderRole:
         """Return the node's protocol object; it is wired after the subscriptions are created (implements `Role`)."""
         return MemberProtocol(own, self.table.window, masters=MASTERS, wired=False)
 
-    def member_names(self) -> list[str]:
-        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
-        return []
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the parameters that may change in a run (implements `Role`)."""
+        return () if self.table.mode == "snapshot" else ("split_duration",)
 
-    def relative_topics(self) -> list[str]:
-        """Return the relative signal topics: none, since a recorder has no stage (implements `Role`)."""
-        return []
+    def tune(self, values: Mapping[str, Value]) -> str:
+        """Change the length of the bag's files (implements `Role`).
+
+        Raises:
+            InputError: the bag is closed.
+        """
+        if self._writer is None:
+            raise InputError(f"{self.node.full_name}: bag {self._path} is closed")
+        split(self._writer, float(cast("float", values["split_duration"])))
+        return "from the next message on"
 
     def begin(self, *, joins: bool) -> None:
         """Prepare for block 0 (implements `Role`).
@@ -103,15 +112,6 @@ class RecorderRole:
             raise LatheError(
                 f"{self.node.full_name}: the cell is running already; start a recorder before it, or use lathe record"
             )
-
-    def perform(self, action: Action) -> None:
-        """Ignore the actions of a time master (implements `Role`)."""
-
-    def work(self) -> None:
-        """Do nothing: messages are written when they arrive (implements `Role`)."""
-
-    def failed(self) -> None:
-        """Do nothing after a failure (implements `Role`)."""
 
     def activate(self) -> None:
         """Create the snapshot service and subscribe to the host topics; signal topics follow when announced."""
@@ -152,10 +152,6 @@ class RecorderRole:
             ours = any(status.name in self.node.protocol.members for status in told.status)
         if ours:
             self._open.write(topic, self._log_ns, data)
-
-    def publications(self) -> list[tuple[str, str, bool]]:
-        """Return the published signals: none."""
-        return []
 
     def subscriptions(self) -> list[str]:
         """Return all signal topics of the members."""

@@ -40,6 +40,7 @@ from lathe_rc.names import instead
 from lathe_rc.nodes import arguments, replayed_qos, standalone_node
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.nodes.replayed_qos import DEPTH
+from lathe_rc.nodes.standalone_node import StandaloneNode
 
 _ACKNOWLEDGED = 30.0  # [s] for a reader to acknowledge its messages
 _CLOCK, _STATE = "/clock", "/cell_state"
@@ -50,6 +51,46 @@ _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the system clock may be set back without harm
 _LONG = 10.0  # [s] of wall time until the next message, from which on the wait is reported
 _LOOK = 0.05  # [s] of wall time between polls of services and signals
+
+
+class _Pace:
+    """Wall time at which each message of a replay is due.
+
+    Args:
+        rate: pace against the bag's time; 0: every message is due at once.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._origin_ns: int | None = None  # log time of the bag that is due at `_began`
+        self._began = 0.0  # monotonic [s]
+
+    def begin(self) -> None:
+        """Begin with the next message."""
+        self._origin_ns = None
+
+    def due(self, log_ns: int) -> float:
+        """Return the monotonic time at which a message is due [s]."""
+        if self._origin_ns is None:
+            self._origin_ns, self._began = log_ns, time.monotonic()
+        return self._began + (log_ns - self._origin_ns) * 1e-9 / self._rate if self._rate else self._began
+
+    def hold(self, seconds: float) -> None:
+        """Postpone all messages by a pause."""
+        self._began += seconds
+
+    def change(self, rate: float, now: float, newest_ns: int) -> None:
+        """Continue at another rate from the place that the replay has reached.
+
+        Args:
+            rate: new rate.
+            now: monotonic time, of the begin of a pause if there is one [s].
+            newest_ns: log time of the newest message: the place of a replay without a pace.
+        """
+        if self._origin_ns is not None:
+            passed = round((now - self._began) * self._rate * 1e9)
+            self._origin_ns = self._origin_ns + passed if self._rate else newest_ns
+        self._rate, self._began = rate, now
 
 
 class Replayer:
@@ -64,7 +105,7 @@ class Replayer:
         InputError: the bag lacks a topic, or a message type is not installed on this machine.
     """
 
-    def __init__(self, node: Node, parameters: ReplayerParameters, source: Source) -> None:
+    def __init__(self, node: StandaloneNode, parameters: ReplayerParameters, source: Source) -> None:
         self._node, self._parameters, self._source = node, parameters, source
         if parameters.as_cell and (parameters.loop or parameters.start or parameters.end or parameters.topics):
             raise InputError(
@@ -99,6 +140,8 @@ class Replayer:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._looked = 0.0
+        self._pace, self._held_since, self._newest_ns = _Pace(parameters.rate), 0.0, self._start_ns
+        node.tunes("rate", self._change_rate)
         for name, paused in (
             ("pause", lambda: True),
             ("resume", lambda: False),
@@ -121,6 +164,10 @@ class Replayer:
             raise InputError(
                 f"{topic}: message type {kind} is not installed; install its package, or name other topics"
             ) from None
+
+    def _change_rate(self, rate: float) -> None:
+        """Continue at another rate; the pause of a paused replay goes on."""
+        self._pace.change(rate, self._held_since if self.paused else time.monotonic(), self._newest_ns)
 
     def _service(self, paused: Callable[[], bool]) -> Callable[[Any, Any], Any]:
         def call(_request: Any, response: Any) -> Any:
@@ -269,18 +316,16 @@ class Replayer:
             yield topic, self._start_ns, data
 
     def _once(self) -> None:
-        rate, origin, began = self._parameters.rate, None, time.monotonic()
         told: int | None = None
+        self._pace.begin()
         for topic, log_ns, data in self._chosen():
-            if origin is None:
-                origin, began = log_ns, time.monotonic()
-            due = began + (log_ns - origin) * 1e-9 / rate if rate else 0.0
-            if (wait := due - time.monotonic()) > _LONG:
+            if (wait := self._pace.due(log_ns) - time.monotonic()) > _LONG:
                 offset = _seconds(log_ns - self._source.first_ns)
                 self._node.get_logger().warning(
                     f"{topic}: the next message comes in {_span(wait)}; start = {offset} begins with it"
                 )
-            began += self._wait_until(due)
+            self._wait_for(log_ns)
+            self._newest_ns = log_ns
             if log_ns != told:
                 told = log_ns
                 self._send(_CLOCK, Clock(clock=Time(sec=log_ns // 10**9, nanosec=log_ns % 10**9)))
@@ -309,21 +354,19 @@ class Replayer:
         if self._waiting[topic] >= DEPTH // 2:
             self._acknowledged(topic)
 
-    def _wait_until(self, due: float) -> float:
-        """Wait until a monotonic time, longer while paused; return the time spent paused [s]."""
-        held = 0.0
+    def _wait_for(self, log_ns: int) -> None:
+        """Wait until a message is due, longer while paused; pauses and rates may change meanwhile."""
         while True:
-            now = time.monotonic()
+            self._held_since = now = time.monotonic()
             if self.paused:
                 self._look(_LOOK)
-                held += time.monotonic() - now
-            elif now < due + held:
-                self._look(min(due + held - now, _LOOK))
+                self._pace.hold(time.monotonic() - now)
+            elif (wait := self._pace.due(log_ns) - now) > 0.0:
+                self._look(min(wait, _LOOK))
+            elif now - self._looked > _LOOK:
+                self._look()
             else:
-                if now - self._looked > _LOOK:
-                    self._look()
-                    continue
-                return held
+                return
 
     def _hold(self) -> None:
         """Limit the blocks in flight to the recorder's queue; acknowledged by DDS does not mean read."""
@@ -367,7 +410,7 @@ def _span(seconds: float) -> str:
     return f"{seconds / unit:.3g} {name}"
 
 
-def _work(node: Node, parameters: ReplayerParameters) -> None:
+def _work(node: StandaloneNode, parameters: ReplayerParameters) -> None:
     if not parameters.bag:
         raise InputError(f"{KIND}.bag is empty; name the bag's folder")
     with Source(Path(parameters.bag)) as source:

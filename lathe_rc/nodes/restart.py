@@ -8,27 +8,15 @@ again. The state is at most two windows old: publishers, which may be one window
 
 from collections import deque
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
-from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.events import Trigger
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.inputs import Inputs
-from lathe_rc.nodes.outputs import Outputs
 
-
-class Resumable(Protocol):
-    """Interface of a stage's role whose state can be stored (see `lathe_rc.nodes.stage_role.StageRole`)."""
-
-    node: CellNode
-    stage: Stage
-    inputs: Inputs
-    outputs: Outputs
-    blocks: int
-    samples: int
-    started: bool
+if TYPE_CHECKING:
+    from lathe_rc.nodes.stage_role import StageRole
 
 
 class Restart:
@@ -45,7 +33,7 @@ class Restart:
         InputError: the cell has no window.
     """
 
-    def __init__(self, role: Resumable, file: str) -> None:
+    def __init__(self, role: "StageRole", file: str) -> None:
         self._role, self._file, self._node = role, file, role.node
         self._window = role.node.table.window
         if not self._window:
@@ -54,7 +42,7 @@ class Restart:
             )
         self.keep_at = 0
         # The newest states: number of blocks, state, and events scheduled since.
-        self._states: deque[tuple[int, bytes, list[tuple[str, int]]]] = deque()
+        self._states: deque[tuple[int, bytes, list[tuple[str, float]]]] = deque()
 
     def begin(self, *, joins: bool) -> None:
         """Begin at block 0, or resume from the state of another process."""
@@ -71,10 +59,15 @@ class Restart:
             self._states.popleft()
         self._write()
 
-    def keep_event(self, action: str, index: int) -> None:
-        """Append a scheduled event to the state file, for a process that resumes."""
+    def keep_event(self, action: str, place: float) -> None:
+        """Append a scheduled event to the state file, for a process that resumes.
+
+        Args:
+            action: the event.
+            place: sample at which it takes effect, an int; or number of revolutions, a float.
+        """
         for _, _, events in self._states:
-            events.append((action, index))
+            events.append((action, place))
         if self._states:
             self._write()
 
@@ -100,15 +93,16 @@ class Restart:
     def _resume(self) -> None:
         """Resume from the state of another process."""
         role, fresh, protocol = self._role, self._kept(), self._node.protocol
-        state = state_file.load(Path(self._file), self._node.table, fresh, Block)
+        state = state_file.load(Path(self._file), self._node.table, fresh, Block, Trigger)
         if state["of"] != fresh["of"]:
             raise LatheError(f"{self._file}: the state of another node or run; expected {fresh['of']}")
         role.blocks, role.samples, role.started = state["blocks"], state["samples"], True
         protocol.resumed(role.blocks)
         role.outputs.framer.companions = state["companions"]
         role.stage, role.inputs.buffers = state["stage"], state["tracks"]
-        for action, index in state["events"]:
-            role.stage.schedule(action, index)
+        for action, place in state["events"]:
+            schedule = role.stage.schedule if isinstance(place, int) else role.stage.schedule_at_revolution
+            schedule(action, place)
         assert protocol.master is not None, "it has announced all members"
         sources = {topic: name for name in protocol.master.members for topic in protocol.members[name].publishes}
         for topic, queue in role.inputs.queues.items():

@@ -3,6 +3,7 @@
 
 import time
 from collections import deque
+from collections.abc import Mapping
 from functools import partial
 from typing import cast
 
@@ -12,6 +13,7 @@ from rosgraph_msgs.msg import Clock
 
 from lathe_rc import messages
 from lathe_rc.cell.latency_histogram import LATENCY, LATENESS
+from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
@@ -26,6 +28,11 @@ _BURST = 64  # blocks released before other work gets its turn
 _JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is evaluated [s], and its largest loss
 
 
+def _per_block(table: TimeMasterParameters) -> float:
+    """Return the wall time per block [s]; 0: no pace."""
+    return table.block_size * table.step / table.speed_factor if table.speed_factor else 0.0
+
+
 class SpindleRole(StageRole):
     """Role of the time master; its stage is the spindle and its encoder.
 
@@ -38,17 +45,36 @@ class SpindleRole(StageRole):
     def __init__(self, node: CellNode) -> None:
         super().__init__(node)
         table = self.table = cast("TimeMasterParameters", node.table)
-        if table.members and not table.window and not table.speed_factor:
-            raise InputError(
-                f"{node.get_name()}.speed_factor = 0 with window = 0: nothing would hold the spindle back; "
-                "allowed: a speed_factor above 0, or a window"
-            )
+        self._check_pace(table)
         block = table.block_size * table.step
-        self.pace = Pace(
-            block / table.speed_factor if table.speed_factor else 0.0, table.window, round(_JUDGED / block)
-        )
+        self.pace = Pace(_per_block(table), table.window, round(_JUDGED / block))
         self._reported: deque[Progress] = deque()  # of members in this process
         self._cell: Cell | None = None
+
+    def _check_pace(self, table: TimeMasterParameters) -> None:
+        if table.members and not table.window and not table.speed_factor:
+            raise InputError(
+                f"{self.node.get_name()}.speed_factor = 0 with window = 0: nothing would hold the spindle back; "
+                "allowed: a speed_factor above 0, or a window"
+            )
+
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the parameters that may change in a run (extends `StageRole`)."""
+        return (*super().tunable, "speed_factor")
+
+    def tune(self, values: Mapping[str, Value]) -> str:
+        """Change the pace of the run at once; it touches no sample (extends `StageRole`).
+
+        Raises:
+            InputError: nothing would hold the spindle back.
+        """
+        table = self.table.changed(self.node.get_name(), values)
+        self._check_pace(table)
+        self.table = table
+        self.pace.change(_per_block(table), self.blocks, time.monotonic())
+        self.node.next_tick = time.monotonic()
+        return f"from block {self.blocks} on"
 
     @property
     def leads(self) -> TimeMasterProtocol:

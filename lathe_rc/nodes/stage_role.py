@@ -1,46 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Role of a node with a stage: reads blocks in order, computes alone or in a chain, and publishes."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import messages
-from lathe_rc.cell.parameters import explain_overflow
+from lathe_rc.cell import events
+from lathe_rc.cell.parameters import Value, explain_overflow
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import MASTERS, STAGES
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals
 from lathe_rc.nodes.block_queue import BlockQueue
-from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.inputs import Inputs
 from lathe_rc.nodes.outputs import Memory, Outputs
 from lathe_rc.nodes.restart import Restart
 from lathe_rc.protocol import Announcement, MemberProtocol
-from lathe_rc.protocol.actions import Action
+
+if TYPE_CHECKING:
+    from lathe_rc.nodes.chain import Chain
 
 _TOGETHER = 2  # steps per window, so that members still work in parallel
 
 
-class Chain(Protocol):
-    """Interface of stages that are computed together (implemented by `lathe_rc.nodes.chain.Chain`)."""
-
-    def advance(self) -> None:
-        """Compute as far as the inputs from outside the chain allow; the first stage sets the limit."""
-
-    def ready(self) -> tuple[int, bool] | None:
-        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
-
-    def compute(self, samples: int, *, last: bool) -> None:
-        """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
-
-    def leave(self) -> None:
-        """Dissolve the chain: each stage goes on alone from its current sample."""
-
-
-class StageRole:
+class StageRole(Role):
     """Role of a cell node that computes a stage.
 
     Args:
@@ -53,6 +42,7 @@ class StageRole:
         together: largest number of blocks computed in one step.
         started: the first sample is known.
         chain: chain of the stage; None if it computes alone.
+        angle: measured spindle angle of the newest sample [rad], of a stage with tunable parameters.
     """
 
     stage: Stage
@@ -63,8 +53,9 @@ class StageRole:
             self.stage = STAGES[node.kind](node.get_name(), node.table)
         compile_kernels(self.stage)  # so that the first block takes no longer than the next
         self.blocks = self.samples = 0
-        self.started = False
+        self.started, self.angle = False, 0.0
         self.chain: Chain | None = None
+        self._shown = self.stage.parameters_now
         self.together = max(min(node.table.window // _TOGETHER, messages.MAX_BLOCK // node.table.block_size), 1)
         self.inputs = Inputs([(node.topic(port.topic), port) for port in self.stage.inputs], node.table, self.together)
         self.outputs = Outputs(node, self.stage)
@@ -76,10 +67,6 @@ class StageRole:
     def protocol(self, own: Announcement) -> MemberProtocol:
         """Return the node's protocol object (implements `Role`)."""
         return MemberProtocol(own, self.node.table.window, masters=MASTERS)
-
-    def member_names(self) -> list[str]:
-        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
-        return []
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """Return topic, message type and sparse flag of each output (implements `Role`)."""
@@ -139,9 +126,6 @@ class StageRole:
                 f"{self.node.full_name}: the cell is running already, and this node cannot go on in mid-run"
             )
 
-    def perform(self, action: Action) -> None:
-        """Ignore the actions of a time master (implements `Role`)."""
-
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
         """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
         if self.chain is not None:
@@ -182,9 +166,6 @@ class StageRole:
         if self.chain is not None:
             self.chain.leave()
 
-    def finish(self) -> None:
-        """Do nothing: a stage has no files to close (implements `Role`)."""
-
     def clean_up(self) -> None:
         """Leave the chain and the exchange of the process (implements `Role`)."""
         self.failed()
@@ -209,19 +190,69 @@ class StageRole:
     # ---- events -------------------------------------------------------------------------------------
 
     def _on_schedule(self, request: Any, response: Any) -> Any:
-        node, index = self.node, max(self.samples, int(request.not_before))
-        if (self.restart is not None and not node.protocol.ready) or node.protocol.failure:
-            response.message = str(node.protocol.failure or f"{node.full_name} is not ready yet; ask again")
-            return response
+        index = max(self.samples, int(request.not_before))
         try:
+            self._accept_events(request.action)
             self.stage.schedule(request.action, index)
-        except InputError as error:
+        except LatheError as error:
             response.message = str(error)
             return response
-        if self.restart is not None and not node.protocol.over:
-            node.attempt(partial(self.restart.keep_event, request.action, index))
+        self._keep_event(request.action, index)
         response.accepted, response.sample_index = True, index
         return response
+
+    def _accept_events(self, *actions: str) -> None:
+        """Check that events can be scheduled now, and that the cell still converges after those that set parameters.
+
+        Raises:
+            LatheError: the reason why not.
+        """
+        node, protocol = self.node, self.node.protocol
+        if protocol.failure:
+            raise protocol.failure
+        if self.restart is not None and not protocol.ready:
+            raise InputError(f"{node.full_name} is not ready yet; ask again")
+        for action in actions:
+            self.stage.check_action(action)
+        if protocol.master is None or not any(action.startswith(f"{events.SET} ") for action in actions):
+            return
+        tuned = self.stage.tuned(*actions)
+        cell = Cell(*node.announced(protocol.master.members))
+        known = cell.stages[node.full_name.removeprefix(node.namespace)]
+        values = {name: getattr(tuned.shared, name) for name in tuned.tunable}
+        table = known.shared.model_copy(update={**values, "events": [], "faults": []})
+        type(known)(known.name, table).check_cell(cell, cures=False)
+        for warning in cell.warnings:
+            node.get_logger().warning(warning)
+
+    def _keep_event(self, action: str, place: float) -> None:
+        if self.restart is not None and not self.node.protocol.over:
+            self.node.attempt(partial(self.restart.keep_event, action, place))
+
+    @property
+    def tunable(self) -> tuple[str, ...]:
+        """Return the stage's parameters that may change in a run (implements `Role`)."""
+        return self.stage.tunable
+
+    def tune(self, values: Mapping[str, Value]) -> str:
+        """Schedule changed parameters as events at the begin of the next cycle (implements `Role`).
+
+        Raises:
+            LatheError: the node computes no samples, or the cell would not converge.
+        """
+        node = self.node
+        if not self.started or node.protocol.over:
+            when = "has ended" if node.protocol.over else "has not begun"
+            before = f"; 'ros2 lifecycle set {node.full_name} cleanup' lets parameters be set before it"
+            raise InputError(f"{node.full_name}: the run {when}{'' if node.protocol.over else before}")
+        actions = [f"{events.SET} {name} {value!r}" for name, value in values.items()]
+        self._accept_events(*actions)
+        cycle = int(getattr(self.stage.parameters_now, "cycle_revolutions", 1))
+        revolution = float((self.angle // (2.0 * np.pi * cycle) + 1) * cycle)
+        for action in actions:
+            self.stage.schedule_at_revolution(action, revolution)
+            self._keep_event(action, revolution)
+        return f"from revolution {revolution:g} on, as an event on {node.full_name}/events"
 
     # ---- data ---------------------------------------------------------------------------------------
 
@@ -268,12 +299,17 @@ class StageRole:
         """Compute and publish some blocks in one step; the last block of the run may be shorter."""
         memory = self.outputs.memory(samples)
         inputs = self.inputs.read(self.samples, samples)
+        if self.stage.tunable and self.stage.angle_input is not None:
+            self.angle = float(inputs[self.stage.angle_input]["angle"][-1])
         said = self.stage.advance(self.samples, inputs, [signals for signals, _ in memory], last=last)
         self._publish(said, memory, samples, last=last)
 
     def _publish(self, said: Sequence[Sparse], memory: Sequence[Memory], samples: int, *, last: bool) -> None:
         self.blocks += self.outputs.publish(self.samples, said, memory, last=last)
         self.samples += samples
+        if self.stage.parameters_now is not self._shown:
+            self._shown = self.stage.parameters_now
+            self.node.show_parameters(self._shown, self.stage.tunable)
         self.node.completed(self.blocks, self.samples, last=last)
         if last:
             self._complete()
@@ -302,7 +338,7 @@ class StageRole:
         master = self.node.protocol.master
         return master.name if master is not None else ""
 
-    def join(self, chain: Chain, inside: Collection[str]) -> None:
+    def join(self, chain: "Chain", inside: Collection[str]) -> None:
         """Join a chain at sample 0; the stages of the chain publish the topics ``inside``."""
         self.chain = chain
         self.inputs.join_chain(inside)

@@ -4,18 +4,70 @@
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from lathe_rc.cell.parameters import Table
-from lathe_rc.errors import LatheError
-from lathe_rc.nodes import dds, declare
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import arguments, dds, declare
 
 T = TypeVar("T", bound=Table)
+
+
+class StandaloneNode(Node):
+    """Node whose parameters are those of a table.
+
+    Args:
+        kind: name of the node.
+        table: parameter table of the node.
+        rosout: publish log messages on /rosout as well.
+
+    Attributes:
+        tuners: function that takes up a new value, by parameter; all other parameters are read-only.
+    """
+
+    def __init__(self, kind: str, table: type[Table], *, rosout: bool = True) -> None:
+        super().__init__(
+            kind,
+            automatically_declare_parameters_from_overrides=True,
+            allow_undeclared_parameters=True,
+            enable_rosout=rosout,
+        )
+        self._table = table
+        self.tuners: dict[str, Callable[[Any], None]] = {}
+
+    def tunes(self, name: str, tuner: Callable[[Any], None]) -> None:
+        """Let clients change a parameter, whose new values a function takes up."""
+        self.tuners[name] = tuner
+        declare.release(self, [name])
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Change parameters that can be tuned (extends `rclpy.node.Node`)."""
+        try:
+            parameters = [each if declare.is_of_rclpy(each.name) else self._checked(each) for each in parameter_list]
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        result = super().set_parameters_atomically(parameters)
+        for each in parameters:
+            if result.successful and each.name in self.tuners:
+                self.tuners[each.name](each.value)
+        return result
+
+    def _checked(self, parameter: Parameter) -> Parameter:
+        name, checked = self.get_name(), declare.checked(self.get_name(), self._table, parameter)
+        if checked.name not in self.tuners:
+            tunable = f"; allowed now: {', '.join(self.tuners)}" if self.tuners else ""
+            raise InputError(
+                f"{name}.{checked.name} is read-only: the node is made with it{tunable}; start it again with "
+                f"-p {name}:{checked.name}:=VALUE"
+            )
+        return checked
 
 
 @contextlib.contextmanager
@@ -27,7 +79,7 @@ def standalone_node(
     *,
     signals: SignalHandlerOptions | None = None,
     rosout: bool = True,
-) -> Iterator[tuple[Node, T]]:
+) -> Iterator[tuple[StandaloneNode, T]]:
     """Provide a node and its parameters as a context manager.
 
     Args:
@@ -41,18 +93,15 @@ def standalone_node(
     Raises:
         InputError: a parameter is invalid.
     """
+    arguments.check_namespaces(args)
     dds.settle()
     rclpy.init(args=["lathe", *args], signal_handler_options=signals)
     try:
-        node = Node(
-            kind,
-            automatically_declare_parameters_from_overrides=True,
-            allow_undeclared_parameters=True,
-            enable_rosout=rosout,
-        )
+        node = StandaloneNode(kind, table, rosout=rosout)
         declare.refuse_lost(node, args)
-        given = {name: value for name, value in declare.overrides(node).items() if value is not None}
-        yield node, table.read(kind, {**given, **values})
+        if warning := declare.missing_entry(node, args):
+            node.get_logger().warning(warning)
+        yield node, declare.declare(node, table, values)
     finally:
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()
@@ -61,7 +110,7 @@ def standalone_node(
 def run(
     kind: str,
     table: type[T],
-    work: Callable[[Node, T], None],
+    work: Callable[[StandaloneNode, T], None],
     values: Mapping[str, object],
     args: Sequence[str],
 ) -> int:

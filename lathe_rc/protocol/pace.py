@@ -20,11 +20,19 @@ class Pace:
     """
 
     def __init__(self, block: float, window: int, judged: int = 0) -> None:
-        self.block, self._judged = block, judged
-        self.most_late = max(1, window // 2) * block
+        self.block, self._window, self._judged = block, window, judged
         self.schedule = self.slipped = 0.0
         self.lateness = Durations()
         self._percentiles, self._late = Percentiles(), 0
+
+    @property
+    def most_late(self) -> float:
+        """Return the largest lateness that the cell catches up [s]."""
+        return max(1, self._window // 2) * self.block
+
+    def change(self, block: float, blocks: int, now: float) -> None:
+        """Continue with another wall time per block [s]: the next block, after ``blocks``, is due one from now."""
+        self.block, self.schedule = block, now - blocks * block
 
     def due(self, blocks: int) -> float:
         """Return the monotonic time at which the next block is due, given the number of blocks before it [s]."""

@@ -13,11 +13,14 @@ import pytest
 import installer
 import workplace
 from lathe_rc import __version__
+from lathe_rc.cell.beside import BESIDE
+from lathe_rc.cell.scenario import TABLES
 
 pytestmark = pytest.mark.system
 
 UV = workplace.PYTHON.with_name("uv")
 LOCK = workplace.REQUIREMENTS / "python.lock"
+EXECUTABLES = {*TABLES.own, *BESIDE, "container", "launch_plan"}  # of `ros2 run`
 NOT_COPIED = shutil.ignore_patterns(".git", ".lathe", ".*_cache", ".hypothesis", "bags")
 
 
@@ -55,12 +58,15 @@ MESSAGES = {name for name in files("msg_defs") if name.endswith((".msg", ".srv")
 def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
     (wheel,) = dist.glob("lathe_rc-*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    data = f"lathe_rc-{__version__}.data/data/share"
+    prefix = f"lathe_rc-{__version__}.data/data"
+    data = f"{prefix}/share"
     shared = {"package.xml", *files("config"), *files("launch")}
     expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")} | files("lathe_papers")
     expected |= {f"lathe_rc/{name}" for name in MESSAGES}
     expected |= {f"{data}/lathe_rc/{name}" for name in shared}
     expected |= {f"{data}/ament_index/resource_index/packages/lathe_rc"}
+    # Not on the PATH, where pip puts scripts, but where `ros2 run` looks.
+    expected |= {f"{prefix}/lib/lathe_rc/{name}" for name in EXECUTABLES}
     assert {name for name in names if f"lathe_rc-{__version__}.dist-info/" not in name} == expected
 
 
@@ -89,7 +95,7 @@ class Installed:
     """An environment with lathe_rc, called as a user calls it, from a folder of the user's own."""
 
     def __init__(self, place: Path) -> None:
-        self._programs = place / "bin"
+        self.programs = place / "bin"
         self.folder = place / "work"
         self.folder.mkdir()
 
@@ -97,7 +103,7 @@ class Installed:
         """Return what a program of the environment prints, on both streams."""
         environ = {"PATH": os.defpath, "HOME": str(self.folder)}
         done = subprocess.run(
-            [self._programs / program, *words],
+            [self.programs / program, *words],
             cwd=self.folder,
             env=environ,
             stdout=subprocess.PIPE,
@@ -122,7 +128,8 @@ def test_it_runs_without_ros(alone):
     alone.run("lathe", "report", "B", "-o", "report.html")
     assert (alone.folder / "report.html").stat().st_size > 100_000
     assert "Usage: " in alone.run("lathe", "study", "--help")
-    assert alone.run("tool", code=1).startswith("lathe: no module ")
+    assert not (alone.programs / "tool").exists()
+    assert alone.run("../lib/lathe_rc/tool", code=1).startswith("lathe: no module ")
     alone.run("lathe", "new", "law", "mine")
     notebook = """
 from pathlib import Path

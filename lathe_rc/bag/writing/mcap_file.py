@@ -93,7 +93,7 @@ class McapFile:
     def __init__(self, path: Path, *, chunk_size: int, compress: bool, profile: str = "ros2") -> None:
         # Unbuffered, so that flush() hands all bytes to the operating system and `_put` can truncate a failed write.
         self._stream = path.open("xb", buffering=0)
-        self._chunk_size = chunk_size
+        self._chunk_size, self._compress, self._profile = chunk_size, compress, profile
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
@@ -111,6 +111,19 @@ class McapFile:
         self._kept = self._described = 0
         self._refused: OSError | None = None
         self._put(MCAP0_MAGIC + _encoded(records.Header(profile, "lathe_rc")))
+
+    def successor(self, path: Path) -> "McapFile":
+        """Return a new file for further messages, with the same settings, schemas and channel numbers.
+
+        Raises:
+            OSError: the file cannot be created.
+        """
+        made = McapFile(path, chunk_size=self._chunk_size, compress=self._compress, profile=self._profile)
+        made._schemas, made._channels = self._schemas.copy(), self._channels.copy()
+        made.counts = dict.fromkeys(self.counts, 0)
+        for record in (*made._schemas, *made._channels):
+            made._append(record)
+        return made
 
     def _begin_chunk(self) -> None:
         self._chunk.seek(0)  # its memory is reused

@@ -29,7 +29,15 @@ def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -
     if snapshots is not None and table.mode == "snapshot":
         return snapshots
     bag = BagWriter(path, compression=table.compression, chunk_size=table.chunk_size, about={})
+    split(bag, table.split_duration)
     return bag if snapshots is None else Both(bag, snapshots)
+
+
+def split(output: Output, duration: float) -> None:
+    """Set the simulated time [s] after which the bag of a whole run goes on in another file; 0: one file."""
+    bag = output.first if isinstance(output, Both) else output
+    if isinstance(bag, BagWriter):
+        bag.split_ns = round(duration * 1e9)
 
 
 def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) -> Output:

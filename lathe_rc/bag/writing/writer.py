@@ -121,6 +121,24 @@ def refuse_existing(path: Path) -> None:
         raise InputError(f"{path}: there is no folder {path.parent}; make it, or name another one")
 
 
+class _Part(NamedTuple):
+    """Completed file of a bag: name, messages by channel, smallest and largest log time [ns], None without messages."""
+
+    name: str
+    counts: Mapping[int, int]
+    first_ns: int | None
+    last_ns: int | None
+
+    def span(self) -> dict[str, Any]:
+        """Return start, duration and number of messages as in the metadata of a bag."""
+        first = _NEVER if self.first_ns is None else self.first_ns
+        return {
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "duration": {"nanoseconds": max((self.last_ns or 0) - first, 0)},
+            "message_count": sum(self.counts.values()),
+        }
+
+
 class BagWriter:
     """Writer of one bag.
 
@@ -130,6 +148,10 @@ class BagWriter:
         chunk_size: size after which a chunk is written out, and thus the largest loss in a crash [B].
         about: strings for the bag's metadata (see `tell`).
         profile: profile of the MCAP file.
+
+    Attributes:
+        split_ns: span of log time after which the next message begins another file [ns]; 0: one file. It may change
+            at any time.
 
     Raises:
         InputError: the folder exists, or cannot be created.
@@ -146,6 +168,9 @@ class BagWriter:
     ) -> None:
         refuse_existing(path)
         self._path, self._name = path, f"{path.name}.mcap"
+        self.split_ns = 0
+        self._parts: list[_Part] = []
+        self._began_ns: int | None = None  # log time of the first message in the file
         try:
             path.mkdir(mode=0o755)
             self._file = McapFile(
@@ -170,7 +195,8 @@ class BagWriter:
         try:
             yield
         except OSError as error:
-            before = "" if self._file.first_ns is None else "what was recorded before is readable: "
+            is_empty = self._file.first_ns is None and not self._parts
+            before = "" if is_empty else "what was recorded before is readable: "
             raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
 
     def tell(self, about: Mapping[str, str]) -> None:
@@ -237,6 +263,22 @@ class BagWriter:
         with self._on_disk():
             self._file.copy_record(opcode, content)
 
+    def _continue_at(self, log_ns: int) -> None:
+        """Begin another file if the current one has the span that it may have."""
+        if self._began_ns is None:
+            self._began_ns = log_ns
+        elif 0 < self.split_ns <= log_ns - self._began_ns:
+            following = f"{self._path.name}_{len(self._parts) + 1}.mcap"
+            made = self._file.successor(self._path / following)
+            made.add_metadata("lathe_rc", self._about)
+            self._file.free_room()
+            self._file.finish()
+            self._parts.append(self._part())
+            self._file, self._name, self._began_ns = made, following, log_ns
+
+    def _part(self) -> _Part:
+        return _Part(self._name, self._file.counts, self._file.first_ns, self._file.last_ns)
+
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to an announced topic.
 
@@ -244,6 +286,7 @@ class BagWriter:
             LatheError: writing to the disk fails.
         """
         with self._on_disk():
+            self._continue_at(log_ns)
             self._file.add_message(self._channels[topic], log_ns, data)
 
     def channel(self, topic: str) -> int:
@@ -257,6 +300,7 @@ class BagWriter:
             LatheError: writing to the disk fails.
         """
         with self._on_disk():
+            self._continue_at(first_ns)
             self._file.add_rows(plan.size, data)
 
     def flush(self) -> None:
@@ -301,13 +345,14 @@ class BagWriter:
 
     def _metadata(self) -> dict[str, Any]:
         """Return the bag metadata (version 9) with the message counts of the file."""
-        counts = {topic: sum(map(self._file.counts.__getitem__, each)) for topic, (_, each) in self._topics.items()}
-        first = _NEVER if self._file.first_ns is None else self._file.first_ns
-        span = {
-            "starting_time": {"nanoseconds_since_epoch": first},
-            "duration": {"nanoseconds": max((self._file.last_ns or 0) - first, 0)},
-            "message_count": sum(counts.values()),
+        parts = [*self._parts, self._part()]
+        counts = {
+            topic: sum(part.counts.get(number, 0) for part in parts for number in numbers)
+            for topic, (_, numbers) in self._topics.items()
         }
+        firsts = [part.first_ns for part in parts if part.first_ns is not None]
+        lasts = [part.last_ns for part in parts if part.last_ns is not None]
+        whole = _Part("", dict(enumerate(counts.values())), min(firsts, default=None), max(lasts, default=None))
         topics = [
             {
                 "topic_metadata": {
@@ -324,12 +369,12 @@ class BagWriter:
         return {
             "version": 9,
             "storage_identifier": "mcap",
-            "relative_file_paths": [self._name],
-            **span,
+            "relative_file_paths": [part.name for part in parts],
+            **whole.span(),
             "topics_with_message_count": topics,
             "compression_format": "",
             "compression_mode": "",
-            "files": [{"path": self._name, **span}],
+            "files": [{"path": part.name, **part.span()} for part in parts],
             "custom_data": self._about or None,
             "ros_distro": "rosbags",
         }
@@ -339,46 +384,50 @@ class Both:
     """Pair of outputs with the same topics, both of which receive every message; an `Output`.
 
     Args:
-        first, second: the two outputs.
+        first: bag of the whole run.
+        second: other output.
+
+    Attributes:
+        first: see the arguments.
     """
 
-    def __init__(self, first: Output, second: Output) -> None:
-        self._first, self._second = first, second
+    def __init__(self, first: BagWriter, second: Output) -> None:
+        self.first, self._second = first, second
 
     def tell(self, about: Mapping[str, str]) -> None:
         """Store strings in the metadata of both outputs."""
-        self._first.tell(about)
+        self.first.tell(about)
         self._second.tell(about)
 
     def add_topic(self, topic: str, msgtype: str, qos: Qos) -> None:
         """Announce a topic to both outputs."""
-        self._first.add_topic(topic, msgtype, qos)
+        self.first.add_topic(topic, msgtype, qos)
         self._second.add_topic(topic, msgtype, qos)
 
     def channel(self, topic: str) -> int:
         """Return the channel number of a topic, which is the same in both outputs."""
-        number = self._first.channel(topic)
+        number = self.first.channel(topic)
         assert number == self._second.channel(topic), "topics are announced to both in the same order"
         return number
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
         """Append a message to both outputs."""
-        self._first.write(topic, log_ns, data)
+        self.first.write(topic, log_ns, data)
         self._second.write(topic, log_ns, data)
 
     def write_rows(self, plan: RowPlan, first_ns: int, data: bytes | memoryview) -> None:
         """Append rows of blocks to both outputs."""
-        self._first.write_rows(plan, first_ns, data)
+        self.first.write_rows(plan, first_ns, data)
         self._second.write_rows(plan, first_ns, data)
 
     def flush(self) -> None:
         """Flush both outputs."""
-        self._first.flush()
+        self.first.flush()
         self._second.flush()
 
     def close(self) -> None:
         """Close both outputs, the second even if closing the first fails."""
         try:
-            self._first.close()
+            self.first.close()
         finally:
             self._second.close()

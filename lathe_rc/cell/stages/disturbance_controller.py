@@ -20,7 +20,7 @@ from lathe_rc.cell.stages.law import Now
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
 from lathe_rc.control.disturbance import DisturbanceTable, FormAhead, commanded, disturbance, forget, observed
-from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing
+from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing, with_gain
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 
@@ -106,6 +106,7 @@ class DisturbanceController(FormLaw):
     kind = "disturbance_controller"
     Parameters = DisturbanceControllerParameters
     parameters: DisturbanceControllerParameters
+    tunable = ("learning_gain",)
     law: Memory
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
     factor = "sup|factor of a revolution|"
@@ -127,6 +128,12 @@ class DisturbanceController(FormLaw):
             forget(self.law.known)
         else:
             super().perform(action)
+
+    def tune(self, parameters: DisturbanceControllerParameters) -> None:
+        """Continue with another learning gain from the next sample on; memory and estimates are kept."""
+        self.parameters = parameters
+        known = self.law.known
+        self.law = self.law._replace(known=known._replace(memory=with_gain(known.memory, parameters.learning_gain)))
 
     def settings(self) -> str:
         """Return the drive model that decides whether learning converges, in words."""

@@ -29,6 +29,7 @@ from lathe_rc.plants.linear import discretise, second_order
 
 _SETTLED = 4.0  # settling time of a drive, in lead times
 _FILE_ACTIONS = ("save", "load")
+_OF_Q = {"fir": ("q_pass", "q_stop")}  # parameters that act, by Q filter; of all others the width
 _STATUS = "coarse/learning"  # topic
 _MOST = 1024  # largest number of entries in a table of margins
 _LEAST_Q = 1e-6  # [s] smallest Q width from which a wider Q is searched
@@ -56,6 +57,7 @@ class LearningController(Learner):
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
         super().__init__(name, parameters)
+        self.tunable = ("learning_gain", "lead_time", *_OF_Q.get(parameters.q_filter, ("q_time",)))
         self._q = parameters.make_q(name)
         self._controller = RepetitiveController(
             grid=parameters.points_per_revolution,
@@ -240,6 +242,13 @@ class LearningController(Learner):
         else:
             controller.learning = action == "learn"
 
+    def tune(self, parameters: LearningControllerParameters) -> None:
+        """Continue with another gain, lead or Q from the next sample on; the memory is kept."""
+        self.parameters = parameters
+        self._q = parameters.make_q(self.name)
+        self._margins.forget_suprema()
+        self._controller.retune(self._q, parameters.learning_gain, parameters.make_preview(self.name))
+
     # ---- samples ------------------------------------------------------------------------------------
 
     @property
@@ -352,6 +361,10 @@ class Margins:
     def __getstate__(self) -> dict[str, Any]:
         """Return the pickled state, without the responses, which are computed on demand."""
         return {**self.__dict__, "_responses": {}}
+
+    def forget_suprema(self) -> None:
+        """Forget what depends on gain, lead and Q."""
+        self._suprema.clear()
 
     def _response(self, model: Identified) -> Response:
         # Three digits of a model exceed the accuracy of its margin, and a steady model is computed once.

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The real ``ros2`` command line, launch and launch_testing, where there is a ROS 2 whose index has lathe_rc.
+
+Its Python need not have what lathe_rc needs. ROS 2 that is sourced has all of it; beside the wheels, pip installs the
+public sources of ros2cli, launch and launch_ros.
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from lathe_rc import harness
+from lathe_rc.bag import reader
+from lathe_rc.cell.beside import BESIDE
+from lathe_rc.cell.scenario import TABLES, load
+from lathe_rc.harness import launch_plan
+
+ROS2 = shutil.which("ros2")
+FILE = Path(__file__).parents[2] / "config" / "piston.yaml"
+
+pytestmark = [pytest.mark.system, pytest.mark.skipif(ROS2 is None, reason="no ros2 on the PATH")]
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch, domain):
+    """An empty folder, and a ROS domain of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "log"))
+    return tmp_path
+
+
+def ros2(*words, code=0):
+    """What a command of ros2 prints on both streams; ``code``: None for any."""
+    done = subprocess.run([ROS2, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert code is None or done.returncode == code, done.stdout
+    return done.stdout
+
+
+def test_the_executables_are_found_by_ros2():
+    """``ros2 pkg executables`` lists every node, also after an installation by pip."""
+    listed = {line.split()[1] for line in ros2("pkg", "executables", "lathe_rc").splitlines()}
+    assert {*TABLES.own, *BESIDE, "container", launch_plan.__name__.rpartition(".")[2]} <= listed
+    assert "usage: ros2 run lathe_rc tool" in ros2("run", "lathe_rc", "tool", "--help")
+
+
+def test_an_argument_that_there_is_not_is_refused():
+    assert "no launch argument 'revolutions'" in ros2(
+        "launch", "lathe_rc", "cell.launch.py", "revolutions:=5.0", code=1
+    )
+
+
+TWO_CELLS = """
+from launch import LaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.actions import PushRosNamespace
+from launch_ros.substitutions import FindPackageShare
+
+FILE = PathJoinSubstitution([FindPackageShare("lathe_rc"), "launch", "cell.launch.py"])
+
+
+def cell(name, **arguments):
+    arguments |= {"bag": name, "spindle_encoder.revolutions": "3.0", "spindle_encoder.speed_factor": "0.0"}
+    include = IncludeLaunchDescription(PythonLaunchDescriptionSource(FILE), launch_arguments=arguments.items())
+    return GroupAction([PushRosNamespace("shop"), include])
+
+
+def generate_launch_description():
+    return LaunchDescription([cell("plain"), cell("deeper", namespace="left")])
+"""
+
+
+def test_two_included_cells_are_in_the_namespaces_that_are_pushed_and_end():
+    Path("two.launch.py").write_text(TWO_CELLS)
+    assert ros2("launch", "two.launch.py").count("process has finished cleanly") == 10
+    for bag, namespace in (("plain", "/shop"), ("deeper", "/shop/left")):
+        recording = reader.read_bag(Path(bag))
+        assert all(topic.startswith(f"{namespace}/") for topic in recording.dense)
+
+
+DICTIONARY = """
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    values = {{"feed": 0.3e-3}}
+    return LaunchDescription([Node(package="lathe_rc", executable="tool", parameters=["{file}", values])])
+"""
+
+
+def test_a_dictionary_of_a_launch_file_does_not_lose_silently():
+    Path("dictionary.launch.py").write_text(DICTIONARY.format(file=FILE))
+    said = ros2("launch", "dictionary.launch.py")
+    assert re.search(
+        r"lathe: feed = 0.0003 of \S+ does not reach /tool, which has 0.0001 of an earlier file; write", said
+    )
+
+
+def test_parameters_are_set_in_a_run_that_is_simulated_again():
+    """``ros2 param set`` changes gain and pace in a run; the same event gives the same digests."""
+    slow = ("spindle_encoder.revolutions:=12.0", "spindle_encoder.speed_factor:=0.005")
+    with subprocess.Popen(
+        [ROS2, "launch", "lathe_rc", "cell.launch.py", "bag:=bag", *slow], stdout=subprocess.PIPE, text=True
+    ) as launch:
+        try:
+            while "begins with" not in launch.stdout.readline():
+                pass
+            ours, said = "/learning_controller", ""
+            while "successful: from revolution 1 on, as an event on" not in said:  # not before its first block
+                said = ros2("param", "set", ours, "learning_gain", "0.5", code=None)
+            assert "Setting parameter failed: " in ros2("param", "set", ours, "gain", "0.5", code=None)
+            assert "is read-only: " in ros2("param", "set", ours, "feedback_delay", "64", code=None)
+            assert "Double value is: 0.5" in ros2("param", "get", ours, "learning_gain")
+            assert "successful: from block" in ros2("param", "set", "/spindle_encoder", "speed_factor", "0.0")
+            rest = launch.stdout.read()
+            assert launch.wait() == 0, rest
+        finally:
+            launch.send_signal(signal.SIGINT)
+            ros2("daemon", "stop")
+    recording = reader.read_bag(Path("bag"))
+    said = recording.sparse["/learning_controller/events"].values
+    assert said["action"] == ["set learning_gain 0.5"]
+    event = f"sample {said['sample_index'][0]}: set learning_gain 0.5"
+    sets = ["spindle_encoder.revolutions=12.0", f"learning_controller.events=['{event}']"]
+    assert recording.digests() == harness.run(load(FILE, sets)).digest
+
+
+def test_the_example_for_launch_pytest_passes(place):
+    python = os.environ.get("ROS2_PYTHON", "/usr/bin/python3")  # the one that ros2 runs
+    if subprocess.run([python, "-c", "import launch_pytest"], capture_output=True, check=False).returncode:
+        pytest.skip(f"{python} has no launch_pytest")
+    shutil.copy(Path(__file__).parents[2] / "examples" / "cell_launch_pytest.py", "test_cell.py")
+    command = [python, "-m", "pytest", "-p", "no:cacheprovider", "test_cell.py"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.skipif(shutil.which("launch_test") is None, reason="no launch_test on the PATH")
+def test_the_example_for_launch_testing_passes():
+    example = Path(__file__).parents[2] / "examples" / "cell_launch_test.py"
+    done = subprocess.run(
+        ["launch_test", example],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        env=os.environ,
+    )
+    assert done.returncode == 0, done.stdout

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ROS and pip are told of the package: its dependencies, executables and tests."""
+
+import ast
+import runpy
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+import setuptools
+
+ROOT = Path(__file__).parents[1]
+#: rosdep keys by requirement; None: rosdep has none, or one for another system alone
+KEYS = {
+    **{name: f"python3-{name}" for name in ("click", "jinja2", "matplotlib", "numba", "numpy", "platformdirs")},
+    **{name: f"python3-{name}" for name in ("pydantic", "rich", "scipy")},
+    "pyyaml": "python3-yaml",
+    "rosbags": "python3-rosbags-pip",
+    **dict.fromkeys(("control", "isal", "lz4", "mcap", "plotext", "pyarrow", "vl-convert-python", "zstandard")),
+}
+#: packages of ROS whose modules lathe_rc and its launch file may import
+OF_ROS = (
+    "ament",
+    "builtin",
+    "composition",
+    "diagnostic",
+    "domain",
+    "launch",
+    "lifecycle",
+    "rcl",
+    "ros",
+    "sensor",
+    "std",
+)
+
+
+@pytest.fixture(scope="module")
+def declared():
+    root = ET.parse(ROOT / "package.xml").getroot()  # noqa: S314 - our own
+    return {depend.text for depend in root.iter("exec_depend")}
+
+
+def imported():
+    """The modules that lathe_rc and its launch file import, without their submodules."""
+    for path in [*(ROOT / "lathe_rc").rglob("*.py"), *(ROOT / "launch").glob("*.py")]:
+        if "msg_defs" in path.parts:
+            continue  # the package of the messages, which has a package.xml of its own
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module]
+            yield from (name.partition(".")[0] for name in names)
+
+
+def test_ros_packages_that_are_imported_are_declared(declared):
+    modules = {name for name in imported() if name.startswith(OF_ROS) and name not in sys.stdlib_module_names}
+    assert {"rclpy", "rcl_interfaces", "builtin_interfaces", "ament_index_python", "launch_ros"} <= modules
+    assert modules - {"rosbags"} <= declared
+
+
+def test_requirements_with_a_rosdep_key_are_declared(declared):
+    lines = (ROOT / "requirements" / "runtime.in").read_text(encoding="utf-8").splitlines()
+    names = {line.partition(">")[0].partition("=")[0].strip() for line in lines if line and not line.startswith("#")}
+    assert names == KEYS.keys()
+    assert {key for key in KEYS.values() if key} <= declared
+
+
+@pytest.fixture
+def metadata(monkeypatch):
+    """The arguments of setup() for a command of setup.py."""
+
+    def given(command):
+        found = {}
+        monkeypatch.setattr(setuptools, "setup", lambda **words: found.update(words))
+        monkeypatch.setattr(sys, "argv", ["setup.py", command])
+        monkeypatch.chdir(ROOT)
+        runpy.run_path("setup.py")
+        return found
+
+    return given
+
+
+def test_pip_puts_the_command_lathe_alone_on_the_path(metadata):
+    """In a wheel the executables of ``ros2 run`` are files in lib/lathe_rc, where colcon puts its scripts."""
+    assert metadata("bdist_wheel")["entry_points"]["console_scripts"] == ["lathe = lathe_rc.cli:main"]
+    names = {text.partition(" = ")[0] for text in metadata("install")["entry_points"]["console_scripts"]}
+    assert {"lathe", "tool", "profile", "container", "launch_plan"} <= names
+
+
+def test_colcon_finds_the_tests(metadata):
+    """Without pytest among the requirements of the tests, ``colcon test`` runs none and is green."""
+    assert "pytest" in metadata("install")["extras_require"]["test"]
