@@ -141,9 +141,9 @@ def noticed(name: str, node: str, fault: str, revolution: int) -> tuple[str, int
 HEAD = """\
 # Every fault, and its reaction
 
-`./lathe python figures/safety.py` prints this page, one run per row. Each fault begins at the given revolution and is
-permanent. "Too deep" is the largest form error into the part from the fault until the tool is out, or until the end.
-Definitions and limits are in [safety.md](safety.md).
+`./lathe python figures/safety.py` prints this page; each row is one run. Each fault begins at the given revolution and
+is permanent. "Too deep by" is the largest form error into the part between the fault and the safe state, or the end of
+the run. [safety.md](safety.md) gives the definitions and limits.
 """
 
 

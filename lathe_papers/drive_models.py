@@ -45,7 +45,7 @@ _FREQUENCIES = 20_001  # number of frequencies of Q - Z
 class DriveModelsParameters(StudyParameters):
     """Parameters of the drive-model study: source of the step response, and settings of the controller."""
 
-    file: str = parameter("", "CSV with columns time_ms,response; empty: simulate the drive", path=True)
+    file: str = parameter("", "measurement with time and response; empty: simulate the drive", path=True)
     natural_frequency: Annotated[float, Ge(50), Le(10_000)] = parameter(1038.0, "ωn of the simulated drive", "rad/s")
     damping: Annotated[float, Ge(0.05), Le(10)] = parameter(0.804, "damping ratio ζ of the simulated drive")
     delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "delay τ of the simulated drive", "s")

@@ -11,6 +11,7 @@ from types import ModuleType
 from lathe_rc.errors import LatheError
 
 _MODULES = {
+    "formats": ("asammdf", "nptdms", "x3pio"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),
@@ -20,14 +21,13 @@ _MODULES = {
         "xxhash",
     ),
     "view": ("rerun", "rerun_bindings"),
-    "formats": ("x3pio",),
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
 _CHECKOUT = {
+    "formats": "./lathe setup formats in a checkout",
     "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
     "sweep": "./lathe setup sweep in a checkout",
     "view": "./lathe setup view in a checkout",
-    "formats": "./lathe setup formats in a checkout",
 }
 
 

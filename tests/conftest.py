@@ -3,13 +3,15 @@
 
 import gc
 import signal
+import sys
+from collections import Counter
 
 import pytest
 import rclpy
 from hypothesis import HealthCheck, settings
 
 import slow_tests
-from lathe_rc import allowed_code, harness
+from lathe_rc import allowed_code, harness, process_launcher
 from lathe_rc.nodes import dds
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
@@ -25,6 +27,34 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Nodes that the tests make have the DDS settings of those of a cell: by default what one missed comes after 3 s.
 dds.settle()
+
+
+_started = Counter()  # processes that the running test has started, by their kind
+
+
+def _count_program(event, arguments):
+    if event == "subprocess.Popen" and not any("lathe_rc.nodes.fork_server" in str(word) for word in arguments[1]):
+        _started["programs"] += 1
+
+
+def _counted(start):
+    def call(*arguments, **options):
+        _started["processes"] += 1
+        return start(*arguments, **options)
+
+    return call
+
+
+sys.addaudithook(_count_program)
+process_launcher.ForkServer.start = _counted(process_launcher.ForkServer.start)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item, call):
+    """Report the processes of cells and the programs that a test has started; fixtures count for their first test."""
+    if call.when == "teardown":
+        item.user_properties.extend(_started.items())
+        _started.clear()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -73,6 +73,13 @@ FAULTS = (
     ),
     Fault(
         "member",
+        "            if other.state not in established:  # an established namesake would answer in turn, without end\n"
+        "                self.announce()\n",
+        "            self.announce()\n",
+        "two established namesakes answer each other",
+    ),
+    Fault(
+        "member",
         "        return names_this and self.phase in (None, Phase.WAITING)\n",
         "        return True\n",
         "a second time master takes the place of the first",

@@ -32,6 +32,7 @@ from lathe_rc.protocol import (
 SIZE = 4  # samples in a block
 HOST = "here"
 LEASE = 0.08  # [s] of DDS's liveliness
+RESTART_TIME = 1.0  # [s] that the cell waits for another process of a member
 HORIZON = 60.0  # [s] of simulated wall time after which a member that is still there hangs
 
 
@@ -121,8 +122,8 @@ class Network:
     def forget(self, process: str) -> None:
         """Remove an ended process: its messages in transit may be lost, since they are not repeated."""
         self._history = {key: queue for key, queue in self._history.items() if key[0] != process}
-        gone = {key for key in self._matched if process in key[:2]}
-        self._matched -= {key for key in gone if key[1] == process or self._cell.random.random() < 0.5}
+        gone = sorted(key for key in self._matched if process in key[:2])  # the order of a set differs by process
+        self._matched.difference_update(key for key in gone if key[1] == process or self._cell.random.random() < 0.5)
 
 
 class Process:
@@ -172,7 +173,7 @@ class Process:
         masters = ("spindle_encoder",)
         self.protocol: MemberProtocol
         if is_master:
-            reactions = Reactions(cell.stalls, 0.5, 1.0, cell.safe_blocks * SIZE, SIZE)
+            reactions = Reactions(cell.stalls, 0.5, RESTART_TIME, cell.safe_blocks * SIZE, SIZE)
             self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters)
             self.protocol.know_end(cell.length * SIZE)
         else:
@@ -288,7 +289,8 @@ class Process:
         if self.alive and not self.stopped and self.listens and not self.protocol.done:
             self.look()
         if self.alive:
-            self.cell.at(self.cell.now + (0.1 if self.protocol.ready else 0.02), self.tick)
+            rests = self.protocol.ready and self.design.name != self.cell.master
+            self.cell.at(self.cell.now + (0.1 if rests else 0.02), self.tick)
 
     def _step(self) -> None:
         self._perform_all()
@@ -699,6 +701,9 @@ class Schedule:
     def _slow(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
             process.cost = min(seconds, 0.02)
+            messages_per_report = (len(design.inputs) + 1) * process.protocol.progress_step
+            if self.cell.stalls == "safe" and process.cost * messages_per_report > 0.2:
+                self.cell.culprits.add(design.name)  # it reports nothing for longer than ``stall_time``
 
     def _pause(self, design: Design, seconds: float, other: Design) -> None:
         """Deactivate a node, and activate it again."""
@@ -752,11 +757,12 @@ class Schedule:
 
     def _shutdown(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
-            if process.protocol.phase in (None, 0):
-                return
             self._blame(design)
             process.protocol.shut_down(self.cell.now)
             process._step()
+            if not self._running():
+                self.cell.killed[design.name] = self.cell.now
+                self.cell.at(self.cell.now + 1.2 + min(seconds, 0.5), partial(self._launch, design))
 
     def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():
@@ -801,6 +807,7 @@ def violations(cell: Simulation) -> list[str]:
     to_blame = cell.culprits | cell.killed.keys()
     if not lost <= to_blame:
         found.append(f"lost {sorted(lost)}; {sorted(to_blame)} are to blame")
+    found += [f"{name} was not waited for" for name in _lost_too_early(cell)]
     if not cell.culprits and not lost:
         found += [f"{p.identity}: {p.protocol.failure}" for p in everyone if p.protocol.exit_code]
         recorders = [p for p in everyone if p.design.records and p.blocks == cell.length]
@@ -814,14 +821,31 @@ def violations(cell: Simulation) -> list[str]:
     return found
 
 
+def _lost_too_early(cell: Simulation) -> Iterator[str]:
+    """Yield the members that were lost alone and dead, although another process of them could still come."""
+    died: dict[str, float] = {}
+    lost: set[str] = set()
+    for time, _, event, values in cell.reports:
+        if event == "dead" and values["restarts"]:
+            died[values["member"]] = time
+        if event == "safe":
+            new, lost = set(values["lost"]) - lost, set(values["lost"])
+            yield from (
+                name
+                for name in new
+                if len(new) == 1 and f"{name} died" in values["why"] and time - died.get(name, -1.0) < RESTART_TIME
+            )
+
+
 def _waits_for_another(process: Process) -> bool:
-    """Return True if a process has lost its time master, or is a second node of one name, which no cell waits for.
+    """Return True if a process has lost its time master, or is a second node of one name, or waits for such a master.
 
     Such a process reports this; an operator ends it, or starts another time master.
     """
-    master = process.protocol.master
+    master, cell = process.protocol.master, process.cell
     named = master is not None and process.design.name in master.members
-    return process.namesake or not (named or process.cell.process_of(process.cell.master))
+    masters = [each for each in cell.processes.values() if each.design.name == cell.master]
+    return process.namesake or (all(each.namesake for each in masters) if masters else not named)
 
 
 def play(seed: int) -> tuple[Simulation, list[str]]:

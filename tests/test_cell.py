@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
-from cells import Seen, held
-from lathe_rc_msgs.msg import EncoderBlock, ToolBlock
+from cells import Seen
 from lathe_rc_msgs.srv import Schedule
 from rosbags.highlevel import AnyReader
 
@@ -49,13 +48,13 @@ HOSTS = {
 def test_host_block_size_window_pace_and_grouping_change_no_bit(offline, mode, overrides, groups):
     result = harness.run(piston(*overrides), mode=mode, groups=groups)
     assert result.digest == offline
-    assert "spindle_encoder.speed_factor=1.0" not in overrides or result.real_time_factor <= 1.0
+    paced = "spindle_encoder.speed_factor=1.0" in overrides
+    assert (result.lateness is not None) == paced
+    assert not paced or result.real_time_factor <= 1.0
 
 
-# The largest window is longer than the run: nobody waits, and still the stopped one is named before the end.
-@pytest.mark.parametrize(("nodes", "window"), [(["tool", "recorder", "spindle_encoder"], 64), (["tool"], 4096)])
-def test_a_stopped_process_changes_no_bit(offline, nodes, window, tmp_path):
-    stopped = piston("spindle_encoder.speed_factor=0.2", f"window={window}")
+def test_a_stopped_process_changes_no_bit(offline, tmp_path):
+    nodes, stopped = ["tool", "recorder", "spindle_encoder"], piston("spindle_encoder.speed_factor=0.2")
     cell = harness.with_recorder(stopped, tmp_path / "bag", keep=True)
     with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
         seen = Seen(processes)
@@ -66,22 +65,6 @@ def test_a_stopped_process_changes_no_bit(offline, nodes, window, tmp_path):
             # then does it go on.
             seen.wait_for("stall", member=f"/{node}")
             os.kill(processes.pids[node], signal.SIGCONT)
-        processes.wait_for_end()
-    assert reader.read_bag(tmp_path / "bag").digests() == offline
-
-
-def test_a_stranger_that_listens_from_the_start_changes_no_bit(offline, ghost, domain, tmp_path):
-    cell, heard = harness.with_recorder(piston("spindle_encoder.speed_factor=0.5"), tmp_path / "bag", keep=True), []
-    ears = [
-        ghost.create_subscription(EncoderBlock, "/encoder", lambda _: None, 10),
-        ghost.create_subscription(ToolBlock, "/tool", heard.append, 10),
-    ]
-    with held(cell, domain) as (processes, begin):
-        while not all(ear.get_publisher_count() for ear in ears):
-            rclpy.spin_once(ghost, timeout_sec=0.02)
-        begin()
-        while not heard:
-            rclpy.spin_once(ghost, timeout_sec=0.1)
         processes.wait_for_end()
     assert reader.read_bag(tmp_path / "bag").digests() == offline
 

@@ -3,6 +3,7 @@
 
 import os
 import pty
+import re
 import threading
 from contextlib import contextmanager
 
@@ -20,7 +21,10 @@ from lathe_rc.nodes import encoder_role
 
 pytest.importorskip("rclpy")
 
+import leading
 from sensor_msgs.msg import JointState
+
+from lathe_rc.protocol import Phase
 
 SAFE = ElectrodynamicActuatorParameters().safe_position
 PATIENT = {"max_lag": 60.0, "max_silence": 60.0}  # no test may depend on the wall clock
@@ -171,6 +175,15 @@ def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, 
     assert recording.dense["/coarse/state"]["position"][-1] == pytest.approx(SAFE, abs=1e-6)
 
 
+@contextmanager
+def leads(**parameters):
+    """A time master of its own kind in this process, as soon as its run has begun."""
+    given = {"counts_per_revolution": COUNTS, "revolutions": 2.0, **PATIENT, **parameters}
+    with leading.time_master("encoder_device", encoder_role.EncoderRole, **given) as node:
+        leading.begin(node)
+        yield node
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -183,40 +196,33 @@ def test_when_the_encoder_is_lost_the_others_come_to_their_safe_state(tmp_path, 
     ],
 )
 def test_an_encoder_that_is_lost_before_the_first_sample_ends_the_cell_at_once(tmp_path, changed, message):
+    """There is nothing yet that could come to a safe state: the time master fails, and the cell with it."""
     path = tmp_path / "counts.csv"
     write_counts(path, 0.2)
-    with (
-        serial_line(lines(path)) as (line, watch, told),
-        pytest.raises(LatheError, match=f"^encoder_device: {message}"),
-    ):
-        harness.run(device(device=line, **changed), mode="composed", watch=watch)
-    assert "safe" not in {event["event"] for event in told}
+    pipe = tmp_path / "pipe"
+    pipe.write_text(lines(path).partition("\n")[2])
+    with leads(source="line", device=str(pipe), **changed) as node:
+        for _ in range(100):
+            node.tick(node.next_tick)
+        assert re.match(f"encoder_device: {message}", str(node.protocol.failure))
+        assert node.protocol.phase == Phase.FAILED
 
 
-def test_silence_is_an_error_and_names_the_topic_that_nobody_publishes():
-    cell = device(source="topic", device="", max_silence=0.2)
-    with pytest.raises(
-        LatheError, match=r"no counts for .* max_silence = 0.2 s; nobody publishes /spindle/joint_states"
-    ):
-        harness.run(cell, mode="composed")
-
-
-def test_silence_of_the_spindle_among_others_is_an_error_that_names_them(ghost, domain):
-    publisher = ghost.create_publisher(JointState, "/spindle/joint_states", 10)
-    ended = threading.Event()
-
-    def publish():
-        while not ended.wait(0.01):
-            publisher.publish(JointState(name=["gripper", "wrist"], position=[0.01, 0.2]))
-
-    writer = threading.Thread(target=publish, daemon=True)
-    writer.start()
-    cell = device(source="topic", device="", joint="spindle", max_silence=0.5)
-    message = r"\d+ messages on /spindle/joint_states have no position of joint 'spindle', the last of gripper, wrist"
-    with pytest.raises(LatheError, match=rf"no counts for .* max_silence = 0.5 s; {message} with 2 positions$"):
-        harness.run(cell, mode="composed", domain=domain)
-    ended.set()
-    writer.join(10.0)
+@pytest.mark.parametrize("others", [False, True])
+def test_silence_is_an_error_that_names_the_topic_and_what_came_of_others(others):
+    """Nobody publishes the topic, or joint states of others come on it."""
+    given = {"joint": "spindle"} if others else {}
+    why = "; nobody publishes /spindle/joint_states"
+    with leads(source="topic", max_silence=0.2, **given) as node:
+        if others:
+            node.role._on_joints(JointState(name=["gripper", "wrist"], position=[0.01, 0.2]))
+            why = (
+                "; 1 messages on /spindle/joint_states have no position of joint 'spindle', the last of gripper, wrist"
+            )
+        node.role._listens = others
+        node.role._came -= 1.0  # as if a second had passed
+        node.tick(node.next_tick)
+        assert re.search(f"no counts for .* max_silence = 0.2 s{why}", str(node.protocol.failure))
 
 
 @pytest.mark.parametrize(
@@ -241,10 +247,9 @@ def test_a_joint_state_without_the_spindle_s_position_is_another_s(joint, names,
 
 
 def test_a_line_that_cannot_be_opened_is_refused_before_the_cell_begins():
-    with pytest.raises(
-        LatheError, match=r"/dev/no_such: cannot be opened \(No such file or directory\); check the path"
-    ):
-        harness.run(device(device="/dev/no_such"), mode="composed")
+    with leading.time_master("encoder_device", encoder_role.EncoderRole, source="line", device="/dev/no_such") as node:
+        refusal = str(node.protocol.failure)
+    assert "/dev/no_such: cannot be opened (No such file or directory); check the path" in refusal
 
 
 def test_a_file_keeps_a_pace_among_nodes_and_how_well_is_told(tmp_path):

@@ -4,38 +4,24 @@
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("rclpy")
 
-from lathe_rc.harness import free_domain  # noqa: E402
-from lathe_rc.nodes.cell_node import CellNode  # noqa: E402
-from lathe_rc.nodes.exchange import Exchange  # noqa: E402
-from lathe_rc.nodes.report import Reporter  # noqa: E402
-from lathe_rc.nodes.spindle_role import SpindleRole  # noqa: E402
-from lathe_rc.protocol import Progress  # noqa: E402
+import leading
+
+from lathe_rc.nodes.spindle_role import SpindleRole
+from lathe_rc.protocol import Progress
 
 
 @pytest.fixture
-def spindle(monkeypatch):
+def spindle():
     """A spindle of a short run with one member, in a process with an exchange; not yet running."""
-    given = ["members:=['eager']", "window:=3", "speed_factor:=0.0", "revolutions:=0.3"]
-    with free_domain() as domain:
-        rclpy.init(args=["test", "--ros-args", *(part for text in given for part in ("-p", text))], domain_id=domain)
-        try:
-            node = CellNode("spindle_encoder", "spindle_encoder", SpindleRole, Reporter(), Exchange())
-            node.trigger_configure()
-            node.exchange.join(node.protocol.own.publishes)
-            yield node
-            # Left alive, it would hand its blocks to the next cell in this domain.
-            node.destroy_node()
-        finally:
-            rclpy.shutdown()
+    with leading.time_master("spindle_encoder", SpindleRole, window=3, speed_factor=0.0, revolutions=0.3) as node:
+        yield node
 
 
 def begin(spindle):
     """Let the run begin, as if its member were ready."""
-    spindle.trigger_activate()
-    spindle.protocol.begun(0.0)
-    spindle.attempt(lambda: spindle.protocol.start(0.0))
+    leading.begin(spindle)
     while spindle.protocol.credit and not spindle.protocol.failure:  # it looks at its members between two bursts
         spindle.attempt(spindle.role.release)
 

@@ -4,25 +4,26 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import told_until_all_have_ended
+import rclpy
+from cells import refusals, told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from lathe_rc import harness, messages, process_launcher
+from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
-from lathe_rc.commands.progress import TROUBLE
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.nodes import process
+from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.report import Reporter
 
 CONFIG = Path(__file__).parents[1] / "config"
 PISTON = CONFIG / "piston.yaml"
@@ -90,21 +91,9 @@ sys.meta_path.insert(0, Finder())
 RUN = ["spindle_encoder.revolutions=1000.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
 
 
-@pytest.mark.parametrize(
-    ("node", "told_late"), [("learning_controller", False), ("electrodynamic_actuator", False), ("supervisor", True)]
-)
-def test_the_death_of_a_member_ends_in_the_safe_state(node, told_late, monkeypatch, tmp_path):
-    """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself.
-
-    The harness says how it died, also if the server that started it tells that after the end of the cell.
-    """
-    if told_late:
-        say = harness.Processes._say
-        monkeypatch.setattr(
-            harness.Processes,
-            "_say",
-            lambda self, event, name, **values: say(self, event, name, **values) if event != "exit" else None,
-        )
+@pytest.mark.parametrize("node", ["electrodynamic_actuator", "supervisor"])
+def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
+    """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself."""
     bag, events = tmp_path / "bag", []
     scenario = load(CONFIG / "supervised.yaml", RUN)
     killer = Killer(node, signal.SIGKILL)
@@ -169,66 +158,14 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     assert not check(bag).wrong
 
 
-def told_after_the_death_of(node, bag):
-    """The events of a piston's cell that loses a node in the midst and is left to itself."""
-    cell = harness.with_recorder(load(PISTON, RUN), bag, keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes.wait_for("cycle")
-        os.kill(processes.pids[node], signal.SIGKILL)
-        return told_until_all_have_ended(processes)
-
-
-def test_without_the_harness_every_process_of_a_cell_that_lost_a_member_says_so_by_its_exit_code(tmp_path):
-    told = told_after_the_death_of("tool", tmp_path / "bag")
-    codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
-    assert {name for name, code in codes.items() if code == -signal.SIGKILL} == {"tool"}
-    assert {code for code in codes.values() if code != -signal.SIGKILL} == {LatheError.exit_code}
+def test_a_member_that_is_ended_by_sigterm_in_the_middle_of_a_run_makes_the_cell_safe(tmp_path):
+    """It says so itself: it has not just died."""
+    groups = [[name for name in NODES if name != "tool"]]
+    why = r"tool was ended by SIGTERM in the middle of a run: safe state from sample \d+ on$"
+    killer = Killer("tool", signal.SIGTERM)
+    with pytest.raises(LatheError, match=why):
+        harness.run(load(PISTON, RUN), mode="processes", groups=groups, bag=tmp_path / "bag", watch=killer)
     assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
-
-
-#: Members are waited for as long as a time master: a busy machine keeps nobody silent for that.
-CAUTIOUS = [*RUN, "spindle_encoder.stall_reaction=safe", "spindle_encoder.stall_time=2.0"]
-
-
-def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait(tmp_path):
-    killer = Killer("tool", signal.SIGSTOP)
-    with pytest.raises(LatheError, match=r"^/tool fell silent: safe state from sample \d+ on$"):
-        harness.run(load(PISTON, CAUTIOUS), mode="processes", bag=tmp_path / "bag", watch=killer)
-    assert not check(tmp_path / "bag").wrong
-    assert not alive(killer.pids["tool"])
-
-
-def test_a_time_master_that_stalls_is_given_up_by_name_if_the_cell_shall_not_wait(tmp_path):
-    killer = Killer("spindle_encoder", signal.SIGSTOP)
-    with pytest.raises(LatheError, match=r"^/spindle_encoder, the time master, has been silent for 2 s: no sample"):
-        harness.run(
-            load(PISTON, CAUTIOUS),
-            mode="processes",
-            bag=tmp_path / "bag",
-            watch=killer,
-        )
-    assert not check(tmp_path / "bag").wrong
-    assert not alive(killer.pids["spindle_encoder"])
-
-
-def test_a_time_master_that_was_given_up_and_comes_back_says_so_and_computes_no_more(tmp_path):
-    cell = harness.with_recorder(load(PISTON, CAUTIOUS), tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes.wait_for("cycle")
-        os.kill(processes.pids["spindle_encoder"], signal.SIGSTOP)
-        told, given_up = [], 0
-        for event in processes.events(60.0):
-            told.append(event)
-            given_up += event["event"] == "masterless"
-            if event["event"] == "masterless" and given_up == len(cell.nodes) - 1:
-                os.kill(processes.pids["spindle_encoder"], signal.SIGCONT)
-            if sum(event["event"] == "exit" for event in told) == len(cell.nodes):
-                break
-    assert not [event for event in told if event["event"] in ("dead", "safe")]
-    said = [event["message"] for event in told if event["event"] == "error"]
-    assert len(said) == 1, told
-    assert re.fullmatch(r"/spindle_encoder stood still at sample \d+: the others have given it up", said[0])
-    assert not check(tmp_path / "bag").wrong
 
 
 def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
@@ -236,89 +173,19 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
 
     Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed.
     """
-    told = told_after_the_death_of("spindle_encoder", tmp_path / "bag")
+    cell = harness.with_recorder(load(PISTON, RUN), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
+        told = told_until_all_have_ended(processes)
     said = [event["message"] for event in told if event["event"] == "abandoned"]
     assert said
     assert any("/spindle_encoder, the time master, is lost: no sample follows" in line for line in said)
     assert [event["complete"] for event in told if event["event"] == "closed"] == [False]
+    codes = {event["node"]: event["code"] for event in told if event["event"] == "exit"}
+    assert codes.pop("spindle_encoder") == -signal.SIGKILL
+    assert set(codes.values()) == {LatheError.exit_code}
     assert not check(tmp_path / "bag").wrong
-
-
-def test_who_does_not_end_after_a_complete_run_is_killed_and_named_and_nothing_is_lost(monkeypatch, tmp_path):
-    """A process that does not end after a complete run is killed and named, and no sample is lost."""
-    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
-    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)  # it writes no log that tells where it is
-    bag, told = tmp_path / "bag", []
-    cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), bag, keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes._children["held"] = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
-        thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), processes._children["held"]))
-        thread.start()
-        processes.wait_for_end(told.append)
-        thread.join()
-        # Nobody is left to wait for.
-        with pytest.raises(LatheError, match="no node has reported anything for 1 s"):
-            processes.wait_for("cycle")
-    assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
-    assert reader.read_bag(bag).digests() == harness.run(load(PISTON, ["spindle_encoder.revolutions=6.0"])).digest
-
-
-def test_who_does_not_end_after_the_safe_state_is_killed_and_named(monkeypatch, tmp_path):
-    """It has said that it is done, as all others that still run: nothing is lost without it."""
-    monkeypatch.setattr("lathe_rc.harness.processes._FAREWELL", 1.0)
-    monkeypatch.setattr("lathe_rc.harness.processes._GRACE", 0.2)
-    cell, told = (
-        harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=1000.0"]), tmp_path / "bag", keep=True),
-        [],
-    )
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        held = subprocess.Popen(["/bin/sh", "-c", "trap '' USR1; exec sleep 1000"])
-        processes._children["held"] = held
-        thread = threading.Thread(target=processes._listen, args=("held", socket.socket(), held))
-        thread.start()
-        processes.wait_for("cycle")
-        processes._say("done", "held")
-        os.kill(processes.pids["electrodynamic_actuator"], signal.SIGKILL)
-        for event in processes.events(60.0):
-            told.append(event)
-            if processes._ended == set(processes._children):
-                break
-        thread.join()
-    assert [event["node"] for event in told if event["event"] == "stuck"] == ["held"]
-    assert [event["lost"] for event in told if event["event"] == "safe"] == [["/electrodynamic_actuator"]]
-
-
-def test_who_crashes_while_leaving_a_complete_run_is_named_and_nothing_is_lost(tmp_path):
-    """A process that crashes after a complete run is named, and no sample is lost."""
-    told = []
-    cell = harness.with_recorder(load(PISTON, ["spindle_encoder.revolutions=6.0"]), tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes.wait_for("closed")
-        processes._children["crashed"] = child = subprocess.Popen(["/bin/sh", "-c", "kill -SEGV $$"])
-        thread = threading.Thread(target=processes._listen, args=("crashed", socket.socket(), child))
-        thread.start()
-        processes.wait_for_end(told.append)
-        thread.join()
-    # of all that ended: a library may crash while another leaves, and that is no more to the run than this one
-    (end,) = [event for event in told if event["event"] == "exit" and event["node"] == "crashed"]
-    assert TROUBLE["exit"](end) == "crashed was killed by SIGSEGV"
-
-
-def test_a_bag_that_is_closed_makes_no_safe_state_a_success(tmp_path, monkeypatch):
-    """A cell that lost its spindle in the safe state is no success, even if the bag comes to its end all the same."""
-    cell = harness.with_recorder(load(CONFIG / "supervised.yaml", RUN), tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
-        processes.wait_for("cycle")
-        os.kill(processes.pids["tool"], signal.SIGKILL)
-        processes.wait_for("safe")
-        events = processes.events(60.0)
-        while not processes._lost:  # the harness may hear later than the spindle that the tool has died
-            processes._raise_failure(next(events))
-        # not by an event: the recorder's own, that its bag is not complete, may come before the spindle's end
-        monkeypatch.setattr(harness.Processes, "_complete", property(lambda _: True))
-        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
-        with pytest.raises(LatheError, match=r"^tool was killed by SIGKILL; the run did not come to its end"):
-            processes.wait_for_end()
 
 
 @pytest.mark.parametrize("mode", ["composed", "processes"])
@@ -357,59 +224,49 @@ def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
         assert not closed["complete"]
 
 
-@pytest.mark.parametrize(
-    ("node", "arguments", "expected"),
-    [
-        ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
-        ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
-        ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
-        ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
-        ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
-        ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
-        (
-            "tool",
-            ["-p", "tool:profile:=polygon", "--params-file", str(PISTON)],
-            "does not reach /tool, which has 'csv'",
-        ),
-    ],
+BAD = (  #: node, ROS arguments, and what is said of them
+    ("tool", ["-p", "feed:=-1.0"], "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]"),
+    ("tool", ["-p", "fed:=1.0"], "tool.fed: unknown parameter"),
+    ("spindle_encoder", ["-p", "nominal_rpm:=fast"], "spindle_encoder.nominal_rpm = 'fast'; allowed:"),
+    ("learning_controller", ["-p", "events:=['soon: freeze']"], "learning_controller.events = 'soon: freeze'"),
+    ("tool", ["--params-file", "/nowhere.yaml"], "Couldn't parse params file: '--params-file /nowhere.yaml'"),
+    ("recorder", ["-p", "bag:=/"], "/ exists; a bag is never overwritten"),
+    ("tool", ["-p", "tool:profile:=polygon", "--params-file", PISTON], "does not reach /tool, which has 'csv'"),
 )
-def test_a_node_alone_refuses_bad_parameters_in_one_line(node, arguments, expected, domain, tmp_path):
-    log = tmp_path / "said"
-    ours, theirs = socket.socketpair()
-    with ours, theirs, log.open("wb") as file:
-        child = process_launcher.server().start(
-            [node, "--ros-args", *arguments],
-            environment=os.environ | {"ROS_LOG_DIR": str(tmp_path)},
-            report=theirs,
-            log=file.fileno(),
-        )
-        code = child.wait(60.0)
-    said = log.read_text(encoding="utf-8")
-    assert code == 2, said
-    assert expected in said
-    assert "Traceback" not in said
 
 
-def test_the_command_ends_with_the_exit_code_of_its_node(domain, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "lathe_rc", "node", "tool", "--ros-args", "-p", "feed:=-1.0"],
-        env=os.environ | {"ROS_LOG_DIR": str(tmp_path)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2, done.stderr
-    assert "tool.feed = -1.0; allowed: a finite number from 0 [m/rev]" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_node_alone_refuses_bad_parameters_in_one_line(domain, monkeypatch, tmp_path):
+    """And its command ends with exit code 2."""
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    told = refusals(*(["node", node, "--ros-args", *arguments] for node, arguments, _ in BAD))
+    for (code, said), (node, arguments, expected) in zip(told, BAD, strict=True):
+        assert code == 2, (node, arguments, said)
+        assert expected in said
+        assert "Traceback" not in said
 
 
-def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(tmp_path):
-    """The time master makes the checks before the start with the announced parameters.
-
-    Without the harness's check, as under ros2 launch: the time master checks what its members announce.
-    """
-    scenario = load(PISTON, ["learning_controller.q_time=10e-6"])
-    cell = harness.with_recorder(scenario, tmp_path / "bag", keep=True)
-    diverges = pytest.raises(InputError, match=r"learning diverges with electrodynamic_actuator: sup\|Q - Z\|")
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes, diverges:
-        processes.wait_for_end()
+def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(domain, tmp_path):
+    """The time master makes the checks before the start with the announced parameters: also without the harness."""
+    cell = harness.with_recorder(load(PISTON, ["learning_controller.q_time=10e-6"]), tmp_path / "bag", keep=True)
+    file = tmp_path / "cell.yaml"
+    file.write_text(cell.to_yaml(), encoding="utf-8")
+    rclpy.init(args=["test", "--ros-args", "--params-file", str(file)])
+    try:
+        nodes = {name: process._make(name, cell.kind(name), Reporter(), Exchange()) for name in NODES}
+        for node in nodes.values():
+            node.trigger_configure()
+        spindle = nodes["spindle_encoder"]
+        spindle.trigger_activate()
+        for name in NODES[1:]:
+            spindle.protocol.hear_member(nodes[name].protocol.own, 0.0)
+        spindle.attempt(spindle.role._check_cell)
+        nodes["recorder"].role.clean_up()
+        for node in nodes.values():
+            node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert isinstance(spindle.protocol.failure, InputError)
+    assert "learning diverges with electrodynamic_actuator: sup|Q - Z|" in str(spindle.protocol.failure)
 
 
 def test_an_existing_bag_is_refused_before_anything_starts(tmp_path):

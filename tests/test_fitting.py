@@ -71,14 +71,20 @@ def first_away(time):
 @pytest.mark.parametrize(
     ("response", "step", "options", "lacking", "message"),
     [
-        (decay, 5e-3, [], {"inverse"}, "inverse: response in steps of 0.005 s, lags from 0.001 s; .*--lag 0.005, or a"),
-        (decay, 5e-3, ["--lag", "5e-3"], set(), ""),
+        (decay, 5e-3, ["--lag", "1e-3"], {"inverse"}, "inverse: response in steps of 0.005 s, .*--lag 0.005, or a"),
+        (decay, 5e-3, [], set(), ""),
         (lambda t: t - 0.02 * decay(t), 1e-3, ["--integrator"], set(), ""),
-        (lambda t: 5.0 * t, 0.1, ["--integrator"], {"inverse"}, "inverse: response in steps of 0.1 s"),
+        (lambda t: 5.0 * t, 0.1, ["--integrator"], set(), ""),
         (first_away, 1e-3, ["--poles", "2", "--zeros", "1"], {"inverse"}, "inverse of .*a zero that is not stable; "),
         (lambda t: -decay(t), 1e-3, [], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of 60"),
         (decay, 1e-3, ["--gain-margin", "1e9"], {"pid", "loop"}, r"tuning: no crossover from .* of 60° and 1e\+09"),
-        (lambda t: -decay(t), 0.005, [], {"inverse", "pid", "loop"}, "inverse: .*; tuning: no crossover from"),
+        (
+            lambda t: -decay(t),
+            0.005,
+            ["--lag", "1e-3"],
+            {"inverse", "pid", "loop"},
+            "inverse: .*; tuning: no crossover",
+        ),
     ],
 )
 def test_a_model_without_an_inverse_or_a_pid_is_kept(tmp_path, monkeypatch, response, step, options, lacking, message):
@@ -96,10 +102,34 @@ def test_a_model_without_an_inverse_or_a_pid_is_kept(tmp_path, monkeypatch, resp
     assert re.match(f"lathe: {path}: {message}" if lacking else "$", done.stderr)
 
 
+@pytest.mark.parametrize("kind", ["step", "response"])
+def test_channel_with_a_delay_is_found_in_either_measurement(tmp_path, monkeypatch, kind):
+    """The inverse is that of the rest; the PID meets the delay."""
+    monkeypatch.setattr(pid_tuning, "_TRIES", 4)
+    delay, time = 0.07, np.arange(200) * 1e-2
+    if kind == "step":
+        late = np.maximum(time - delay, 0.0)
+        path = step_file(tmp_path, time, 3.0 - 3.0 * np.exp(-late / 0.2))
+    else:
+        frequency = np.geomspace(0.05, 20.0, 60)
+        value = 3.0 / (1.0 + 0.2j * 2 * np.pi * frequency) * np.exp(-2j * np.pi * frequency * delay)
+        columns = (frequency, 20.0 * np.log10(np.abs(value)), np.degrees(np.angle(value)))
+        path = written(tmp_path / "response.csv", "frequency_hz,magnitude_db,phase_deg", *columns)
+    done = lathe("channel", path, "--poles", 1, "--dead-time", "--figure", tmp_path / "fit.png", "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["model"]["delay"] == pytest.approx(delay, rel=1e-2)
+    assert_allclose(found["model"]["numerator"][0] / found["model"]["denominator"][-1], 3.0, rtol=1e-3)
+    assert -1.0 / np.roots(found["model"]["denominator"])[0] == pytest.approx(0.2, rel=1e-2)
+    assert found["inverse"]["rms"] < 0.2
+    assert found["loop"]["phase_margin_deg"] == pytest.approx(60.0, abs=0.5)
+
+
 def test_a_model_alone_is_told_in_words(tmp_path, monkeypatch):
     monkeypatch.setattr(pid_tuning, "_TRIES", 4)
     time = np.arange(20) * 5e-3
-    done = lathe("channel", step_file(tmp_path, time, -decay(time)), "--poles", 1, "--figure", tmp_path / "fit.svg")
+    path = step_file(tmp_path, time, -decay(time))
+    done = lathe("channel", path, "--poles", 1, "--lag", 1e-3, "--figure", tmp_path / "fit.svg")
     assert [line[:9] for line in done.stdout.splitlines()] == ["model    ", "figure:  "]
 
 

@@ -3,9 +3,7 @@
 
 import contextlib
 import math
-import os
 import re
-import signal
 import subprocess
 import sys
 from collections import deque
@@ -22,6 +20,7 @@ pytest.importorskip("rclpy")
 from lathe_rc import harness, messages
 from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.bag import reader
+from lathe_rc.bag.check import check
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Unknown
@@ -30,7 +29,11 @@ from lathe_rc.nodes import graph
 from lathe_rc.protocol import Announcement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-PROGRAMS = {"learning_controller": "controller.py", "electrodynamic_actuator": "drive.py", "listener": "listener.py"}
+PROGRAMS = {
+    "learning_controller": (EXAMPLES / "controller.py",),
+    "electrodynamic_actuator": (EXAMPLES / "drive.py",),
+    "listener": (EXAMPLES / "listener.py",),
+}
 DELAY = 3200
 MISSING = "not checked: the parameters of electrodynamic_actuator are not known here: whether"
 CONVERGES = f"{MISSING} learning_controller converges with electrodynamic_actuator"
@@ -57,7 +60,7 @@ def cell(domain, bag, foreign, together, **nodes):
         processes = stack.enter_context(harness.Processes(Scenario("test", ours), groups, domain=domain))
         theirs = {}
         for name in foreign:
-            command = [sys.executable, EXAMPLES / PROGRAMS[name], "--ros-args", "-p", "run_id:=test"]
+            command = [sys.executable, *PROGRAMS[name], "--ros-args", "-p", "run_id:=test"]
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
             theirs[name] = stack.enter_context(process)
             stack.callback(process.kill)
@@ -98,7 +101,7 @@ def driven(recording):
 
 def test_the_examples_use_nothing_of_lathe_rc_but_its_messages():
     """They run without the Python package lathe_rc, and each fits on a screen or two."""
-    for path in EXAMPLES.glob("*.py"):
+    for path in set(EXAMPLES.glob("*.py")) - set(EXAMPLES.glob("*_launch_*.py")):
         text = path.read_text(encoding="utf-8")
         used = {name.partition(".")[0] for name in re.findall(r"^(?:from|import) (\S+)", text, re.MULTILINE)}
         assert used - sys.stdlib_module_names <= {"rclpy", "lathe_rc_msgs", "std_msgs", "cell_member"}, path
@@ -141,22 +144,49 @@ def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, tog
         assert said["listener"] == f"{errors.size} samples, form error {math.sqrt(squares / errors.size)} m RMS\n"
 
 
-@pytest.mark.parametrize("killed", ["learning_controller", "tool"])
-def test_a_cell_that_loses_one_of_ours_or_of_theirs_goes_to_its_safe_state(domain, tmp_path, killed):
-    """The death of a foreign member is noticed, and a foreign member answers when one of ours has died."""
-    endless = {"revolutions": 1000.0, "speed_factor": 1.0}
-    foreign = ["learning_controller"]
-    with cell(domain, tmp_path / "bag", foreign, ["electrodynamic_actuator", "recorder"], spindle_encoder=endless) as (
-        processes,
-        theirs,
-    ):
+ENDLESS = {"revolutions": 1000.0, "speed_factor": 1.0}
+
+
+def test_the_death_of_a_foreign_member_makes_the_cell_safe(domain, tmp_path):
+    foreign, together = ["learning_controller"], ["electrodynamic_actuator", "recorder"]
+    with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=ENDLESS) as (processes, theirs):
         processes.wait_for("progress")
-        (controller,) = theirs.values()
-        os.kill(processes.pids.get(killed, controller.pid), signal.SIGKILL)
-        with pytest.raises(LatheError, match=f"{killed} died: safe state from sample"):
+        theirs["learning_controller"].kill()
+        with pytest.raises(LatheError, match="learning_controller died: safe state from sample"):
             processes.wait_for_end()
-        controller.communicate()
-        assert controller.returncode == (1 if killed == "tool" else -signal.SIGKILL)
+
+
+#: The example controller, which after some revolutions gives a command that is not finite.
+SPOILED = """
+import math, sys
+sys.path.insert(0, sys.argv.pop(1))
+from controller import Controller, run
+
+class Spoiled(Controller):
+    def learn(self, place, error):
+        super().learn(place, math.nan if self.so_far.blocks > 200 else error)
+
+run(Spoiled)
+"""
+
+
+def test_a_command_that_is_not_finite_loses_its_reader_and_not_the_container(domain, tmp_path, monkeypatch):
+    """A drive that shares its process with the tool fails by name, the others go on to the safe state.
+
+    The foreign member answers that it cannot go on without the drive.
+    """
+    monkeypatch.setitem(PROGRAMS, "learning_controller", ("-c", SPOILED, EXAMPLES))
+    foreign, together = ["learning_controller"], ["electrodynamic_actuator", "tool", "recorder"]
+    with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=ENDLESS) as (processes, theirs):
+        nan = (
+            r"electrodynamic_actuator failed: /coarse/command: /learning_controller sends position = nan at sample \d+"
+        )
+        with pytest.raises(LatheError, match=rf"{nan}; allowed: finite numbers: safe state from sample \d+ on"):
+            processes.wait_for_end()
+        theirs["learning_controller"].communicate()
+        assert theirs["learning_controller"].returncode == 1
+    wrong = check(tmp_path / "bag").wrong
+    assert [line for line in wrong if not line.startswith("/coarse/command: ")] == []
 
 
 KNOWN = ElectrodynamicActuatorParameters(damping=0.5)

@@ -288,10 +288,7 @@ def test_file_gives_the_loop(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "displacement_um,command_um\n0,1\n",
-            "header 'displacement_um,command_um'; allowed: command_um,displacement_um",
-        ),
+        ("displacement_um,u\n0,1\n", "columns 'displacement_um', 'u'; allowed: command and displacement"),
         (HEAD, "no points; give one and a half loops"),
     ],
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ROS and pip are told of the package: its dependencies, executables and tests."""
+"""Data of the package for ROS and pip: its dependencies, executables and tests."""
 
 import ast
 import runpy

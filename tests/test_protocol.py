@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The protocol of a cell without ROS: simulated cells under thousands of schedules, and single rules."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from deliberate_faults import FAULTS, faulty
-from simulation import play
+from simulation import Design, Simulation, play, violations
 
 from lathe_rc import messages
 from lathe_rc.errors import LatheError
@@ -40,6 +43,130 @@ def test_a_schedule_is_the_same_each_time():
     one, other = play(7)[0], play(7)[0]
     assert one.reports == other.reports
     assert one.now == other.now
+
+
+# ---- schedules with one disturbance
+
+
+DESIGNS = (
+    Design("/spindle"),
+    Design("/controller", (("/spindle", 0), ("/tool", 1)), restarts=True),
+    Design("/drive", (("/controller", 0),)),
+    Design("/tool", (("/spindle", 0), ("/drive", 0))),
+    Design("/recorder", (("/spindle", 0), ("/controller", 0), ("/drive", 0), ("/tool", 0))),
+)
+
+
+def piston(disturb, at=5, *, stalls="wait", window=4, length=20) -> Simulation:
+    """A cell after its run, in which ``disturb(cell)`` was called once when some blocks had been released.
+
+    No wait without a deadline, values as offline up to the safe state, and the cause named: as in all schedules.
+    """
+    cell = Simulation(1, DESIGNS, window, length, stalls)
+    for design in DESIGNS:
+        cell.start(design)
+    cell.at_block[at] = [lambda: disturb(cell)]
+    cell.run()
+    assert violations(cell) == []
+    return cell
+
+
+def told(cell: Simulation, event: str) -> list[tuple[str, dict]]:
+    return [(name, values) for _, name, kind, values in cell.reports if kind == event]
+
+
+def stopped(cell: Simulation, name: str, seconds: float) -> None:
+    cell.culprits.add(name)
+    cell.stop(cell.process_of(name), seconds)
+
+
+def killed(cell: Simulation, name: str) -> None:
+    cell.culprits.add(name)
+    cell.kill(cell.process_of(name))
+
+
+def exit_codes(cell: Simulation) -> dict[str, int]:
+    return {process.design.name: process.protocol.exit_code for process in cell.gone}
+
+
+def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait():
+    cell = piston(lambda cell: stopped(cell, "/tool", 5.0), stalls="safe")
+    ((_, safe),) = told(cell, "safe")
+    assert safe["lost"] == ["/tool"]
+    assert safe["why"].startswith("/tool fell silent: safe state from sample ")
+    assert told(cell, "abandoned")[0][0] == "/tool", "it resumes, and learns that the cell has lost it"
+
+
+def test_a_member_that_stalls_is_named_and_waited_for_if_the_cell_shall_wait():
+    cell = piston(lambda cell: stopped(cell, "/tool", 5.0))
+    assert {values["member"] for _, values in told(cell, "stall")} == {"/tool"}
+    assert not told(cell, "safe")
+    assert set(exit_codes(cell).values()) == {0}
+
+
+def test_a_member_that_stalls_is_named_before_the_end_although_the_window_holds_the_whole_run():
+    """No credit is missing then: the time master names it by its liveliness."""
+    cell = piston(lambda cell: stopped(cell, "/tool", 0.5), window=64)
+    assert [values["member"] for _, values in told(cell, "stall")] == ["/tool"]
+
+
+def test_a_time_master_that_stalls_is_given_up_by_name_and_says_so_when_it_resumes():
+    """If the cell shall not wait: after 2 s each member gives up."""
+    cell = piston(lambda cell: stopped(cell, "/spindle", 3.0), stalls="safe")
+    given_up = {values["message"] for _, values in told(cell, "masterless")}
+    assert given_up == {"/spindle, the time master, has been silent for 2 s: no sample follows"}
+    assert {name for name, _ in told(cell, "masterless")} == {design.name for design in DESIGNS[1:]}
+    ((name, error),) = told(cell, "error")
+    assert name == "/spindle"
+    assert re.fullmatch(r"/spindle stood still at sample \d+: the others have given it up", error["message"])
+    assert not told(cell, "safe")
+    assert not told(cell, "dead")
+
+
+def test_the_members_end_by_themselves_when_their_time_master_has_died():
+    cell = piston(lambda cell: killed(cell, "/spindle"))
+    assert {values["message"] for _, values in told(cell, "abandoned")} == {
+        "/spindle, the time master, is lost: no sample follows"
+    }
+    assert exit_codes(cell) == dict.fromkeys([design.name for design in DESIGNS[1:]], 1)
+
+
+def test_each_survivor_of_a_lost_member_says_so_by_its_exit_code():
+    cell = piston(lambda cell: killed(cell, "/tool"))
+    assert [values["lost"] for _, values in told(cell, "safe")] == [["/tool"]]
+    assert exit_codes(cell) == dict.fromkeys(["/spindle", "/controller", "/drive", "/recorder"], 1)
+
+
+@pytest.mark.parametrize("event", ["shut_down", "interrupt"])
+def test_a_member_that_is_ended_in_the_middle_of_a_run_is_lost_and_named(event):
+    """By ``ros2 lifecycle set NODE shutdown``, or by SIGTERM."""
+
+    def end(cell):
+        cell.culprits.add("/tool")
+        protocol = cell.process_of("/tool").protocol
+        protocol.shut_down(cell.now) if event == "shut_down" else protocol.interrupt("SIGTERM")
+        cell.process_of("/tool")._step()
+
+    ((_, safe),) = told(piston(end), "safe")
+    how = "/tool was shut down" if event == "shut_down" else "/tool was ended by SIGTERM"
+    assert safe["why"].startswith(f"/tool failed: {how} in the middle of a run: safe state from sample ")
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_controller_that_is_restarted_is_waited_for_unless_its_state_is_lost(kept):
+    """A new process without a state gives up: the cell goes to its safe state at once, not after ``restart_time``."""
+
+    def kill(cell):
+        killed(cell, "/controller")
+        if not kept:
+            cell.files.clear()
+        cell.at(cell.now + 0.1, lambda: cell.start(DESIGNS[1]))
+
+    cell = piston(kill)
+    assert [values["restarts"] for _, values in told(cell, "dead")] == [True]
+    assert bool(told(cell, "back")) == kept
+    lost = [] if kept else ["/controller failed: /controller: no state to go on from"]
+    assert [values["why"].partition(": safe state")[0] for _, values in told(cell, "safe")] == lost
 
 
 # ---- single rules
@@ -115,6 +242,15 @@ def test_a_second_time_master_is_a_stranger(tool):
         tool.hear_member(member("/second", stage="spindle_encoder", members=("/second", "/tool")), 0.0)
 
 
+def test_two_established_namesakes_do_not_answer_each_other_without_end(tool):
+    """On two machines both are accepted: each answered the announcement of the other by its own."""
+    tool.ready = True
+    tool.actions.clear()
+    with pytest.raises(ForeignMessage, match="this node, process 7, has that name"):
+        tool.hear_member(member("/tool", MemberState.READY, host="elsewhere"), 0.0)
+    assert not tool.actions
+
+
 def test_the_newcomer_of_two_namesakes_gives_up_and_names_the_other(tool):
     ready = member("/tool", MemberState.READY, pid=6)
     tool.hear_member(ready, 0.0)
@@ -122,6 +258,17 @@ def test_the_newcomer_of_two_namesakes_gives_up_and_names_the_other(tool):
     assert tool.done
     announced = [action.member.state for action in tool.actions if isinstance(action, actions.Announce)]
     assert MemberState.FAILED not in announced  # the others would take it for the failure of the established one
+
+
+def test_a_newcomer_in_a_running_cell_waits_for_its_namesake_to_be_heard(tool):
+    """It cannot go on in mid-run in any case: after a second it says that, and names nobody."""
+    for name in ("/drive", "/recorder"):
+        tool.hear_member(member(name, MemberState.READY), 100.0)
+    tool.hear_member(replace(SPINDLE, state=MemberState.READY), 100.0)
+    tool.hear_cell_state(CellState("", Phase.RUNNING, 0), 100.0)
+    for now, wants in ((100.9, False), (101.1, True)):
+        tool.look(now, {}, ())
+        assert tool.wants_match == wants
 
 
 def test_an_established_member_refuses_its_namesake(tool):

@@ -148,20 +148,6 @@ def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(g
     assert reader.read_bag(tmp_path / "bag").digests() == expected.digest
 
 
-def test_a_controller_whose_state_is_lost_is_not_waited_for(tmp_path):
-    path = tmp_path / "state"
-    cell = load(CONFIG / "piston.yaml", [f"{OWN}.restart_file={path}", "spindle_encoder.revolutions=40.0"])
-
-    class Vandal(Killer):
-        def __call__(self, event):
-            super().__call__(event)
-            if event["event"] == "exit":
-                path.write_bytes(b"nothing")
-
-    with pytest.raises(LatheError, match=f"{path}: not a state of this node"):
-        harness.run(cell, mode="processes", watch=Vandal(OWN, [30_000]))
-
-
 # ---- the file -------------------------------------------------------------------------------------------
 
 

@@ -6,11 +6,12 @@ import json
 import pytest
 
 import slow_tests
-from slow_tests import Cost, Name, Told
+from slow_tests import Cost, Name
 from workplace import RefusalError
 
 REPORT = """<testsuites><testsuite>
-<testcase classname="tests.test_a" name="test_one[x-[y]]" time="2.5"/>
+<testcase classname="tests.test_a" name="test_one[x-[y]]" time="2.5"><properties>
+<property name="processes" value="5"/><property name="programs" value="1"/></properties></testcase>
 <testcase classname="tests.test_a" name="test_one[z]" time="0.5"/>
 <testcase classname="tests.test_a.TestFullCell" name="test_is_held" time="4"/>
 <testcase classname="" name="tests.test_b" time="0"><skipped message="no rerun"/></testcase>
@@ -23,24 +24,18 @@ def files(tmp_path, monkeypatch):
     """A report of two test files, one of them skipped."""
     (tmp_path / "test_a.py").write_text(
         """
-import harness
-
-def helper():
-    return harness.run("piston", mode="composed")
-
 class TestFullCell:
     def test_is_held(self):
         '''The force|edge is held.
 
         More of it.
         '''
-        helper()
 
 def test_one(x):
     '''Not what "processes" do.'''
 
 def test_the_paper_s_two():
-    subprocess.run([])
+    pass
 """,
         encoding="utf-8",
     )
@@ -77,17 +72,17 @@ def test_the_page_has_all_rows_and_the_share_of_each_file():
 
 def test_cases_are_added_up_by_test_and_class(files):
     assert slow_tests.took(files) == {
-        Name("test_a", "", "test_one"): Cost(3.0, 2),
+        Name("test_a", "", "test_one"): Cost(3.0, 2, with_cell=1, processes=5, programs=1),
         Name("test_a", "TestFullCell", "test_is_held"): Cost(4.0, 1),
         Name("test_b", "", "tests.test_b"): Cost(0.0, 1),
     }
 
 
 def test_a_promise_is_the_first_line_of_the_docstring_or_else_the_name(files):
-    assert {name.test: told for name, told in slow_tests.told().items()} == {
-        "test_is_held": Told("The force|edge is held.", "composed"),
-        "test_one": Told('Not what "processes" do.', ""),
-        "test_the_paper_s_two": Told("the paper's two", "programs"),
+    assert {name.test: promise for name, promise in slow_tests.told().items()} == {
+        "test_is_held": "The force|edge is held.",
+        "test_one": 'Not what "processes" do.',
+        "test_the_paper_s_two": "the paper's two",
     }
     assert slow_tests.in_words(Name("test_a", "TestFullCell", "test_is_held")) == "full cell: is held"
 
@@ -97,12 +92,13 @@ def test_the_slowest_come_first_by_file_and_what_is_wrong_is_named(files):
     page = slow_tests.written(slow_tests.took(files), said)
     assert page.splitlines()[-3:] == [
         "| **test_a** | 100.0 % | | | |",
-        r"| TestFullCell.`test_is_held` | 57.1 % | 1 | composed | The force\|edge is held. |",
-        '| `test_one` | 42.9 % | 2 |  | Not what "processes" do. |',
+        r"| TestFullCell.`test_is_held` | 57.1 % | 1 |  | The force\|edge is held. |",
+        '| `test_one` | 42.9 % | 2 | 5 processes, 1 program | Not what "processes" do. |',
     ]
+    assert "starts: 1 tests, in\n1 cases, start processes of cells, and 0 others programs." in page
     assert slow_tests.wrong(page, said) == []
     del said[Name("test_a", "", "test_one")]
-    said[Name("test_a", "TestFullCell", "test_is_held")] = Told("The force is held.", "")
+    said[Name("test_a", "TestFullCell", "test_is_held")] = "The force is held."
     assert slow_tests.wrong(page, said) == [
         "test_is_held says: The force is held.",
         "no test test_one in tests/test_a.py",

@@ -7,6 +7,7 @@ import os
 import signal
 from pathlib import Path
 
+import leading
 import numpy as np
 import pytest
 import rclpy
@@ -32,6 +33,7 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import START_NS
+from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.view.report import losses
 from lathe_rc.view.report_gather import gather
 
@@ -244,11 +246,12 @@ def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(ghost, domai
     assert span(left, 0, last) == span(expected, found["first_sample"], last)
 
 
-def test_service_says_why_there_is_no_snapshot(ghost, domain, tmp_path):
-    complete = harness.with_recorder(cell([], 0.0, 1.0), tmp_path / "bag", keep=True)
-    with harness.Processes(complete, [list(complete.nodes)], domain=domain) as processes:
-        processes.wait_for("cycle")
-        assert ask(ghost) == (False, "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both")
+def test_service_says_why_there_is_no_snapshot(tmp_path):
+    with leading.configured("recorder", RecorderRole, bag=str(tmp_path / "bag")) as node:
+        found = node.role._on_snapshot(Trigger.Request(), Trigger.Response())
+        node.role.clean_up()
+    assert not found.success
+    assert found.message == "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both"
 
 
 @pytest.mark.parametrize("node", ["tool", "recorder"])
@@ -386,12 +389,17 @@ def test_what_cannot_work_is_refused(tmp_path, kind, mode):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("mode", ["offline", "composed"])
-def test_existing_snapshots_are_never_overwritten(tmp_path, mode):
+@pytest.mark.parametrize("is_node", [False, True])
+def test_existing_snapshots_are_never_overwritten(tmp_path, is_node):
     (tmp_path / "bag_snapshots").mkdir()
     (tmp_path / "bag_snapshots" / "precious").write_text("data")
-    with pytest.raises(InputError, match="bag_snapshots exists; a bag is never overwritten"):
-        harness.run(cell(mode="snapshot"), mode=mode, bag=tmp_path / "bag")
+    why = "bag_snapshots exists; a bag is never overwritten"
+    if is_node:
+        with leading.configured("recorder", RecorderRole, bag=str(tmp_path / "bag"), mode="snapshot") as node:
+            assert why in str(node.protocol.failure)
+    else:
+        with pytest.raises(InputError, match=why):
+            harness.run(cell(mode="snapshot"), bag=tmp_path / "bag")
     assert [path.name for path in (tmp_path / "bag_snapshots").iterdir()] == ["precious"]
 
 

@@ -171,9 +171,9 @@ def test_csv_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "allowed: time_ms,response"),
+        ("", "no columns of numbers; allowed: time and response"),
         (None, "cannot be read"),
-        ("t,h\n" + GOOD, "header 't,h'"),
+        ("t,h\n" + GOOD, "columns 't', 'h'; allowed: time and response"),
         ("time_ms,response\n", "0 times"),
         ("time_ms,response\n" + GOOD + "13\n", ":102: 1 values"),
         ("time_ms,response\n" + GOOD + "13,one\n", ":102: 'one' is not a number"),

@@ -2,6 +2,7 @@
 """Two cells in one ROS domain, in two namespaces, never mix."""
 
 import concurrent.futures
+import itertools
 import os
 import signal
 
@@ -82,6 +83,16 @@ def test_two_composed_cells_start_at_once(domain, tmp_path):
     assert mixed(tmp_path / "left", "/left") == mixed(tmp_path / "right", "/right") == set()
     again = resimulate(tmp_path / "right")
     assert again.digest == again.recorded == harness.run(RIGHT).digest
+
+
+def test_a_domain_that_a_cell_was_given_is_chosen_for_no_other(monkeypatch):
+    """A harness that chooses a domain by itself leaves out those that other harnesses were given by --domain."""
+    with harness.free_domain() as number:
+        pass
+    with harness.free_domain(number) as given:
+        monkeypatch.setattr("lathe_rc.harness.processes._numbers", itertools.count(number - 1))  # the next one tried
+        with harness.free_domain() as chosen, harness.free_domain(number) as shared:
+            assert given == shared == number != chosen
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ from workplace import NODE, VENV
 HEAD = """\
 # Licences
 
-This page lists the packages that `./lathe setup docs notebook sweep test view` installs, by their stated licence:
-Python packages in the versions of `requirements/python.lock` and `requirements/ros.lock`, then the npm packages of the
-documentation site. lathe_rc copies no source of them. "Not stated": the package contains only the text of its licence.
-`./lathe python tools/licences.py > docs/licences.md` writes this page.
+This page lists the packages that `./lathe setup docs formats notebook sweep test view` installs, by their stated
+licence: Python packages in the versions of `requirements/python.lock` and `requirements/ros.lock`, then the npm
+packages of the documentation site. lathe_rc copies no source of them. "Not stated": the package contains only the text
+of its licence. `./lathe python tools/licences.py > docs/licences.md` writes this page.
 """
 OURS = {"lathe_rc", "lathe_rc_msgs"}
 LONGEST = 60  # characters; longer: the text of a licence

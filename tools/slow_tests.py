@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """./lathe test --table: docs/tests.md, the promise and the cost of each slow test; --promises: the promises of all.
 
-The times are those of the last ./lathe test, the promises those that stand at the tests: a docstring's first line, or
-else the test's name. What a test starts is read off its source and that of the helpers and fixtures in its file.
+Times and processes are those of the last ./lathe test, the promises those that stand at the tests: a docstring's first
+line, or else the test's name.
 """
 
 import ast
@@ -25,24 +25,22 @@ TESTS = ROOT / "tests"
 SLOWEST = 60  #: tests in the table
 
 _FILE = re.compile(r"^\| \*\*(test_\w+)\*\* \| ([\d.]+) % \|", re.MULTILINE)
-_ROW = re.compile(r"^\| (?:(\w+)\.)?`(test_\w+)` \| [\d.]+ % \| \d+ \| [a-z, ]*\| (.*) \|$", re.MULTILINE)
+_ROW = re.compile(r"^\| (?:(\w+)\.)?`(test_\w+)` \| [\d.]+ % \| \d+ \| [\w, ]*\| (.*) \|$", re.MULTILINE)
 _COVERAGE = (
     "Coverage: {:.1f} % of {} statements and {} branches of lathe_rc, child processes counted, compiled kernels not."
 )
+_ONE = {"processes": "process", "programs": "program"}
 _UNKNOWN = "Coverage: not measured; `./lathe test --coverage` does it."
-_HOSTS = ("offline", "composed", "processes")
-_PROCESSES = {"Processes", "starting", "held"}
-_PROGRAMS = {"Popen", "subprocess", "started"}
-_RUN = {"harness.run", "cell_run", "cells.run", "run"}
 _HEAD = """\
 # The slow tests
 
 Which promise each of the {slowest} slowest tests of `./lathe test` holds, and its share of the time of all {tests}
 tests ({seconds:.0f} s, one after the other). `./lathe test && ./lathe test --table` writes this page anew. Machines
 differ, so it is the share that counts. The cases of a test are added up; what several tests share counts for the first
-of them. A promise is the first line of the test's docstring, or else its name, and what a test starts is read off its
-source: change them there. tests/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts
-with the files that take longest.
+of them. A promise is the first line of the test's docstring, or else its name: change it there.
+tests/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts with the files that take
+longest. The table has the number of processes of cells and of programs that a test starts: {functions} tests, in
+{cases} cases, start processes of cells, and {programs} others programs.
 
 {coverage}
 
@@ -66,17 +64,19 @@ class Name(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """The cost of a test: seconds, and the number of its cases."""
+    """The cost of a test: seconds, cases, cases with a cell, and the processes of cells and programs of all cases."""
 
-    seconds: float
-    cases: int
+    seconds: float = 0.0
+    cases: int = 0
+    with_cell: int = 0
+    processes: int = 0
+    programs: int = 0
 
-
-class Told(NamedTuple):
-    """The description of a test: its promise, and the hosts and programs that it starts."""
-
-    promise: str
-    starts: str
+    @property
+    def starts(self) -> str:
+        """The processes and programs that a test starts, in words."""
+        counted = {"processes": self.processes, "programs": self.programs}
+        return ", ".join(f"{number} {kind if number > 1 else _ONE[kind]}" for kind, number in counted.items() if number)
 
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -92,43 +92,13 @@ def in_words(name: Name) -> str:
     return f"{owner}: {said}" if owner else said
 
 
-def _defined(tree: ast.Module) -> Iterator[tuple[str, str, ast.stmt]]:
-    """Yield class or nothing, name and statement of all that a module and its classes define."""
+def _defined(tree: ast.Module) -> Iterator[tuple[str, Function]]:
+    """Yield class or nothing, and function, of all tests of a module and its classes."""
     for outer in tree.body:
         owner, body = (outer.name, outer.body) if isinstance(outer, ast.ClassDef) else ("", [outer])
         for node in body:
-            if isinstance(node, Function):
-                yield owner, node.name, node
-            if isinstance(node, ast.Assign):
-                yield from ((owner, target.id, node) for target in node.targets if isinstance(target, ast.Name))
-
-
-def _parts(node: ast.stmt) -> Iterator[ast.AST]:
-    """Yield all of a statement but the docstring."""
-    told = node.body[0] if isinstance(node, Function) and ast.get_docstring(node) is not None else None
-    waiting: list[ast.AST] = [node]
-    while waiting:
-        if (part := waiting.pop()) is not told:
-            yield part
-            waiting += ast.iter_child_nodes(part)
-
-
-def _starts(test: Function, defined: Mapping[str, ast.stmt]) -> str:
-    """Return what a test starts, with what it calls in its own file."""
-    found, seen, waiting = set[str](), {test.name}, [test.name]
-    while waiting:
-        for part in _parts(defined[waiting.pop()]):
-            words = [getattr(part, key, None) for key in ("id", "attr", "arg", "value")]
-            names = {word for word in words if isinstance(word, str)}
-            found |= names & set(_HOSTS)
-            found |= {"programs"} if names & _PROGRAMS else set()
-            found |= {"processes"} if names & _PROCESSES else set()
-            if isinstance(part, ast.Call) and ast.unparse(part.func) in _RUN:
-                found |= set() if any(word.arg in ("mode", None) for word in part.keywords) else {"offline"}
-            for word in (names & defined.keys()) - seen:
-                seen.add(word)
-                waiting.append(word)
-    return ", ".join(kind for kind in (*_HOSTS, "programs") if kind in found)
+            if isinstance(node, Function) and node.name.startswith("test_"):
+                yield owner, node
 
 
 def _promise(name: Name, test: Function) -> str:
@@ -136,17 +106,18 @@ def _promise(name: Name, test: Function) -> str:
     return (ast.get_docstring(test) or in_words(name)).splitlines()[0]
 
 
-def told() -> dict[Name, Told]:
-    """Return what all tests say of themselves, those of tests/system apart."""
+def _promises(path: Path) -> dict[Name, str]:
+    """Return the promises of the tests of a file."""
     found = {}
-    for path in sorted(TESTS.glob("test_*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        defined = {name: node for _, name, node in _defined(tree)}
-        for owner, test, node in _defined(tree):
-            if isinstance(node, Function) and test.startswith("test_"):
-                name = Name(path.stem, owner, test)
-                found[name] = Told(_promise(name, node), _starts(node, defined))
+    for owner, node in _defined(ast.parse(path.read_text(encoding="utf-8"))):
+        name = Name(path.stem, owner, node.name)
+        found[name] = _promise(name, node)
     return found
+
+
+def told() -> dict[Name, str]:
+    """Return the promises of all tests, those of tests/system apart."""
+    return {name: promise for path in sorted(TESTS.glob("test_*.py")) for name, promise in _promises(path).items()}
 
 
 def promises(words: Sequence[str]) -> int:
@@ -159,10 +130,8 @@ def promises(words: Sequence[str]) -> int:
         if words and not any(word in path.stem for word in words):
             continue
         print(path.relative_to(TESTS).as_posix())
-        for owner, test, node in _defined(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, Function) and test.startswith("test_"):
-                name = Name(path.stem, owner, test)
-                print(f"  {owner}{'::' * bool(owner)}{test}: {_promise(name, node)}")
+        for name, promise in _promises(path).items():
+            print(f"  {name.owner}{'::' * bool(name.owner)}{name.test}: {promise}")
     return 0
 
 
@@ -177,20 +146,24 @@ def took(report: Path) -> dict[Name, Cost]:
     """
     if not report.exists():
         raise RefusalError("no report of a run is here; run ./lathe test first")
-    found: dict[Name, list[float]] = defaultdict(list)
+    found: dict[Name, Cost] = defaultdict(Cost)
     files = set[str]()
     for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - pytest wrote it here
         _, _, place = (case.get("classname") or case.get("name") or "").partition("tests.")
         file, _, owner = place.partition(".")
         files.add(file)
-        found[Name(file, owner, case.get("name", "").partition("[")[0])].append(float(case.get("time", 0.0)))
+        name = Name(file, owner, case.get("name", "").partition("[")[0])
+        counts = {each.get("name"): int(each.get("value", 0)) for each in case.iter("property")}
+        processes, programs = counts.get("processes", 0), counts.get("programs", 0)
+        case_cost = Cost(float(case.get("time", 0.0)), 1, int(processes > 0), processes, programs)
+        found[name] = Cost(*(whole + part for whole, part in zip(found[name], case_cost, strict=True)))
     here = {path.stem for path in TESTS.glob("test_*.py")}
     if missing := sorted(here - files):
         raise RefusalError(
             f"the last ./lathe test ran {len(here) - len(missing)} of {len(here)} files of tests "
             f"({missing[0]} is missing); run it without arguments first"
         )
-    return {name: Cost(sum(times), len(times)) for name, times in found.items()}
+    return dict(found)
 
 
 def shares() -> dict[str, float]:
@@ -211,7 +184,7 @@ def coverage() -> str:
 # ---- the page
 
 
-def written(costs: Mapping[Name, Cost], said: Mapping[Name, Told]) -> str:
+def written(costs: Mapping[Name, Cost], said: Mapping[Name, str]) -> str:
     """Return the page: the slowest tests by file, whatever takes longest first."""
     whole = sum(cost.seconds for cost in costs.values())
     files: dict[str, float] = defaultdict(float)
@@ -223,14 +196,22 @@ def written(costs: Mapping[Name, Cost], said: Mapping[Name, Told]) -> str:
         lines.append(f"| **{file}** | {100 * files[file] / whole:.1f} % | | | |")
         for name in known:
             if name.file == file:
-                owner, cost, test = name.owner and f"{name.owner}.", costs[name], said[name]
-                share, promise = 100 * cost.seconds / whole, test.promise.replace("|", r"\|")
-                lines.append(f"| {owner}`{name.test}` | {share:.1f} % | {cost.cases} | {test.starts} | {promise} |")
-    tests = sum(cost.cases for cost in costs.values())
-    return _HEAD.format(slowest=len(known), tests=tests, seconds=whole, coverage=coverage()) + "\n".join(lines) + "\n"
+                owner, cost = name.owner and f"{name.owner}.", costs[name]
+                share, promise = 100 * cost.seconds / whole, said[name].replace("|", r"\|")
+                lines.append(f"| {owner}`{name.test}` | {share:.1f} % | {cost.cases} | {cost.starts} | {promise} |")
+    head = _HEAD.format(
+        slowest=len(known),
+        tests=sum(cost.cases for cost in costs.values()),
+        seconds=whole,
+        functions=sum(cost.with_cell > 0 for cost in costs.values()),
+        cases=sum(cost.with_cell for cost in costs.values()),
+        programs=sum(cost.programs > 0 and not cost.with_cell for cost in costs.values()),
+        coverage=coverage(),
+    )
+    return head + "\n".join(lines) + "\n"
 
 
-def wrong(page: str, said: Mapping[Name, Told]) -> list[str]:
+def wrong(page: str, said: Mapping[Name, str]) -> list[str]:
     """Return what a page says otherwise than the tests."""
     found, file = [], ""
     for line in page.splitlines():
@@ -240,8 +221,8 @@ def wrong(page: str, said: Mapping[Name, Told]) -> list[str]:
             name, promise = Name(file, row[1] or "", row[2]), row[3].replace(r"\|", "|")
             if name not in said:
                 found.append(f"no test {row[2]} in tests/{file}.py")
-            elif promise != said[name].promise:
-                found.append(f"{row[2]} says: {said[name].promise}")
+            elif promise != said[name]:
+                found.append(f"{row[2]} says: {said[name]}")
     return found
 
 

@@ -21,7 +21,7 @@ import scipy
 from lathe_papers.formulas.responses import second_order
 from lathe_rc.analysis.reduced_order import refuse_unusable
 from lathe_rc.errors import InputError
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals import measurement_file
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -201,15 +201,17 @@ def fit_second_order(measured: StepResponse, *, delayed: bool) -> SecondOrder:
 
 
 def read_csv(path: Path) -> StepResponse:
-    """Read a step response from a CSV file.
+    """Read a step response from a file (see `lathe_rc.signals.measurement_file`).
 
-    The columns are ``time_ms`` [ms], starting at the step, and ``response``, relative to the step.
+    The quantities are ``time`` since the step and ``response`` relative to the step.
 
     Raises:
         InputError: the file is missing or malformed, or does not contain a step response.
     """
-    _, rows = read_table(path, [("time_ms", "response")], "step response")
+    measurement = measurement_file.read(path, {})
+    if "time" not in measurement or "response" not in measurement:
+        raise measurement.lacking("time and response")
     try:
-        return StepResponse(rows[:, 0] * 1e-3, rows[:, 1])
+        return StepResponse(*measurement.read("time", "response"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

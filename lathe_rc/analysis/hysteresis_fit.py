@@ -22,11 +22,11 @@ import scipy
 
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals import measurement_file
+from lathe_rc.signals.measurement_file import Measurement
 
 Array = npt.NDArray[np.float64]
 
-_HEADER = ("command_um", "displacement_um")
 _WHOLE = 0.95  # fraction of the range that counts as the full range
 _LEAST = 1e-9  # a slope below this cannot be inverted
 
@@ -125,16 +125,27 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
     return Identified(PrandtlIshlinskii(thresholds, weights, float(proportional)), float(offset) * stroke, residual)
 
 
+def of_measurement(measurement: Measurement) -> Loop:
+    """Return the loop in a measurement: ``command`` and ``displacement``, in order of time.
+
+    Raises:
+        InputError: a quantity is missing, or contains a non-finite value.
+    """
+    if "command" not in measurement or "displacement" not in measurement:
+        raise measurement.lacking("command and displacement")
+    command, displacement = measurement.read("command", "displacement")
+    if not command.size:
+        raise InputError(f"{measurement.name}: no points; give one and a half loops or more")
+    return Loop(command, displacement)
+
+
 def read_csv(path: Path) -> Loop:
-    """Read a loop from a CSV file with the columns ``command_um`` and ``displacement_um`` [µm], in order of time.
+    """Read a loop from a file with the quantities ``command`` and ``displacement`` (`lathe_rc.signals`).
 
     Raises:
         InputError: the file is missing or malformed, or contains a non-finite value.
     """
-    _, rows = read_table(path, [_HEADER], "hysteresis loop")
-    if not rows.size:
-        raise InputError(f"{path}: no points; give one and a half loops or more")
-    return Loop(*(rows.T * 1e-6))
+    return of_measurement(measurement_file.read(path, {}))
 
 
 def from_signals(

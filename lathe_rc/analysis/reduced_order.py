@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduced-order model of a channel from its step response, and its realisable inverse.
+"""Reduced-order model of a channel from its step or frequency response, and its realisable inverse.
 
 The module covers both stages of paper 004 (Figs 6-9):
 
@@ -7,11 +7,13 @@ The module covers both stages of paper 004 (Figs 6-9):
     inverse    (c_r·p^r + … )/Π(1 + p·τ_i), by nonlinear programming: the step response of model and inverse in series
                approximates a step in the mean square
 
-A model is linear in its numerator, so only the denominator is searched. The denominator consists of factors of second
-and first order with positive coefficients, which keeps the poles stable. The lags τ_i of the inverse have a lower
-bound; without it, the optimum would be the exact inverse, which is not realisable.
+A model is linear in its numerator, so only the denominator is searched, and with it a delay e^{-pτ} if asked for. The
+denominator consists of factors of second and first order with positive coefficients, which keeps the poles stable. The
+relative error of a frequency response is minimised, weighted by its uncertainty. The lags τ_i of the inverse have a
+lower bound; without it, the optimum would be the exact inverse, which is not realisable.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,15 +21,19 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.control.decoupler import LAG, inverse
 from lathe_rc.errors import InputError, at_least
-from lathe_rc.signals.table import read_table
+from lathe_rc.signals import measurement_file
+from lathe_rc.signals.measurement_file import Measurement
 from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 
 Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
 
 _SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, relative to the length of the record
 _DAMPINGS = (0.2, 1.2)
+_POINTS = 2000  # of the step response of a model from a frequency response
 _MOST = 60  # largest number of evaluations in one of several searches, of which the best counts
 _LARGEST_LAG = 100.0  # largest lag of the inverse, relative to the least one
 
@@ -83,16 +89,27 @@ class ChannelStep:
         return float(self.time[-1] / (self.time.size - 1))
 
 
-def read_csv(path: Path) -> ChannelStep:
-    """Read a step response from a CSV file.
+def of_measurement(measurement: Measurement) -> ChannelStep:
+    """Return the step response in a measurement: ``time`` since the step, and ``response`` to a step of 1.
 
-    The columns are ``time_s``, the time since the step [s], and ``response``, divided by the height of the step.
+    Raises:
+        InputError: a quantity is missing, or the response is unusable.
+    """
+    if "time" not in measurement or "response" not in measurement:
+        raise measurement.lacking("time and response, or frequency with magnitude and phase")
+    try:
+        return ChannelStep(*measurement.read("time", "response"))
+    except InputError as error:
+        raise InputError(f"{measurement.name}: {error}") from None
+
+
+def read_csv(path: Path) -> ChannelStep:
+    """Read a step response from a file with the quantities ``time`` and ``response`` (`lathe_rc.signals`).
 
     Raises:
         InputError: the file is missing or malformed, or does not contain a step response.
     """
-    _, table = read_table(path, [("time_s", "response")], "step response")
-    return ChannelStep(table[:, 0].copy(), table[:, 1].copy())
+    return of_measurement(measurement_file.read(path, {}))
 
 
 def _through(transfer: TransferFunction, step: float, signal: Array, hold: Hold) -> Array:
@@ -115,12 +132,14 @@ class Fit:
         time: time [s], shape (n,).
         wanted: desired output, shape (n,).
         found: actual output, shape (n,).
+        delay: delay behind the transfer function [s].
     """
 
     transfer: TransferFunction
     time: Array
     wanted: Array
     found: Array
+    delay: float = 0.0
 
     @property
     def rms(self) -> float:
@@ -152,7 +171,83 @@ def _starts(poles: int, pairs: int, span: float) -> list[Array]:
     return starts
 
 
-def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = False, oscillating: bool = True) -> Fit:
+@dataclass(frozen=True)
+class ResponseFit:
+    """Model fitted to a frequency response.
+
+    Attributes:
+        transfer: fitted transfer function.
+        frequency: frequencies [rad/s], shape (n,).
+        wanted: measured response, shape (n,).
+        found: response of the model with its delay, shape (n,).
+        delay: delay behind the transfer function [s].
+    """
+
+    transfer: TransferFunction
+    frequency: Array
+    wanted: Complex
+    found: Complex
+    delay: float
+
+    @property
+    def rms(self) -> float:
+        """RMS of the difference between measurement and model, relative to the measurement [1]."""
+        return float(np.sqrt(np.mean(np.abs((self.found - self.wanted) / self.wanted) ** 2)))
+
+    def step(self) -> ChannelStep:
+        """Return the step response of the model without its delay, over five times its slowest time constant."""
+        poles = np.abs(self.transfer.poles.real)
+        slowest = 5.0 / float(poles[poles > 0.0].min()) if np.any(poles > 0.0) else 2.0 * np.pi / self.frequency[0]
+        time = np.linspace(0.0, slowest, _POINTS)
+        return ChannelStep(time, step_of(self.transfer, time))
+
+
+def _check_orders(zeros: int, poles: int, *, integrator: bool) -> None:
+    if not (0 <= zeros < poles + integrator and 0 <= poles <= 8):
+        raise InputError(
+            f"reduced order: {zeros} zeros, {poles} poles, {'an' if integrator else 'no'} integrator; allowed: up to 8 "
+            "poles, and fewer zeros than poles and integrator"
+        )
+
+
+def _search(
+    residual: Callable[[Array], Array], starts: list[Array], powers: Array, low: float, high: float, delay: float | None
+) -> Array:
+    """Return the logarithms of the denominator's coefficients, and the delay, with the least squares.
+
+    Args:
+        residual: of these numbers.
+        starts: logarithms from which the searches start.
+        powers: power of a time that each coefficient is.
+        low: lower bound of these times [s].
+        high: upper bound of these times [s].
+        delay: estimate of the delay [s]; None: the model has none.
+    """
+    bottom, top = np.log(low) * powers, np.log(high) * powers
+    if delay is not None:
+        starts = [np.append(start, part * delay) for start in starts for part in (0.5, 1.0)]
+        bottom, top = np.append(bottom, 0.0), np.append(top, max(4.0 * delay, low))
+    if not bottom.size:
+        return np.empty(0)
+    found = [
+        scipy.optimize.least_squares(
+            residual, np.clip(start, bottom, top), bounds=(bottom, top), x_scale="jac" if delay is not None else 1.0,
+            xtol=1e-10, ftol=1e-10, max_nfev=_MOST,
+        )
+        for start in starts
+    ]  # fmt: skip
+    return np.asarray(min(found, key=lambda one: float(one.cost)).x)
+
+
+def fit(
+    measured: ChannelStep,
+    *,
+    zeros: int,
+    poles: int,
+    integrator: bool = False,
+    oscillating: bool = True,
+    delayed: bool = False,
+) -> Fit:
     """Fit a model of chosen orders by least squares of the step response.
 
     Args:
@@ -161,45 +256,109 @@ def fit(measured: ChannelStep, *, zeros: int, poles: int, integrator: bool = Fal
         poles: n, number of poles without the integrator.
         integrator: whether the model has an integrator.
         oscillating: whether poles may be complex; otherwise the model is a product of lags, as in paper 004.
+        delayed: whether the model has a delay.
 
     Raises:
         InputError: a model of these orders would not be strictly proper.
     """
-    if not (0 <= zeros < poles + integrator and 0 <= poles <= 8):
-        raise InputError(
-            f"reduced order: {zeros} zeros, {poles} poles, {'an' if integrator else 'no'} integrator; allowed: up to 8 "
-            "poles, and fewer zeros than poles and integrator"
-        )
+    _check_orders(zeros, poles, integrator=integrator)
     time, response = measured.time, measured.response
     scale = np.abs(response).max()
     pairs = poles // 2 if oscillating else 0
 
-    def numerator(logarithms: Array) -> tuple[Array, Array, Array]:
-        """Compute the best numerator for a denominator; return both in descending powers, and the step response."""
-        bottom = np.append(_denominator(logarithms, pairs), np.zeros(int(integrator)))
-        powers = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
-        basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in powers], axis=1)
-        size = np.abs(basis).max(axis=0)  # scaled, because columns differ by orders of magnitude
+    def numerator(x: Array) -> tuple[Array, Array, Array]:
+        """Compute the best numerator for a denominator; return both in falling powers, and the step response."""
+        bottom = np.append(_denominator(x[:poles], pairs), np.zeros(int(integrator)))
+        falling = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
+        basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in falling], axis=1)
+        if delayed:
+            basis = np.stack([np.interp(time - x[poles], time, column, left=0.0) for column in basis.T], axis=1)
+        size = np.abs(basis).max(axis=0)  # columns differ by orders of magnitude, which would spoil the solution
         top = np.linalg.lstsq(basis / size, response, rcond=None)[0] / size
         return top, bottom, basis @ top
 
-    def residual(logarithms: Array) -> Array:
-        return np.asarray((numerator(logarithms)[2] - response) / scale)
-
-    best = np.empty(0)
-    if poles:
-        low, high = np.log(measured.step / 10.0), np.log(100.0 * time[-1])
-        # Coefficients of p² are squared times.
-        square = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
-        found = [
-            scipy.optimize.least_squares(
-                residual, start, bounds=(low * square, high * square), xtol=1e-10, ftol=1e-10, max_nfev=_MOST
-            )
-            for start in _starts(poles, pairs, float(time[-1]))
-        ]
-        best = min(found, key=lambda one: float(one.cost)).x
+    # Coefficients of p² are times squared.
+    powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
+    first = float(time[int(np.argmax(np.abs(response) > 0.02 * scale))]) if delayed else None
+    best = _search(
+        lambda x: np.asarray((numerator(x)[2] - response) / scale),
+        _starts(poles, pairs, float(time[-1])) if poles else [np.empty(0)],
+        powers,
+        measured.step / 10.0,
+        100.0 * float(time[-1]),
+        first,
+    )
     top, bottom, output = numerator(best)
-    return Fit(TransferFunction(tuple(top), tuple(bottom)), time, response, output)
+    delay = float(best[poles]) if delayed else 0.0
+    return Fit(TransferFunction(tuple(top), tuple(bottom)), time, response, output, delay)
+
+
+def fit_response(
+    measured: FrequencyResponse,
+    *,
+    zeros: int,
+    poles: int,
+    integrator: bool = False,
+    oscillating: bool = True,
+    delayed: bool = False,
+) -> ResponseFit:
+    """Fit a model of chosen orders by least squares of the relative error of the frequency response.
+
+    Args:
+        measured: frequency response of the channel.
+        zeros: degree of the numerator.
+        poles: number of poles without the integrator.
+        integrator: whether the model has an integrator.
+        oscillating: whether poles may be complex.
+        delayed: whether the model has a delay.
+
+    Raises:
+        InputError: the orders do not give a strictly proper model.
+    """
+    _check_orders(zeros, poles, integrator=integrator)
+    p, value = 1j * measured.frequency, measured.value
+    pairs = poles // 2 if oscillating else 0
+    # A thousandth is added: points that are all but certain would count alone.
+    deviation = np.abs(value) * np.hypot(1e-3, 0.0 if measured.deviation is None else measured.deviation)
+
+    def numerator(x: Array) -> tuple[Array, Array, Complex]:
+        """Compute the best numerator for a denominator; return both in falling powers, and the response."""
+        bottom = np.append(_denominator(x[:poles], pairs), np.zeros(int(integrator)))
+        below = np.polyval(bottom, p) * np.exp(p * (x[poles] if delayed else 0.0))
+        basis = np.stack([p**power / below for power in range(zeros, -1, -1)], axis=1)
+        weighted = basis / deviation[:, None]
+        size = np.abs(weighted).max(axis=0)
+        matrix = np.concatenate((weighted.real, weighted.imag)) / size
+        wanted = np.concatenate((value.real / deviation, value.imag / deviation))
+        top = np.linalg.lstsq(matrix, wanted, rcond=None)[0] / size
+        return top, bottom, basis @ top
+
+    def residual(x: Array) -> Array:
+        error = (numerator(x)[2] - value) / deviation
+        return np.asarray(np.concatenate((error.real, error.imag)) / np.sqrt(value.size), np.float64)
+
+    powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
+    low, high = 1.0 / float(measured.frequency[-1]), 1.0 / float(measured.frequency[0])
+    # Starts of a step response over this span have time constants in the middle of the band.
+    span = float(np.sqrt(low * high)) / _SPREADS[1]
+    lag = max(float(-np.unwrap(np.angle(value))[-1]), 1.0) / float(measured.frequency[-1])
+    best = _search(
+        residual,
+        _starts(poles, pairs, span) if poles else [np.empty(0)],
+        powers,
+        low / 10.0,
+        high * 10.0,
+        lag if delayed else None,
+    )
+    top, bottom, output = numerator(best)
+    delay = float(best[poles]) if delayed else 0.0
+    return ResponseFit(TransferFunction(tuple(top), tuple(bottom)), measured.frequency, value, output, delay)
+
+
+def without_delay(measured: ChannelStep, delay: float) -> ChannelStep:
+    """Return a step response without its delay [s], to the nearest sample."""
+    first = round(delay / measured.step)
+    return ChannelStep(measured.time[: measured.time.size - first], measured.response[first:]) if first else measured
 
 
 def fit_inverse(model: TransferFunction, measured: ChannelStep, *, least_lag: float = LAG) -> Fit:

@@ -9,8 +9,10 @@ from typing import Any
 import click
 import numpy as np
 
-from lathe_rc.analysis import hysteresis_fit, reduced_order
+from lathe_rc.analysis import frequency_response, hysteresis_fit, reduced_order
+from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture
+from lathe_rc.commands.fit_drive import drive
 from lathe_rc.commands.tables import console
 from lathe_rc.control.decoupler import LAG
 from lathe_rc.errors import InputError, LatheError
@@ -19,26 +21,32 @@ from lathe_rc.transfer import TransferFunction
 
 @click.group()
 def fit() -> None:
-    """Fit models to measurements: a hysteresis loop, the step response of a channel."""
+    """Fit models to measurements: a drive with its modes, a hysteresis loop, a channel."""
+
+
+fit.add_command(drive)
 
 
 @fit.command()
-@click.argument("measured", type=options.PATH)
+@measured_options.argument
+@measured_options.columns
 @click.option("--stroke", type=options.POSITIVE, default=15e-6, show_default=True, help="half-stroke of the drive [m]")
 @click.option("--command", "command_topic", default="/fine/command", show_default=True, help="of a bag: topic")
 @click.option("--state", "state_topic", default="/fine/state", show_default=True, help="of a bag: topic")
 @options.as_json
-def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: str, *, as_json: bool) -> None:
+def hysteresis(
+    measured: Path, columns: tuple[str, ...], stroke: float, command_topic: str, state_topic: str, *, as_json: bool
+) -> None:
     """Plays of Prandtl and Ishlinskii by least squares (docs/drives.md).
 
-    MEASURED is a CSV file with command_um,displacement_um, or a bag of a drive that ran with linearisation: none.
+    MEASURED is a file with command,displacement, or a bag of a drive that ran with linearisation: none.
     """
-    if measured.is_dir():
+    if measured.is_dir() and not columns:
         from lathe_rc.bag import reader
 
         loop = hysteresis_fit.from_signals(reader.read_bag(measured).dense, command_topic, state_topic)
     else:
-        loop = hysteresis_fit.read_csv(measured)
+        loop = hysteresis_fit.of_measurement(measured_options.opened(measured, columns))
     found = hysteresis_fit.identify(loop, stroke)
     summary = {
         "identified_proportional": found.model.proportional,
@@ -58,29 +66,40 @@ def hysteresis(measured: Path, stroke: float, command_topic: str, state_topic: s
         out.print(f"{name}: {text if np.ndim(summary[name]) == 0 else f'[{text}]'}")
 
 
+Model = reduced_order.Fit | reduced_order.ResponseFit
+
+
 def _coefficients(transfer: TransferFunction) -> dict[str, list[float]]:
     return {"numerator": list(map(float, transfer.numerator)), "denominator": list(map(float, transfer.denominator))}
 
 
-def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | None) -> None:
+def _draw(path: Path, model: Model, inverse: reduced_order.Fit | None) -> None:
     """Draw both stages of paper 004: the model over the measurement, and model and inverse in series over the step."""
     from matplotlib.figure import Figure
 
-    stages = [(model, "model", "measured")]
+    stages: list[tuple[Model, str, str]] = [(model, "model", "measured")]
     if inverse:
         stages.append((inverse, "channel and inverse in series", "step"))
     figure = Figure(figsize=(5.5 * len(stages), 3.6), layout="constrained")
     for axes, (found, title, wanted) in zip(figure.subplots(1, len(stages), squeeze=False)[0], stages, strict=True):
-        axes.plot(found.time, found.wanted, color="#7f7f7f", lw=3.0, label=wanted)
-        axes.plot(found.time, found.found, color="#c0392b", lw=1.2, label=title)
-        axes.set(xlabel="time [s]", title=f"{title}: RMS {found.rms:.3g}")
+        for values, label, style in (
+            (found.wanted, wanted, {"color": "#7f7f7f", "lw": 3.0}),
+            (found.found, title, {"color": "#c0392b", "lw": 1.2}),
+        ):
+            if isinstance(found, reduced_order.ResponseFit):
+                axes.loglog(found.frequency / (2.0 * np.pi), np.abs(values), label=label, **style)
+            else:
+                axes.plot(found.time, values, label=label, **style)
+        response = isinstance(found, reduced_order.ResponseFit)
+        axes.set(xlabel="frequency [Hz]" if response else "time [s]", title=f"{title}: RMS {found.rms:.3g}")
         axes.grid(visible=True, alpha=0.3)
         axes.legend(fontsize=8)
     picture.save(figure, path)
 
 
 @fit.command()
-@click.argument("measured", type=options.PATH)
+@measured_options.argument
+@measured_options.columns
 @click.option("--zeros", type=click.IntRange(0, 8), default=0, show_default=True, help="degree of the numerator")
 @click.option("--poles", type=click.IntRange(1, 8), default=2, show_default=True, help="beside an integrator")
 @click.option("--integrator", is_flag=True, help="the channel integrates")
@@ -88,40 +107,56 @@ def _draw(path: Path, model: reduced_order.Fit, inverse: reduced_order.Fit | Non
 @click.option("--phase-margin", type=click.FloatRange(1, 89), default=60.0, show_default=True, help="of the PID [°]")
 @click.option("--gain-margin", type=click.FloatRange(min=1), default=3.0, show_default=True, help="of the PID [1]")
 @click.option("--delay", type=click.FloatRange(min=0), default=1e-3, show_default=True, help="in the loop [s]")
-@click.option("--lag", type=options.POSITIVE, default=LAG, show_default=True, help="least lag of the inverse [s]")
+@click.option("--dead-time", is_flag=True, help="the model has a delay too, which the PID meets beside --delay")
+@click.option("--averages", type=options.POSITIVE, help="behind the coherence of a frequency response; default: 16")
+@click.option("--lag", type=options.POSITIVE, help=f"least lag of the inverse [s]; default: {LAG:g}, or a step")
 @click.option("--figure", type=options.PATH, default=Path("fit-channel.png"), show_default=True)
 @options.as_json
 def channel(
     measured: Path,
+    columns: tuple[str, ...],
     zeros: int,
     poles: int,
     phase_margin: float,
     gain_margin: float,
     delay: float,
-    lag: float,
+    averages: float | None,
+    lag: float | None,
     figure: Path,
     *,
     integrator: bool,
     lags: bool,
+    dead_time: bool,
     as_json: bool,
 ) -> None:
     """Reduced-order model, realisable inverse, and the fastest PID with the margins asked for (docs/force_position.md).
 
-    MEASURED is a CSV file with time_s,response: the response to a step of 1 at time 0, in even steps. A model without
-    an inverse or a PID is printed all the same, with the reason, and exit code 1.
+    MEASURED is a file with time,response: the response to a step of 1 at time 0, in even steps; or with
+    frequency,magnitude,phase (or real,imaginary). A unit may follow: time_ms. A model without an inverse or a PID is
+    printed all the same, with the reason, and exit code 1.
     """
-    given = reduced_order.read_csv(measured)
-    model = reduced_order.fit(given, zeros=zeros, poles=poles, integrator=integrator, oscillating=not lags)
-    summary: dict[str, Any] = {"model": _coefficients(model.transfer) | {"rms": model.rms}}
+    measurement = measured_options.opened(measured, columns)
+    orders: dict[str, Any] = {"zeros": zeros, "poles": poles, "integrator": integrator, "oscillating": not lags}
+    model: Model
+    if "frequency" in measurement:
+        model = reduced_order.fit_response(
+            frequency_response.of_measurement(measurement, averages), **orders, delayed=dead_time
+        )
+        given = model.step()
+    else:
+        given = reduced_order.of_measurement(measurement)
+        model = reduced_order.fit(given, **orders, delayed=dead_time)
+        given = reduced_order.without_delay(given, model.delay)  # a delay has no inverse
+    summary: dict[str, Any] = {"model": _coefficients(model.transfer) | {"rms": model.rms, "delay": model.delay}}
     inverse: reduced_order.Fit | None = None
     missing = []
     try:
-        inverse = reduced_order.fit_inverse(model.transfer, given, least_lag=lag)
+        inverse = reduced_order.fit_inverse(model.transfer, given, least_lag=lag or max(LAG, given.step))
         summary["inverse"] = _coefficients(inverse.transfer) | {"rms": inverse.rms}
     except InputError as error:
         missing.append(str(error))
     try:
-        summary |= _tuned(model.transfer, np.radians(phase_margin), gain_margin, delay)
+        summary |= _tuned(model.transfer, np.radians(phase_margin), gain_margin, delay + model.delay)
     except InputError as error:
         missing.append(str(error))
     _draw(figure, model, inverse)
@@ -129,7 +164,7 @@ def channel(
     if as_json:
         click.echo(json.dumps({"inverse": None, "pid": None, "loop": None, **summary, "missing": missing}))
     else:
-        _show(summary, delay)
+        _show(summary, delay + model.delay)
     if missing:
         raise LatheError(f"{measured}: {'; '.join(missing)}")
 
@@ -172,7 +207,8 @@ def _show(summary: Mapping[str, Any], delay: float) -> None:
     for name in ("model", "inverse"):
         if found := summary.get(name):
             top, bottom = (", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator"))
-            out.print(f"{name:8} [{top}] / [{bottom}], RMS {found['rms']:.3g}")
+            delayed = f", delay {found['delay']:.4g} s" if found.get("delay") else ""
+            out.print(f"{name:8} [{top}] / [{bottom}]{delayed}, RMS {found['rms']:.3g}")
     if "pid" in summary:
         loop = summary["loop"]
         out.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in summary["pid"].items()))

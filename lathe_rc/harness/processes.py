@@ -344,6 +344,8 @@ class Processes:
             return  # all nodes of a cell in its safe state exit with an error
         if event["event"] == "exit" and event["code"] and node in self._ended - self._abandoned:
             self._lose(node, self._end_of(node, event["code"]))
+        if event["event"] == "exit" and "block0" not in self._newest and not self._left.issuperset(node.split("+")):
+            raise LatheError(f"{node} has ended before the run began{self._tail(node)}")
 
     def _is_no_cause(self, node: str) -> None:
         """Mark the end of a node's process as explained, so that it is not reported as a failure."""

@@ -47,14 +47,16 @@ _TICK = 0.02  # [s] between polls of the graph while members join
 _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
-_MOST_PUT_OFF = 8  # times the blocks in flight of each topic, while a node is deactivated
-_EARLY = 4  # times the blocks in flight of each topic, before a node is ready
+_MOST_DEFERRED = 8  # times the blocks in flight of each topic, until a node is ready and active
 
 T = TypeVar("T")
 
 
 class Role(Protocol):
-    """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up."""
+    """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up.
+
+    Roles derive from it, and leave out what they do not do.
+    """
 
     @property
     def tunable(self) -> tuple[str, ...]:
@@ -72,15 +74,18 @@ class Role(Protocol):
 
     def member_names(self) -> list[str]:
         """Return the fully qualified names of all members; only a time master knows them."""
+        return []
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """Return topic, message type and sparse flag (messages at chosen samples) of each published signal."""
+        return []
 
     def subscriptions(self) -> list[str]:
         """Return the fully qualified names of the signal topics that the node reads."""
 
     def relative_topics(self) -> list[str]:
         """Return the signal topics of the node's stage before remapping; empty without a stage."""
+        return []
 
     def activate(self) -> None:
         """Create the publishers, subscriptions and services of the node."""
@@ -170,8 +175,7 @@ class CellNode(LifecycleNode):
         self.role: Role | None = None
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
-        self._put_off: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received while deactivated
-        self._early: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received before the node was ready
+        self._deferred: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received too early
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -286,7 +290,8 @@ class CellNode(LifecycleNode):
             self._begin_to_exchange()
             self.role.activate()
         self.protocol.activate(time.monotonic())
-        self._take_up(self._put_off)
+        if not self._is_early():
+            self._take_up()
         self._perform_actions()
         self.reporter("active", self.get_name(), pid=os.getpid())
 
@@ -528,7 +533,7 @@ class CellNode(LifecycleNode):
             case actions.Begin(joins):
                 role.begin(joins=joins)
                 self.protocol.begun(time.monotonic())
-                self._take_up(self._early)
+                self._take_up()
             case actions.Lose(lost, first, end, again):
                 role.lose(lost, first, end, again=again)
             case _:
@@ -573,21 +578,17 @@ class CellNode(LifecycleNode):
         So no message is lost, and blocks from before a node joined do not count as missing. In a free-running cell
         the signals of a deactivated node are dropped instead, and counted like any missing blocks.
         """
-        most = _MOST_PUT_OFF * signal_depth(self.table)
 
         def call(message: Any) -> None:
-            if not self.protocol.active:
-                if self.table.window:
-                    self._put_off.append((callback, message))
-                if len(self._put_off) > most * (len(self.inlets) + 1):
-                    raise LatheError(f"{self.full_name}: {len(self._put_off)} messages wait until it is active again")
-            elif self._is_early():
-                self._early.append((callback, message))
-                if len(self._early) > _EARLY * signal_depth(self.table) * (len(self.inlets) + 1):
-                    self._early.popleft()  # a flood of foreign messages
-            else:
-                self._take_up(self._early)
+            if self.protocol.active and not self._is_early():
+                self._take_up()
                 callback(message)
+            elif self.protocol.active or self.table.window:
+                self._deferred.append((callback, message))
+                if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table) * (len(self.inlets) + 1):
+                    if self.protocol.ready:
+                        raise LatheError(f"{self.full_name}: {len(self._deferred)} messages wait until it is active")
+                    self._deferred.popleft()  # a flood of foreign messages
 
         return call
 
@@ -597,9 +598,9 @@ class CellNode(LifecycleNode):
             return not self.protocol.ready
         return bool(getattr(self.table, "restart_file", "")) and not self.protocol.alone
 
-    def _take_up(self, waiting: deque[tuple[Callable[[Any], object], Any]]) -> None:
-        while waiting:
-            callback, message = waiting.popleft()
+    def _take_up(self) -> None:
+        while self._deferred:
+            callback, message = self._deferred.popleft()
             self.guarded(callback)(message)
 
     def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:

@@ -60,7 +60,11 @@ class Chain:
         """Return the number of computable samples and whether the run ends there; None while an input is missing."""
         samples, last = self._most, False
         for role in self._roles:
-            ready = role.ready() if role.computes else None
+            try:
+                ready = role.ready() if role.computes else None
+            except LatheError as error:
+                role.node.fail(error)  # the reader of the bad input, not the first stage
+                return None
             if ready is None:
                 return None
             if ready[0] <= samples:
@@ -72,12 +76,8 @@ class Chain:
         """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
         first, failure, self._busy = self._roles[0].samples, None, True
         self._tapes.advance(first)
-        for role, stage in zip(self._roles, self._stages, strict=True):
-            for place, (tape, _) in enumerate(stage.inputs):
-                if tape not in self._inside:
-                    written = self._tapes.view(tape, first, samples)
-                    for name, array in role.inputs.take(place, first, samples).items():
-                        written[name][:] = array
+        if not self._take_inputs(first, samples):
+            return
         try:
             self._program.run(first + samples)
         except LatheError as error:
@@ -87,7 +87,10 @@ class Chain:
             if end > first:
                 outputs = [self._tapes.view(topic, first, end - first) for topic in role.outputs.topics]
                 role.angle = self._angle(number, end) if role.stage.tunable else 0.0
-                role.publish_copies(said, outputs, last=last and end == first + samples)
+                try:
+                    role.publish_copies(said, outputs, last=last and end == first + samples)
+                except LatheError as error:
+                    role.node.fail(error)
         for role in self._roles:
             role.inputs.pass_over(self._inside, role.samples)
         self._busy = False
@@ -103,6 +106,26 @@ class Chain:
             return 0.0
         tape, delay = inputs[stage.angle_input]
         return float(self._tapes.view(tape, end - 1, 1, delay)["angle"][0])
+
+    def _take_inputs(self, first: int, samples: int) -> bool:
+        """Copy the samples from outside the chain to its tapes.
+
+        A stage with a bad input fails, and the chain is dissolved: False. No stage has computed any of the samples yet.
+        """
+        for role, stage in zip(self._roles, self._stages, strict=True):
+            for place, (tape, _) in enumerate(stage.inputs):
+                if tape in self._inside:
+                    continue
+                written = self._tapes.view(tape, first, samples)
+                try:
+                    taken = role.inputs.take(place, first, samples)
+                except LatheError as error:
+                    self._busy = False
+                    role.node.fail(error)
+                    return False
+                for name, array in taken.items():
+                    written[name][:] = array
+        return True
 
     def leave(self) -> None:
         """Dissolve the chain: each stage goes on alone from its current sample."""

@@ -55,7 +55,6 @@ class EncoderRole(SpindleRole):
 
     def finish(self) -> None:
         """Close the encoder's line (implements `Role`)."""
-        super().finish()
         if self._line is not None:
             self._line.close()
             self._line = None

@@ -30,11 +30,10 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes.block_queue import BlockQueue
-from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
-from lathe_rc.protocol.actions import Action
 
 _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
@@ -51,7 +50,7 @@ class _Encoders(dict[tuple[str, str, str, int], Encoder]):
         return encoder
 
 
-class RecorderRole:
+class RecorderRole(Role):
     """Role of the recorder; subscribes to the topics of all members, or without a cell to all announced topics.
 
     Args:
@@ -87,10 +86,6 @@ class RecorderRole:
         """Return the node's protocol object; it is wired after the subscriptions are created (implements `Role`)."""
         return MemberProtocol(own, self.table.window, masters=MASTERS, wired=False)
 
-    def member_names(self) -> list[str]:
-        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
-        return []
-
     @property
     def tunable(self) -> tuple[str, ...]:
         """Return the parameters that may change in a run (implements `Role`)."""
@@ -107,10 +102,6 @@ class RecorderRole:
         split(self._writer, float(cast("float", values["split_duration"])))
         return "from the next message on"
 
-    def relative_topics(self) -> list[str]:
-        """Return the relative signal topics: none, since a recorder has no stage (implements `Role`)."""
-        return []
-
     def begin(self, *, joins: bool) -> None:
         """Prepare for block 0 (implements `Role`).
 
@@ -121,15 +112,6 @@ class RecorderRole:
             raise LatheError(
                 f"{self.node.full_name}: the cell is running already; start a recorder before it, or use lathe record"
             )
-
-    def perform(self, action: Action) -> None:
-        """Ignore the actions of a time master (implements `Role`)."""
-
-    def work(self) -> None:
-        """Do nothing: messages are written when they arrive (implements `Role`)."""
-
-    def failed(self) -> None:
-        """Do nothing after a failure (implements `Role`)."""
 
     def activate(self) -> None:
         """Create the snapshot service and subscribe to the host topics; signal topics follow when announced."""
@@ -170,10 +152,6 @@ class RecorderRole:
             ours = any(status.name in self.node.protocol.members for status in told.status)
         if ours:
             self._open.write(topic, self._log_ns, data)
-
-    def publications(self) -> list[tuple[str, str, bool]]:
-        """Return the published signals: none."""
-        return []
 
     def subscriptions(self) -> list[str]:
         """Return all signal topics of the members."""

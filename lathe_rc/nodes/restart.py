@@ -8,28 +8,15 @@ again. The state is at most two windows old: publishers, which may be one window
 
 from collections import deque
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.events import Trigger
-from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.inputs import Inputs
-from lathe_rc.nodes.outputs import Outputs
 
-
-class Resumable(Protocol):
-    """Interface of a stage's role whose state can be stored (see `lathe_rc.nodes.stage_role.StageRole`)."""
-
-    node: CellNode
-    stage: Stage
-    inputs: Inputs
-    outputs: Outputs
-    blocks: int
-    samples: int
-    started: bool
+if TYPE_CHECKING:
+    from lathe_rc.nodes.stage_role import StageRole
 
 
 class Restart:
@@ -46,7 +33,7 @@ class Restart:
         InputError: the cell has no window.
     """
 
-    def __init__(self, role: Resumable, file: str) -> None:
+    def __init__(self, role: "StageRole", file: str) -> None:
         self._role, self._file, self._node = role, file, role.node
         self._window = role.node.table.window
         if not self._window:

@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from lathe_rc_msgs.srv import Schedule
@@ -17,33 +17,19 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals
 from lathe_rc.nodes.block_queue import BlockQueue
-from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.inputs import Inputs
 from lathe_rc.nodes.outputs import Memory, Outputs
 from lathe_rc.nodes.restart import Restart
 from lathe_rc.protocol import Announcement, MemberProtocol
-from lathe_rc.protocol.actions import Action
+
+if TYPE_CHECKING:
+    from lathe_rc.nodes.chain import Chain
 
 _TOGETHER = 2  # steps per window, so that members still work in parallel
 
 
-class Chain(Protocol):
-    """Interface of stages that are computed together (implemented by `lathe_rc.nodes.chain.Chain`)."""
-
-    def advance(self) -> None:
-        """Compute as far as the inputs from outside the chain allow; the first stage sets the limit."""
-
-    def ready(self) -> tuple[int, bool] | None:
-        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
-
-    def compute(self, samples: int, *, last: bool) -> None:
-        """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
-
-    def leave(self) -> None:
-        """Dissolve the chain: each stage goes on alone from its current sample."""
-
-
-class StageRole:
+class StageRole(Role):
     """Role of a cell node that computes a stage.
 
     Args:
@@ -81,10 +67,6 @@ class StageRole:
     def protocol(self, own: Announcement) -> MemberProtocol:
         """Return the node's protocol object (implements `Role`)."""
         return MemberProtocol(own, self.node.table.window, masters=MASTERS)
-
-    def member_names(self) -> list[str]:
-        """Return the members that the node names: none, since it is no time master (implements `Role`)."""
-        return []
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """Return topic, message type and sparse flag of each output (implements `Role`)."""
@@ -144,9 +126,6 @@ class StageRole:
                 f"{self.node.full_name}: the cell is running already, and this node cannot go on in mid-run"
             )
 
-    def perform(self, action: Action) -> None:
-        """Ignore the actions of a time master (implements `Role`)."""
-
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
         """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
         if self.chain is not None:
@@ -186,9 +165,6 @@ class StageRole:
         """Dissolve the chain after a failure; its other stages go on alone (implements `Role`)."""
         if self.chain is not None:
             self.chain.leave()
-
-    def finish(self) -> None:
-        """Do nothing: a stage has no files to close (implements `Role`)."""
 
     def clean_up(self) -> None:
         """Leave the chain and the exchange of the process (implements `Role`)."""
@@ -362,7 +338,7 @@ class StageRole:
         master = self.node.protocol.master
         return master.name if master is not None else ""
 
-    def join(self, chain: Chain, inside: Collection[str]) -> None:
+    def join(self, chain: "Chain", inside: Collection[str]) -> None:
         """Join a chain at sample 0; the stages of the chain publish the topics ``inside``."""
         self.chain = chain
         self.inputs.join_chain(inside)

@@ -21,6 +21,7 @@ SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node co
 GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
 PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
+_NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
 _MOST_MEMBERS = 256  # largest number of announced names
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
@@ -84,8 +85,8 @@ class MemberProtocol:
         self._reported_blocks = 0
         self._moved = 0.0  # time of the last block that this member completed
         self._master_stalls = False
-        self._repeat_due = 0.0
-        self._leave_due = self._wait_report_due = math.inf
+        self._repeat_due = self._time = 0.0
+        self._join_due = self._leave_due = self._wait_report_due = math.inf
         self._wait_report_after: Iterator[float] = iter(())
 
     # ---- lifecycle ----------------------------------------------------------------------------------
@@ -120,6 +121,7 @@ class MemberProtocol:
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was shut down in the middle of a run"))
         else:
+            self._leave_before_the_run()
             self._leave_due = now + _LAST_ANSWER
         self.active = False
 
@@ -127,10 +129,14 @@ class MemberProtocol:
         """Handle a signal that ends the node's process."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
-        elif self._started and not (self.over or self.failure or self.done):
+        elif not (self.over or self.failure or self.done):
+            self._leave_before_the_run()
+            self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
+
+    def _leave_before_the_run(self) -> None:
+        """Announce that the cell must not begin without this member."""
+        if not (self.over or self.failure or self.done):
             self.clean_up()
-            if self.master is not None:
-                self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
 
     # ---- announcements ------------------------------------------------------------------------------
 
@@ -173,7 +179,7 @@ class MemberProtocol:
         if member.name == self.own.name:
             self._meet_namesake(member)
             return
-        self.members[member.name] = member
+        known, self.members[member.name] = self.members.get(member.name), member
         if member.members:
             self._hear_master(member, now)
         self.actions.append(do.Follow(member, bool(member.members or self.own.members)))
@@ -182,6 +188,8 @@ class MemberProtocol:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
         if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
             self.member_failed(member, now)
+        elif known and known.process == member.process and known.state > member.state == MemberState.JOINING:
+            self.member_left(member, now)
         self.actions.append(do.MembersChanged())
         self.members_changed(now)
 
@@ -250,7 +258,8 @@ class MemberProtocol:
         if self.failure or self.done:
             return
         if self.ready or (other.state not in established and self.own.process < other.process):
-            self.announce()
+            if other.state not in established:  # an established namesake would answer in turn, without end
+                self.announce()
             why = f"this node, process {self.own.pid}, has that name"
             raise ForeignMessage("members", other.name, other.run_id, why)
         place = f"process {other.pid}" + ("" if other.host == self.own.host else " of another machine")
@@ -265,6 +274,9 @@ class MemberProtocol:
         """Handle the failure of a member; once the cell may be running, the time master decides on the reaction."""
         if not self.ready:
             self.abandon(member)
+
+    def member_left(self, member: Announcement, now: float) -> None:
+        """Handle a member that was ready and is not any more; only a time master does."""
 
     def abandon(self, member: Announcement) -> None:
         """Fail because another member has failed."""
@@ -301,6 +313,8 @@ class MemberProtocol:
         if not self.active or self.ready or self._beginning or self.failure or not self.complete:
             return False
         if self.phase is None:  # the cell may be running already
+            return False
+        if self.phase != Phase.WAITING and self._time < self._join_due:
             return False
         assert self.master is not None, "the cell is complete"
         return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
@@ -392,6 +406,9 @@ class MemberProtocol:
             self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
+        if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
+            # A member that cannot resume gives up, and names its established namesake if there is one.
+            self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
         if self.failure:
             self._leave_with_the_cell()
         elif self.phase == Phase.ENDED and self.over and not self.done:
@@ -416,14 +433,16 @@ class MemberProtocol:
     # ---- time ---------------------------------------------------------------------------------------
 
     def look(self, now: float, silent: Mapping[str, float], ended: Collection[str]) -> None:
-        """Do the periodic work; called at least ten times a second, and when a member becomes silent.
+        """Do the periodic work; called ten times a second, by a time master more often than `SILENCE`.
+
+        A member that becomes silent is a reason for a further call.
 
         Args:
             now: monotonic time [s].
             silent: time since which each silent or stopped member has been so [s].
             ended: members whose process on this machine has ended.
         """
-        self.silent, self.ended, self.look_due = silent, ended, math.inf
+        self.silent, self.ended, self.look_due, self._time = silent, ended, math.inf, now
         if now >= self._leave_due:
             self.leave()
         if not self._started or self.done:

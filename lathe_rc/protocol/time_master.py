@@ -299,6 +299,11 @@ class TimeMasterProtocol(MemberProtocol):
         else:
             self._give_up_on(member.name, why_failed(member), now)
 
+    def member_left(self, member: Announcement, now: float) -> None:
+        """Give up a member that has left when the run had begun, before it was informed of that."""
+        if self.running and self.completed.get(member.name, self.blocks_in_run) != self.blocks_in_run:
+            self._give_up_on(member.name, "left as the run began", now)
+
     def _give_up_on(self, name: str, why: str, now: float) -> None:
         if self.running and self.window:
             self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)

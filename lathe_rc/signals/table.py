@@ -33,15 +33,19 @@ def read_text(path: Path, what: str) -> str:
         raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None
 
 
-def _number(text: str, path: Path, line: int) -> float:
-    """Parse a finite number from a CSV field."""
+def number(text: str, path: Path, line: int) -> float:
+    """Parse a finite number from a field of a CSV file.
+
+    Raises:
+        InputError: the text is no finite number; the message names path and line.
+    """
     try:
-        number = float(text)
+        found = float(text)
     except ValueError:
         raise InputError(f"{path}:{line}: {text.strip()!r} is not a number") from None
-    if not math.isfinite(number):
+    if not math.isfinite(found):
         raise InputError(f"{path}:{line}: {text.strip()!r}; allowed: finite numbers")
-    return number
+    return found
 
 
 def read_table(
@@ -90,7 +94,7 @@ def parse_table(
         if len(row) != len(header):
             decimals = " (decimals with a point)" if len(row) > len(header) else ""
             raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header{decimals}")
-        numbers.append([_number(text, path, n) for text in row])
+        numbers.append([number(text, path, n) for text in row])
     if since_first and numbers:
         first = Decimal(rows[1][1][0])
         for taken, (_, row) in zip(numbers, rows[1:], strict=True):

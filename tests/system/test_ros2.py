@@ -35,7 +35,7 @@ def place(tmp_path, monkeypatch, domain):
 
 
 def ros2(*words, code=0):
-    """What a command of ros2 prints on both streams; ``code``: None for any."""
+    """Output of a command of ros2 on both streams; ``code``: None for any."""
     done = subprocess.run([ROS2, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     assert code is None or done.returncode == code, done.stdout
     return done.stdout

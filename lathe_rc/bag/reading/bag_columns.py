@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals of a bag as columns of a measurement: ``TOPIC.FIELD``."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from lathe_rc import messages
+from lathe_rc.bag.reading.recorded import Recorded
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell import columns
+from lathe_rc.messages import Samples
+from lathe_rc.signals.measurement_file import Clock, Mapped, Measurement
+
+_DRIVE = {"command": "coarse/command.position", "response": "coarse/state.measured_position"}
+
+
+class BagColumns:
+    """Columns of a bag, for `lathe_rc.signals.measurement_file.Measurement`.
+
+    Args:
+        path: path of the bag.
+
+    Raises:
+        InputError: the path is not a bag.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.units: dict[str, str] = {}
+        self._steps: dict[str, int] = {}
+        with Source(path) as source:
+            self.namespace = Recorded(source, {}).namespace
+            for topic, about in sorted(source.topics.items()):
+                if about.type in messages.block_types() and about.count:
+                    self._steps[topic] = source.step_ns(topic)
+                    for field in messages.allocate(about.type, 0):
+                        # Without a word of its sender a command is one of a position.
+                        unit = columns.units(about.type).get(field, "").partition(" or ")[0]
+                        self.units[f"{topic}.{field}"] = unit
+
+    def read(self, names: Sequence[str]) -> Mapping[str, Samples]:
+        """Return signals by column, shape (n,) each.
+
+        Raises:
+            LatheError: samples are missing or not finite.
+        """
+        with Source(self._path) as source:
+            recorded = Recorded(source, {})
+            places = {name: name.rpartition(".") for name in names}
+            found = {name: recorded.whole(topic, field) for name, (topic, _, field) in places.items()}
+        common = min(array.size for array in found.values())  # a run that was stopped may lack the last blocks of one
+        return {name: array[:common] for name, array in found.items()}
+
+    def clock(self, name: str) -> Clock | None:
+        """Return the sampling of the topic of a column."""
+        return Clock(0.0, self._steps[name.rpartition(".")[0]] * 1e-9)
+
+
+def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
+    """Open a bag as a measurement; without a mapping command and response are those of the coarse drive.
+
+    Raises:
+        InputError: the path is not a bag, or lacks a column of the mapping.
+    """
+    source = BagColumns(path)
+    own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
+    own = {quantity: found for quantity, found in own.items() if found.column in source.units}
+    return Measurement(str(path), source, {**own, **mapping})

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Argument and options of commands that read a measurement."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from lathe_rc.commands import options
+from lathe_rc.signals import measurement_file
+from lathe_rc.signals.measurement_file import Measurement
+
+_BAGS = (".mcap", ".db3", ".zstd")
+
+argument = click.argument("measured", type=options.PATH)
+columns = click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="QUANTITY=COLUMN[:UNIT]",
+    help="where the file names it otherwise, such as command=u_um:um; repeatable",
+)
+
+
+def opened(path: Path, given: Sequence[str]) -> Measurement:
+    """Open a file or a bag with the columns that the options name.
+
+    Raises:
+        InputError: the path has no measurement, or an option names no column of it.
+        LatheError: the package that reads the format is not installed.
+    """
+    mapping = measurement_file.parse_mapping(given)
+    if path.is_dir() or path.suffix in _BAGS:
+        from lathe_rc.bag.reading import bag_columns
+
+        return bag_columns.measurement(path, mapping)
+    return measurement_file.read(path, mapping)

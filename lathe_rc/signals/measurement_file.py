@@ -1,0 +1,506 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements by quantity, in SI units, from CSV, Parquet, MATLAB, TDMS and MDF files.
+
+All commands that read measurements use one format of columns. A column is named by its quantity, with its unit after
+it: ``time_ms``, ``time [ms]``, ``command_um``, ``response``, ``frequency_hz``. Without a unit in its name it has the
+unit that the file states for it, otherwise the SI unit. A mapping of columns gives names and units that differ.
+"""
+
+import csv
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from lathe_rc import extras, files
+from lathe_rc.errors import InputError, shown
+from lathe_rc.signals.table import number
+
+Array = npt.NDArray[np.float64]
+
+_LENGTH = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "": 1.0, "1": 1.0}
+_RATIO = {"": 1.0, "1": 1.0, "%": 1e-2, "pct": 1e-2}
+_DECIBEL = "db"
+_TURN = 2.0 * np.pi
+
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "": 1.0},
+    "command": _LENGTH,
+    "response": _LENGTH,
+    "displacement": _LENGTH,
+    "frequency": {"hz": _TURN, "khz": 1e3 * _TURN, "rad/s": 1.0, "rad_s": 1.0, "": _TURN},
+    "magnitude": {**_RATIO, _DECIBEL: 1.0},
+    "phase": {"deg": np.pi / 180.0, "°": np.pi / 180.0, "rad": 1.0, "": np.pi / 180.0},
+    "real": _RATIO,
+    "imaginary": _RATIO,
+    "coherence": _RATIO,
+    "relative_uncertainty": _RATIO,
+}  #: factors to SI units [s, m, rad/s, 1, rad] by quantity and unit; "": no unit known
+_NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
+_LONGEST_HEADER = 2**20  # [B]
+_MOST_COLUMNS = 12  # that an error message lists
+
+
+class Clock(NamedTuple):
+    """Sampling of a column of a file that states it: time of the first value and step [s]."""
+
+    start: float
+    step: float
+
+
+class Source(Protocol):
+    """Opened measurement: columns by name."""
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit by column, in the order of the file; empty if the file states none."""
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        """Return columns by name, shape (n,) each."""
+
+    def clock(self, name: str) -> Clock | None:
+        """Return the sampling of a column; None if the file does not state it."""
+
+
+class Mapped(NamedTuple):
+    """Column of a quantity as a user names it; an empty unit: that of the column."""
+
+    column: str
+    unit: str
+
+
+def parse_mapping(given: Iterable[str]) -> dict[str, Mapped]:
+    """Parse ``QUANTITY=COLUMN[:UNIT]``; the unit may be a number, the SI value of 1.
+
+    Raises:
+        InputError: the text has another form, the quantity or the unit is unknown, or a quantity is given twice.
+    """
+    mapping: dict[str, Mapped] = {}
+    for text in given:
+        quantity, equals, column = text.partition("=")
+        if not equals or quantity not in UNITS or not column:
+            raise InputError(f"--column {text!r}; allowed: QUANTITY=COLUMN[:UNIT], QUANTITY of {', '.join(UNITS)}")
+        if quantity in mapping:
+            raise InputError(f"--column {text!r}: {quantity} is given twice; allowed: once")
+        name, colon, unit = column.rpartition(":")
+        if not colon:
+            name, unit = column, ""
+        elif _factor(quantity, unit) is None:
+            known = ", ".join(unit for unit in UNITS[quantity] if unit)
+            raise InputError(
+                f"--column {text!r}: no unit {unit!r} of {quantity}; allowed: {known}, or a number, the SI value of 1"
+            )
+        mapping[quantity] = Mapped(name, unit)
+    return mapping
+
+
+def _plain(unit: str) -> str:
+    """Return a unit in the spelling of `UNITS`."""
+    return unit.strip().replace("µ", "u").replace("μ", "u").casefold()
+
+
+def _factor(quantity: str, unit: str) -> float | None:
+    """Return the SI value of 1 in a unit: one of `UNITS` or a number; None for another text."""
+    found = UNITS[quantity].get(_plain(unit))
+    if found is None:
+        try:
+            found = float(unit)
+        except ValueError:
+            return None
+    return found if np.isfinite(found) and found else None
+
+
+def _unit_of(quantity: str, column: str) -> str | None:
+    """Return the unit in the name of a column, ``NAME_UNIT`` or ``NAME [UNIT]``; None if it has none."""
+    match = _NAMED.fullmatch(column)
+    if match and match["bracket"] is not None:
+        return match["bracket"] if re.search("[^\\W\\d]|[%°]", match["bracket"]) else None  # "[2]" is no unit
+    known = sorted((unit for unit in UNITS[quantity] if unit and unit != "1"), key=len, reverse=True)
+    return next((unit for unit in known if _plain(column).endswith(f"_{unit}")), None)
+
+
+def _is_of(quantity: str, column: str) -> bool:
+    """Return whether a column is named by a quantity, with or without its unit."""
+    match = _NAMED.fullmatch(column)
+    name = _plain(match["name"] if match else column).replace(" ", "_")
+    return name == quantity or any(name == f"{quantity}_{unit}" for unit in UNITS[quantity] if unit)
+
+
+def even_clock(time: Array, what: str) -> Clock:
+    """Return start and step of evenly spaced times.
+
+    Args:
+        time: times [s], shape (n,), n at least 2.
+        what: description of the times for error messages.
+
+    Raises:
+        InputError: the times are not even.
+    """
+    if time.size < 2:
+        raise InputError(f"{what}: {time.size} samples; allowed: 2 or more")
+    step = float(time[-1] - time[0]) / (time.size - 1)
+    off = np.abs(time - (time[0] + step * np.arange(time.size)))
+    if step <= 0.0 or off.max() > 0.1 * step:
+        at = int(off.argmax())
+        raise InputError(
+            f"{what}: not in even steps, {time[at]:.9g} s at sample {at} is {off[at]:.3g} s off; allowed: even steps "
+            "(resample the record, or give --rate)"
+        )
+    return Clock(float(time[0]), step)
+
+
+class Measurement:
+    """Quantities of a measurement, in SI units.
+
+    Args:
+        name: path of the measurement, for error messages.
+        source: its columns.
+        mapping: columns of quantities that are not named by them.
+
+    Raises:
+        InputError: a column of the mapping does not exist, or two columns are named by the same quantity.
+    """
+
+    def __init__(self, name: str, source: Source, mapping: Mapping[str, Mapped]) -> None:
+        self.name, self._source = name, source
+        self._columns: dict[str, Mapped] = {}
+        for quantity, (column, unit) in mapping.items():
+            if column not in source.units:
+                raise InputError(f"--column {quantity}={column}: {name} has no such column; it has {self._listed()}")
+            self._columns[quantity] = Mapped(column, unit)
+        for quantity in UNITS.keys() - mapping.keys():
+            fitting = [column for column in source.units if _is_of(quantity, column)]
+            if len(fitting) > 1:
+                raise InputError(
+                    f"{name}: {fitting[0]!r} and {fitting[1]!r} are both {quantity}; allowed: one (--column "
+                    f"{quantity}={fitting[0]})"
+                )
+            if fitting:
+                self._columns[quantity] = Mapped(fitting[0], "")
+
+    def _listed(self) -> str:
+        names = list(self._source.units)
+        more = f" and {len(names) - _MOST_COLUMNS} more" if len(names) > _MOST_COLUMNS else ""
+        return (", ".join(map(repr, names[:_MOST_COLUMNS])) or "no columns of numbers") + more
+
+    def __contains__(self, quantity: str) -> bool:
+        """Return whether the measurement has a quantity."""
+        return quantity in self._columns
+
+    def lacking(self, allowed: str) -> InputError:
+        """Return the error for a measurement without the required quantities; ``allowed`` names these."""
+        return InputError(
+            f"{self.name}: columns {self._listed()}; allowed: {allowed} (name others by --column QUANTITY=COLUMN:UNIT)"
+        )
+
+    def read(self, *quantities: str) -> list[npt.NDArray[Any]]:
+        """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
+
+        Raises:
+            InputError: a column has no finite numbers, its unit is unknown, or the lengths differ.
+        """
+        columns = {quantity: self._columns[quantity] for quantity in quantities}
+        arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
+        found = []
+        for quantity, (column, unit) in columns.items():
+            array = np.asarray(arrays[column])
+            if array.dtype.kind not in "fiuc" or array.ndim != 1:
+                raise InputError(f"{self.name}: column {column!r} holds no numbers in a row; name another column")
+            array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64, copy=False)
+            wrong = np.flatnonzero(~np.isfinite(array))
+            if wrong.size:
+                raise InputError(
+                    f"{self.name}: {column!r} is {array[wrong[0]]} in row {wrong[0] + 1}; allowed: finite numbers"
+                )
+            found.append(self._in_si(quantity, column, unit, array))
+        sizes = [array.size for array in found]
+        if len(set(sizes)) > 1:
+            lengths = ", ".join(f"{size} of {name}" for name, size in zip(quantities, sizes, strict=True))
+            raise InputError(f"{self.name}: {lengths}; allowed: as many of each")
+        return found
+
+    def _in_si(self, quantity: str, column: str, unit: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        named = _unit_of(quantity, column)
+        unit = unit or (named if named is not None else self._source.units[column])
+        factor = _factor(quantity, unit)
+        if factor is None:
+            known = ", ".join(each for each in UNITS[quantity] if each)
+            raise InputError(
+                f"{self.name}: column {column!r} has the unit {shown(unit)!r}; allowed for {quantity}: {known} (or the "
+                f"SI value of 1, --column {quantity}={column}:NUMBER)"
+            )
+        if _plain(unit) == _DECIBEL:
+            return np.asarray(10.0 ** (array / 20.0))
+        return array if factor == 1.0 else array * factor
+
+    def clock(self, rate: float | None, *quantities: str) -> Clock:
+        """Return the common sampling of quantities: of ``rate`` [Hz], the column of the time, or stated by the file.
+
+        Raises:
+            InputError: nothing states it, it is not even, or it differs between the quantities.
+        """
+        if rate is not None:
+            return Clock(0.0, 1.0 / rate)
+        if "time" in self:
+            return even_clock(self.read("time")[0], f"{self.name}: time")
+        columns = [self._columns[quantity].column for quantity in quantities]
+        clocks = [self._source.clock(column) for column in columns]
+        known = [clock for clock in clocks if clock is not None]
+        if not known:
+            raise InputError(f"{self.name}: no time; give --rate HZ, or a column by --column time=COLUMN:UNIT")
+        for column, clock in zip(columns, clocks, strict=True):
+            if clock is None or abs(clock.step - known[0].step) > 1e-6 * known[0].step:
+                raise InputError(f"{self.name}: {columns[0]!r} and {column!r} are sampled differently; resample one")
+            if abs(clock.start - known[0].start) > 1e-3 * known[0].step:
+                raise InputError(f"{self.name}: {columns[0]!r} and {column!r} begin at different times; cut both alike")
+        return known[0]
+
+
+# --- formats
+
+
+@dataclass(frozen=True)
+class _Arrays:
+    """Columns in memory."""
+
+    arrays: Mapping[str, npt.NDArray[Any]]
+    units: Mapping[str, str]
+    clocks: Mapping[str, Clock]
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        return {name: self.arrays[name] for name in names}
+
+    def clock(self, name: str) -> Clock | None:
+        return self.clocks.get(name)
+
+
+class _Csv:
+    """CSV file: comma, semicolon or tabulator between columns; lines that start with # are comments."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._skipped, header, first = self._beginning()
+        self._delimiter = next((mark for mark in (";", "\t") if mark in header), ",")
+        self._decimal = "," if self._delimiter != "," and "," in first else "."
+        names = next(csv.reader([header], delimiter=self._delimiter), [])
+        self._names = [name.strip() for name in names]
+        doubles = [name for name in self._names if self._names.count(name) > 1]
+        if doubles:
+            raise InputError(f"{path}: two columns {doubles[0]!r}; allowed: each name once")
+        self.units = dict.fromkeys(self._names, "")
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        """Yield the lines that are not empty or comments, with their numbers from 1."""
+        try:
+            with open(self._path, encoding="utf-8-sig", newline=None, opener=files.open_file) as stream:
+                number = 0
+                while line := stream.readline(_LONGEST_HEADER):
+                    number += 1
+                    if line.strip() and line.lstrip()[0] != "#":
+                        yield number, line.rstrip("\n")
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot be read ({error.strerror}); check the path") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{self._path}: not a text file; allowed: CSV in UTF-8") from None
+
+    def _beginning(self) -> tuple[int, str, str]:
+        """Return the number of lines up to the header, the header, and the line after it."""
+        lines = self._lines()
+        skipped, header = next(lines, (0, ""))
+        return skipped, header, next(lines, (0, ""))[1]
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        import pyarrow as pa
+        from pyarrow import csv as arrow_csv
+
+        options = {
+            "read_options": arrow_csv.ReadOptions(column_names=self._names, skip_rows=self._skipped),
+            "parse_options": arrow_csv.ParseOptions(delimiter=self._delimiter),
+            "convert_options": arrow_csv.ConvertOptions(
+                include_columns=list(names),
+                column_types=dict.fromkeys(names, pa.float64()),
+                decimal_point=self._decimal,
+            ),
+        }
+        try:
+            table = arrow_csv.read_csv(self._path, **options)
+        except pa.ArrowInvalid:  # comments among the rows, or an error whose line only the second reading knows
+            return self._read_by_line(names)
+        arrays = {name: table.column(name).to_numpy() for name in names}
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            return self._read_by_line(names)
+        return arrays
+
+    def _read_by_line(self, names: Sequence[str]) -> Mapping[str, Array]:
+        """Read the columns line by line; errors name the line."""
+        places = [self._names.index(name) for name in names]
+        lines = self._lines()
+        next(lines)
+        rows = []
+        for line, text in lines:
+            try:
+                row = next(csv.reader([text], delimiter=self._delimiter, strict=True))
+            except csv.Error as error:
+                raise InputError(f"{self._path}:{line}: not CSV ({error})") from None
+            if len(row) != len(self._names):
+                decimals = " (decimals with a point)" if len(row) > len(self._names) else ""
+                raise InputError(
+                    f"{self._path}:{line}: {len(row)} values; allowed: {len(self._names)}, as in the header{decimals}"
+                )
+            rows.append([number(row[place].replace(self._decimal, "."), self._path, line) for place in places])
+        return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
+
+    def clock(self, name: str) -> Clock | None:
+        return None
+
+
+class _Parquet:
+    """Parquet file; the metadata ``unit`` of a field is the unit of the column."""
+
+    def __init__(self, path: Path) -> None:
+        from pyarrow import parquet
+
+        self._file = parquet.ParquetFile(path)
+        schema = self._file.schema_arrow
+        self.units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        table = self._file.read(columns=list(names))
+        return {name: table.column(name).to_numpy() for name in names}
+
+    def clock(self, name: str) -> Clock | None:
+        return None
+
+
+def _mat(path: Path) -> Source:
+    """Read a MATLAB file; a field of a structure is ``NAME.FIELD``."""
+    try:
+        variables = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
+    except NotImplementedError:
+        raise InputError(f"{path}: MATLAB 7.3; allowed: up to 7 (save it with '-v7' in MATLAB)") from None
+    arrays: dict[str, npt.NDArray[Any]] = {}
+
+    def collect(name: str, value: Any) -> None:
+        if hasattr(value, "_fieldnames"):
+            for field in value._fieldnames:  # noqa: SLF001 - the documented way to list the fields
+                collect(f"{name}.{field}", getattr(value, field))
+        elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiuc":
+            arrays[name] = value
+
+    for name, value in variables.items():
+        if not name.startswith("__"):
+            collect(name, value)
+    return _Arrays(arrays, dict.fromkeys(arrays, ""), {})
+
+
+class _Tdms:
+    """TDMS file: ``CHANNEL``, or ``GROUP/CHANNEL`` where the name of the channel alone is not unique."""
+
+    def __init__(self, path: Path) -> None:
+        with extras.named():
+            import nptdms
+
+        self._path = path
+        with nptdms.TdmsFile.read_metadata(path) as file:
+            channels = [channel for group in file.groups() for channel in group.channels()]
+            names = [channel.name for channel in channels]
+            self._places = {
+                channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}": (
+                    channel.group_name,
+                    channel.name,
+                )
+                for channel in channels
+            }
+            about = dict(zip(self._places, (channel.properties for channel in channels), strict=True))
+        self.units = {name: str(found.get("unit_string", "")) for name, found in about.items()}
+        self._clocks = {
+            name: Clock(float(found.get("wf_start_offset", 0.0)), float(found["wf_increment"]))
+            for name, found in about.items()
+            if found.get("wf_increment")
+        }
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        import nptdms
+
+        with nptdms.TdmsFile.open(self._path) as file:
+            return {name: file[group][channel][:] for name in names for group, channel in [self._places[name]]}
+
+    def clock(self, name: str) -> Clock | None:
+        return self._clocks.get(name)
+
+
+class _Mdf:
+    """MDF file (versions 2 to 4): channels by name, the first of each."""
+
+    def __init__(self, path: Path) -> None:
+        with extras.named():
+            import asammdf
+
+        self._file = asammdf.MDF(path)
+        self._places = {
+            name: places[0]
+            for name, places in self._file.channels_db.items()
+            if self._file.masters_db.get(places[0][0]) != places[0][1]
+        }
+        self.units = {name: self._file.get_channel_unit(name, *place) for name, place in self._places.items()}
+
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        return {name: self._file.get(name, *self._places[name], samples_only=True)[0] for name in names}
+
+    def clock(self, name: str) -> Clock | None:
+        time = self._file.get_master(self._places[name][0])
+        return even_clock(np.asarray(time, np.float64), name)
+
+
+_FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
+    ".csv": ("CSV", _Csv),
+    ".txt": ("CSV", _Csv),
+    ".parquet": ("Parquet", _Parquet),
+    ".mat": ("MATLAB", _mat),
+    ".tdms": ("TDMS", _Tdms),
+    ".mf4": ("MDF", _Mdf),
+    ".mdf": ("MDF", _Mdf),
+    ".dat": ("MDF", _Mdf),
+}
+
+
+def open_file(path: Path) -> Source:
+    """Open a measurement file; the ending of its name gives the format.
+
+    Raises:
+        InputError: the ending is unknown, or the file is missing or damaged.
+        LatheError: the package that reads the format is not installed.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read ({'a folder' if path.is_dir() else 'no such file'}); check the path")
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: no format of measurements; allowed: {', '.join(_FORMATS)}, or a bag")
+    name, opened = _FORMATS[path.suffix.lower()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the libraries warn of what they ignore in a file
+            return opened(path)
+    except InputError:
+        raise
+    except _DAMAGED as error:
+        raise InputError(f"{path}: no readable {name} file ({shown(error)})") from None
+
+
+# Errors that the libraries raise for files of other formats and for damaged ones.
+_DAMAGED = (ValueError, OSError, KeyError, IndexError, TypeError, AttributeError, EOFError)
+
+
+def read(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
+    """Open a measurement file with a mapping of its columns.
+
+    Raises:
+        InputError: see `open_file` and `Measurement`.
+        LatheError: see `open_file`.
+    """
+    return Measurement(str(path), open_file(path), mapping)

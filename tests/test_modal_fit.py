@@ -1,0 +1,382 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit of a drive with modes: simulated measurements give back the drive that made them, in every kind and format."""
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.signal
+import yaml
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+from pyarrow import parquet, table
+
+import lathe_rc
+from lathe_rc.analysis import frequency_response, modal_fit
+from lathe_rc.analysis.drive_measurement import data, step_response
+from lathe_rc.analysis.frequency_response import FrequencyResponse, deviation_of, estimate
+from lathe_rc.analysis.modal_drive import ModalDrive
+from lathe_rc.analysis.modal_fit import ResponseData, StepData
+from lathe_rc.cli import main
+from lathe_rc.commands import measured as measured_options
+from lathe_rc.signals import measurement_file
+from lathe_rc.sweep.space import Space, given
+from lathe_rc.transfer import LinearSystem, TransferFunction
+
+TURN = 2.0 * np.pi
+RATE = 20_000.0
+STEP = 1.0 / RATE
+TRUE = ModalDrive(
+    TURN * 165.0, 0.8, 7 * STEP, (TURN * 905.0, TURN * 1620.0), (0.02, 0.018), (0.012, -0.02)
+)  # its delay is one of whole samples
+PLAIN = ModalDrive(TURN * 165.0, 0.8, 7 * STEP)
+HOLDS = ("zero", "linear")
+FREQUENCY = TURN * np.linspace(5.0, 2500.0, 800)
+
+
+def drawn(random):
+    """Return a drive near 165 Hz with modes near 900 and 1600 Hz."""
+    return ModalDrive(
+        TURN * 165.0 * random.uniform(0.85, 1.15),
+        random.uniform(0.5, 1.0),
+        random.uniform(0.2e-3, 0.6e-3),
+        tuple(TURN * np.array([900.0, 1600.0]) * random.uniform(0.93, 1.07, 2)),
+        (0.02, 0.02),
+        tuple(random.choice([-1.0, 1.0], 2) * random.uniform(0.005, 0.03, 2)),
+    )
+
+
+def measured(drive, random, averages=32):
+    """Return an H1 estimate of white noise at 60 dB whose coherence falls at the modes."""
+    response, shape = drive.response(FREQUENCY), (averages, FREQUENCY.size)
+    coherence = np.full(FREQUENCY.size, 1.0 / (1.0 + 1e-6))
+    for mode, damping, _ in drive.modes:
+        coherence *= 1.0 - 0.15 / (1.0 + ((FREQUENCY - mode) / (2.0 * damping * mode)) ** 2)
+    u, noise = (random.normal(size=shape) + 1j * random.normal(size=shape) for _ in range(2))
+    y = response * u + np.abs(response) * np.sqrt((1.0 - coherence) / coherence) * noise
+    power, cross = np.sum(np.abs(u) ** 2, axis=0), np.sum(u.conj() * y, axis=0)
+    coherence = np.abs(cross) ** 2 / (power * np.sum(np.abs(y) ** 2, axis=0))
+    return FrequencyResponse(FREQUENCY, cross / power, deviation_of(coherence, averages), coherence, averages)
+
+
+def simulated(drive, command, hold="foh"):
+    """Return the exact response of a drive whose delay is a whole number of samples."""
+    shares = [(drive.natural_frequency, drive.damping, 1.0 - sum(drive.mode_participation)), *drive.modes]
+    position = np.zeros(command.size)
+    for frequency, damping, share in shares:
+        part = np.empty(command.size)
+        bottom = (1.0, 2.0 * damping * frequency, frequency**2)
+        LinearSystem(TransferFunction((frequency**2,), bottom), STEP, hold).block(command, part)
+        position += share * part
+    late = round(drive.delay / STEP)
+    return np.concatenate((np.zeros(late), position[: position.size - late]))
+
+
+def noisy(position, random, ratio=1e-3):
+    return position + ratio * np.std(position) * random.normal(size=position.size)
+
+
+def assert_found(found, true, delay=2e-6):
+    """Frequencies within 0.5 %, dampings within 10 %."""
+    assert len(found.mode_frequency) == len(true.mode_frequency)
+    assert_allclose(found.natural_frequency, true.natural_frequency, rtol=5e-3)
+    assert_allclose(found.mode_frequency, true.mode_frequency, rtol=5e-3)
+    assert_allclose(found.damping, true.damping, rtol=0.1)
+    assert_allclose(found.mode_damping, true.mode_damping, rtol=0.1)
+    assert_allclose(found.delay, true.delay, atol=delay)
+
+
+# --- model
+
+
+def test_step_and_frequency_response_of_the_model_are_scipys():
+    parts = [
+        (share * w**2 * np.array([1.0]), [1.0, 2.0 * z * w, w**2])
+        for w, z, share in [(TRUE.natural_frequency, TRUE.damping, 1.0 - sum(TRUE.mode_participation)), *TRUE.modes]
+    ]
+    time = np.linspace(0.0, 20e-3, 500)
+    steps = sum(scipy.signal.step(part, T=time)[1] for part in parts)
+    assert_allclose(TRUE.step(time + TRUE.delay), steps, atol=1e-6)
+    responses = sum(scipy.signal.freqs(*part, FREQUENCY)[1] for part in parts)
+    assert_allclose(TRUE.response(FREQUENCY), responses * np.exp(-1j * FREQUENCY * TRUE.delay), rtol=1e-9)
+
+
+def test_derivatives_are_those_of_the_response():
+    x = TRUE.searched()
+    for place in range(x.size):
+        offset = np.zeros(x.size)
+        offset[place] = 1e-6
+        ahead, behind = (ModalDrive.of_searched(x + sign * offset).response(FREQUENCY) for sign in (1, -1))
+        assert_allclose(TRUE.derivatives(FREQUENCY)[:, place], (ahead - behind) / 2e-6, atol=1e-6)
+
+
+# --- fits
+
+
+def test_drives_are_found_in_frequency_responses():
+    """Frequencies within 0.5 %, dampings within 10 %, the delay within 2 µs; the set covers the true drive."""
+    random = np.random.default_rng(44)
+    for _ in range(2):
+        true = drawn(random)
+        fit = modal_fit.fit(ResponseData(measured(true, random)))
+        assert_found(fit.drive, true)
+        assert fit.distance(true) < fit.limit
+    drives = fit.drives(32, seed=0)
+    assert drives[0] is fit.drive
+    assert_allclose([fit.distance(drive) for drive in drives[1:]], fit.limit, rtol=1e-6)
+    assert drives == fit.drives(32, seed=0) != fit.drives(32, seed=1)
+
+
+def test_modes_are_found_beside_what_the_model_lacks():
+    """A gain 2 % too large, a further lag and noise of 0.5 % at logarithmic frequencies without uncertainty."""
+    random = np.random.default_rng(5)
+    frequency = TURN * np.geomspace(2.0, 3000.0, 400)
+    modes = (TURN * 410.0, TURN * 900.0, TURN * 1600.0), (0.03, 0.02, 0.015), (0.02, 0.012, -0.01)
+    true = ModalDrive(TURN * 165.0, 0.7, 0.32e-3, *modes)
+    value = 1.02 * true.response(frequency) / (1.0 + 1j * frequency / 3e4)
+    value *= 1.0 + 5e-3 * (random.normal(size=400) + 1j * random.normal(size=400))
+    fit = modal_fit.fit(ResponseData(FrequencyResponse(frequency, value)))
+    assert_allclose(fit.drive.mode_frequency, true.mode_frequency, rtol=5e-3)
+    assert_allclose(fit.drive.mode_damping, true.mode_damping, rtol=0.1)
+    assert_allclose(fit.drive.delay, true.delay + 1.0 / 3e4, atol=5e-6)
+    assert fit.model_error == pytest.approx(0.017, rel=0.2)
+
+
+def commands(random):
+    """Return a command of each kind by name."""
+    time = np.arange(60_000) * STEP
+    lines = np.zeros(5001, complex)
+    lines[2:1500] = np.exp(1j * random.uniform(0.0, TURN, 1498))
+    return {
+        "noise": random.normal(size=time.size),
+        "chirp": scipy.signal.chirp(time, 5.0, time[-1], 3000.0, phi=-90),
+        "multisine": np.tile(np.fft.irfft(lines), 6),
+    }
+
+
+@pytest.mark.parametrize("kind", ["noise", "chirp", "multisine"])
+def test_drive_is_found_in_a_record(kind):
+    """Each kind of command, at 60 dB; the response lies within its uncertainty."""
+    random = np.random.default_rng(5)
+    command = commands(random)[kind]
+    response = estimate(command, noisy(simulated(TRUE, command), random), STEP)
+    error = np.abs(response.value - response.smoothed(TRUE.response)) / np.abs(response.value)
+    assert 0.2 < np.mean((error / response.deviation) ** 2) / 2.0 < 1.5
+    fit = modal_fit.fit(ResponseData(response), modes=None if kind == "chirp" else 2)
+    assert_found(fit.drive, TRUE, 0.1e-6)
+    assert fit.distance(TRUE) < fit.limit
+
+
+def test_estimate_is_scipys():
+    random = np.random.default_rng(6)
+    command = random.normal(size=20_000)
+    position = noisy(simulated(PLAIN, command), random, 0.3)
+    options = {"fs": RATE, "window": "hann", "nperseg": 1000, "noverlap": 750, "detrend": False}
+    u, y = command - command.mean(), position - position.mean()
+    frequency, cross = scipy.signal.csd(u, y, **options)
+    found = estimate(command, position, STEP, hold="none", resolution=20.0)
+    places = np.round(found.frequency / (TURN * 20.0)).astype(int)
+    assert_allclose(found.frequency, TURN * frequency[places], rtol=0.5)
+    assert_allclose(found.value, (cross / scipy.signal.welch(u, **options)[1])[places], rtol=1e-9)
+    assert_allclose(found.coherence, scipy.signal.coherence(u, y, **options)[1][places], rtol=1e-9)
+
+
+def test_hold_of_the_command_is_taken_out():
+    command = np.random.default_rng(7).normal(size=40_000)
+    response = simulated(PLAIN, command, "zoh")
+    held, linear = (
+        modal_fit.fit(ResponseData(estimate(command, response, STEP, hold=hold)), modes=0).drive for hold in HOLDS
+    )
+    assert_found(held, PLAIN, 0.05e-6)
+    assert linear.delay - PLAIN.delay == pytest.approx(STEP / 2.0, rel=0.02)
+
+
+def test_drive_is_found_in_a_step(tmp_path):
+    random = np.random.default_rng(8)
+    time = np.arange(400) * STEP
+    fit = modal_fit.fit(StepData(time, TRUE.step(time) + 1e-4 * random.normal(size=time.size)), modes=2)
+    assert_found(fit.drive, TRUE)
+    assert fit.distance(TRUE) < fit.limit
+    command = np.where(np.arange(1000) < 100, 2e-6, 12e-6)
+    position = np.concatenate((np.full(100, 2e-6), 2e-6 + 10e-6 * TRUE.step((np.arange(900) + 0.5) * STEP)))
+    path = tmp_path / "step.csv"
+    rows = np.stack((np.arange(1000) * STEP, command * 1e6, position * 1e6), axis=1)
+    np.savetxt(path, rows, "%.15g", ",", header="time,command_um,response_um", comments="")
+    found = step_response(measurement_file.read(path, {}))
+    assert_allclose(found.response, TRUE.step(found.time), atol=1e-9)
+
+
+def test_lines_of_a_command_count_at_their_own_frequencies():
+    """A run of the machine commands harmonics of the spindle, which lie between the bins."""
+    random, time = np.random.default_rng(10), np.arange(60_000) * STEP
+    swing = 1.0 + 0.3 * np.sin(TURN * 0.7 * time)
+    command = swing * sum(np.cos(TURN * 16.97 * k * time + random.uniform(0.0, TURN)) / k for k in range(1, 30))
+    response = estimate(command, noisy(simulated(PLAIN, command), random), STEP)
+    lines = np.round(response.frequency / (TURN * 16.97)) * TURN * 16.97
+    assert np.count_nonzero(np.abs(response.frequency - lines) < TURN * 0.3) > 20
+    fit = modal_fit.fit(ResponseData(response), modes=0)
+    assert_found(fit.drive, PLAIN, 1e-6)
+
+
+def test_bag_of_a_run_has_the_columns_of_its_drive(tmp_path):
+    recording = lathe_rc.run(lathe_rc.load("piston", ["spindle_encoder.revolutions=1"]), bag=tmp_path / "bag").recording
+    found = measured_options.opened(tmp_path / "bag", [])
+    command, response = found.read("command", "response")
+    assert np.array_equal(command, recording.dense["/coarse/command"]["position"])
+    assert np.array_equal(response, recording.dense["/coarse/state"]["measured_position"])
+    assert found.clock(None, "command", "response").step == pytest.approx(1.0 / 64_000.0)
+    (other,) = measured_options.opened(tmp_path / "bag", ["response=/tool.error"]).read("response")
+    assert np.array_equal(other, recording.dense["/tool"]["error"])
+
+
+# --- command and files
+
+
+def lathe(folder, *arguments):
+    places = ["-o", str(folder / "drive.yaml"), "--figure", str(folder / "fit.png")]
+    return CliRunner().invoke(main, ["fit", "drive", *map(str, arguments), *places])
+
+
+def response_file(folder, drive, points=400):
+    frequency = np.linspace(5.0, 2500.0, points)
+    value = drive.response(TURN * frequency)
+    path = folder / "response.csv"
+    rows = np.stack((frequency, 20.0 * np.log10(np.abs(value)), np.degrees(np.angle(value))), axis=1)
+    np.savetxt(path, rows, "%.15g", ",", header="frequency_hz,magnitude_db,phase_deg", comments="")
+    return path
+
+
+def test_command_writes_parameters_set_and_points(tmp_path):
+    """The set is read as cells of a sweep, the points as a measurement with the same fit."""
+    done = lathe(tmp_path, response_file(tmp_path, TRUE), "--modes", 2)
+    assert done.exit_code == 0, done.stderr
+    assert "mode 2 " in done.stdout
+    (table_of,) = yaml.safe_load((tmp_path / "drive.yaml").read_text()).values()
+    assert table_of["ros__parameters"] == {
+        name: pytest.approx(value, rel=1e-5) for name, value in TRUE.parameters().items()
+    }
+    cells = given(tmp_path / "drive.drives.csv")
+    assert len(cells) == 33
+    name = "electrodynamic_actuator.mode_damping"
+    assert cells[0][name] == pytest.approx([0.02, 0.018], rel=1e-5)
+    points = measurement_file.read(tmp_path / "drive.points.csv", {})
+    again = modal_fit.fit(data(points), modes=2)
+    assert_found(again.drive, TRUE, 1e-9)
+
+
+def test_set_of_drives_without_modes_runs_in_a_scenario(tmp_path):
+    done = lathe(tmp_path, response_file(tmp_path, PLAIN), "--json", "--drives", 4)
+    assert json.loads(done.stdout)["modes"] == 0
+    piston = lathe_rc.load("piston")
+    space = Space(given=given(tmp_path / "drive.drives.csv"))
+    space.check(piston)
+    assert space.count(piston) == 5
+
+
+def written(folder, kind, time, command, response):
+    """Write a record with the library of its format, in µm."""
+    u, x = command * 1e6, response * 1e6
+    path = folder / f"record.{kind}"
+    if kind == "csv":
+        rows = (f"{a:.17g};{b:.17g};{c:.17g}\n".replace(".", ",") for a, b, c in zip(time, u, x, strict=True))
+        path.write_text("# tool\nt [s];u_set [um];x_act [um]\n" + "".join(rows))
+    elif kind == "parquet":
+        parquet.write_table(table({"time_s": time, "u_set_um": u, "x_act_um": x}), path)
+    elif kind == "mat":
+        scipy.io.savemat(path, {"record": {"time": time, "u_set_um": u, "x_act_um": x}, "note": "servo"})
+    elif kind == "tdms":
+        import nptdms
+
+        about = {"wf_increment": STEP, "unit_string": "um"}
+        channels = [nptdms.ChannelObject("servo", name, values, about) for name, values in (("u", u), ("x", x))]
+        with nptdms.TdmsWriter(path) as writer:
+            writer.write_segment(channels)
+    else:
+        import asammdf
+
+        file = asammdf.MDF(version="4.10")
+        signals = [asammdf.Signal(v, timestamps=time, name=name, unit="um") for name, v in (("u", u), ("x", x))]
+        file.append(signals)
+        file.save(path)
+        file.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "columns"),
+    [
+        ("csv", ["time=t [s]", "command=u_set [um]", "response=x_act [um]"]),
+        ("parquet", ["command=u_set_um", "response=x_act_um:um"]),
+        ("mat", ["time=record.time", "command=record.u_set_um", "response=record.x_act_um:1e-6"]),
+        ("tdms", ["command=u", "response=x"]),
+        ("mf4", ["command=u", "response=x"]),
+    ],
+)
+def test_formats_are_read_as_their_libraries_write_them(tmp_path, kind, columns):
+    random = np.random.default_rng(9)
+    time, command, response = np.arange(50) * STEP, *(1e-5 * random.normal(size=(2, 50)))
+    path = written(tmp_path, kind, time, command, response)
+    found = measurement_file.read(path, measurement_file.parse_mapping(columns))
+    for values, wanted in zip(found.read("command", "response"), (command, response), strict=True):
+        assert_allclose(values, wanted, rtol=1e-12)
+    assert found.clock(None, "command", "response").step == pytest.approx(STEP)
+
+
+def test_missing_reader_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nptdms", None)
+    (tmp_path / "a.tdms").write_bytes(b"TDSm")
+    done = lathe(tmp_path, tmp_path / "a.tdms")
+    assert done.exit_code == 1
+    assert "lathe_rc[formats]" in done.stderr
+
+
+HEADER = "time_ms,command_um,response_um\n"
+EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in range(600))
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("a,b\n1,2\n", [], "columns 'a', 'b'; allowed: time and response of a step"),
+        (HEADER + EVEN, ["--column", "command=u"], "--column command=u: .* has no such column; it has 'time_ms', "),
+        (HEADER + EVEN, ["--column", "speed=u"], "allowed: QUANTITY=COLUMN"),
+        (
+            HEADER + EVEN,
+            ["--column", "command=u:furlong"],
+            "no unit 'furlong' of command; allowed: m, mm, um, nm, 1, or a",
+        ),
+        (HEADER.replace("_um", " [V]", 1) + EVEN, [], "has the unit 'V'; allowed for command"),
+        (HEADER + EVEN + "30.3,1,1\n", [], "not in even steps.*resample the record, or give --rate"),
+        (HEADER + EVEN + "30,x,1\n", [], ":602: 'x' is not a number"),
+        ("\n".join((HEADER + EVEN).splitlines()[:300]), [], r"record: \d+ samples; allowed: 512 or more"),
+        (HEADER + EVEN, [], "the response follows the command at"),
+        (HEADER + EVEN, ["--band", "9:1"], "--band '9:1'; allowed: LOW:HIGH in Hz"),
+        ("command,response\n" + "1,1\n" * 3, [], "no time; give --rate HZ"),
+        ("frequency,real\n1,1\n", [], "allowed: frequency with magnitude and phase"),
+        ("frequency,real,imaginary\n1,1,0\n", [], "1 points; allowed: 16 or more"),
+        ("frequency,real,imaginary,coherence\n1,1,0,2\n", [], "coherence 2 in row 1; allowed: from 0 to 1"),
+        (
+            "frequency,real,imaginary\n" + "".join(f"{k},9,0\n" for k in range(1, 40)),
+            [],
+            "magnitude 9 at 1 Hz, the lowest frequency; .*:0.1111",
+        ),
+        ("time,response\n" + "".join(f"{k},{k}\n" for k in range(20)), [], "step response: ends at 19; allowed"),
+    ],
+)
+def test_unusable_measurements_are_refused_in_one_line(tmp_path, text, options, message):
+    path = tmp_path / "record.csv"
+    path.write_text(text)
+    done = lathe(tmp_path, path, *options)
+    assert (done.exit_code, done.stdout) == (2, ""), done.stdout
+    assert len(done.stderr.splitlines()) == 1
+    assert re.search(message, done.stderr), done.stderr
+    assert not (tmp_path / "drive.yaml").exists()
+
+
+def test_averages_of_overlapping_windows_are_fewer_than_segments():
+    window = scipy.signal.get_window("hann", 512)
+    assert frequency_response._independent(window, 128, 400) == pytest.approx(400 / 1.93, rel=0.01)
+    assert frequency_response._independent(window, 256, 400) == pytest.approx(400 / 1.056, rel=0.01)
