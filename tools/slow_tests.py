@@ -155,8 +155,14 @@ def took(report: Path) -> dict[Name, Cost]:
         name = Name(file, owner, case.get("name", "").partition("[")[0])
         counts = {each.get("name"): int(each.get("value", 0)) for each in case.iter("property")}
         processes, programs = counts.get("processes", 0), counts.get("programs", 0)
-        case_cost = Cost(float(case.get("time", 0.0)), 1, int(processes > 0), processes, programs)
-        found[name] = Cost(*(whole + part for whole, part in zip(found[name], case_cost, strict=True)))
+        before = found[name]
+        found[name] = Cost(
+            before.seconds + float(case.get("time", 0.0)),
+            before.cases + 1,
+            before.with_cell + int(processes > 0),
+            before.processes + processes,
+            before.programs + programs,
+        )
     here = {path.stem for path in TESTS.glob("test_*.py")}
     if missing := sorted(here - files):
         raise RefusalError(
