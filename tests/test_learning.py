@@ -109,7 +109,7 @@ def test_an_error_of_the_drive_margin_is_the_smallest_with_which_learning_diverg
     phases = np.exp(2j * np.pi * np.arange(720) / 720)
     assert cell.drive_margins.keys() == cell.factors.keys()
     for node, margin in cell.drive_margins.items():
-        loop = cell.loops[node]
+        (loop,) = cell.loops[node]
         at = np.array([margin.waves])
 
         def largest(error, loop=loop, at=at, speed=margin.speed):

@@ -100,7 +100,7 @@ class WiredCell(Protocol):
     warnings: list[str]
     unchecked: list[str]
     factors: dict[str, float]
-    loops: dict[str, Any]
+    loops: dict[str, list[Any]]
 
     @property
     def master(self) -> Any:

@@ -165,7 +165,7 @@ class Cell:
             a remedy; one line each. Set by `check`.
         factors: largest factor of a cycle over all frequencies, sup|Q - γZ| of repetitive control, by learning node;
             below 1 the error decreases from cycle to cycle. Set by `check`.
-        loops: each learning node with the drives that it commands. Set by `check`.
+        loops: each learning node with the drives that it commands, also as each `set` event leaves it. Set by `check`.
         stages: by node name, in the order of the forward edges.
         wiring: see `Wiring`.
         dense: publisher of each topic with one block per block, by relative topic.
@@ -184,7 +184,7 @@ class Cell:
     ) -> None:
         self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
-        self.loops: dict[str, Loop] = {}
+        self.loops: dict[str, list[Loop]] = {}
         self._tables = nodes
         with explain_overflow(nodes):
             made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
@@ -317,5 +317,8 @@ class Cell:
     @property
     def drive_margins(self) -> dict[str, DriveMargin]:
         """Return the drive margin of each learning controller that provides its factors."""
-        found = {name: loop.drive_margin() for name, loop in self.loops.items() if name in self.factors}
-        return {name: margin for name, margin in found.items() if margin}
+        found: dict[str, DriveMargin] = {}
+        for name, loops in self.loops.items():
+            margins = [loop.drive_margin() for loop in loops] if name in self.factors else []
+            found |= {name: margin} if (margin := min(filter(None, margins), default=None)) else {}
+        return found

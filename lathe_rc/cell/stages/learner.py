@@ -201,7 +201,8 @@ class Learner(Obedient):
         for name in unknown:
             cell.leave_open(f"whether {self.name} converges with {name}", name)
         learned, untold = self.learned(cell.stages.values()), list[str]()
-        loop = cell.loops[self.name] = Loop(self, [response for response, _ in learned], speeds)
+        loop = Loop(self, [response for response, _ in learned], speeds)
+        cell.loops.setdefault(self.name, []).append(loop)
         for response, drive in learned:
             self._check_reach(drive)
             told = [(worst, speed) for speed in dict.fromkeys(speeds) if (worst := self.worst(response, speed))]
