@@ -288,7 +288,7 @@ class Gauge(Stage):
             back=_GRID * (parameters.revolutions_late - parameters.angle_offset / _TURN),
             sensor=reading.table,
             dropouts=dropouts.table,
-            begins=NormalDist().inv_cdf(1.0 - share) if share else math.inf,
+            begins=-NormalDist().inv_cdf(share) if share else math.inf,
             length=parameters.dropout_angle,
             gaps=np.array([parameters.gap_start, parameters.gap_width], dtype=float).reshape(2, -1),
             taps=taps,
