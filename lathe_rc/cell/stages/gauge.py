@@ -320,6 +320,8 @@ class Gauge(Stage):
         waves = np.arange(parameters.points_per_revolution // 2)
         learned = parameters.used_gain * gaussian_share(waves, parameters.cutoff)
         waves, learned = waves[learned > _NOTHING], learned[learned > _NOTHING]
+        if not learned.size:
+            return
         turns = 2 * parameters.lag + 1
         limit = 2.0 * np.sin(np.pi / 2.0 / turns)
         if learned[0] >= limit:
@@ -327,7 +329,8 @@ class Gauge(Stage):
                 f"{self.name}.gain = {parameters.used_gain:g}: readings that are {parameters.revolutions_late} "
                 f"revolutions late make the correction diverge; allowed: below {at_most(limit)}, or 0"
             )
-        allowed = float(np.min((np.pi / 2.0 - turns * np.arcsin(learned[1:] / 2.0)) / waves[1:]))
+        phases = (np.pi / 2.0 - turns * np.arcsin(learned[1:] / 2.0)) / waves[1:]
+        allowed = float(np.min(phases, initial=np.inf))
         if abs(parameters.angle_offset) >= allowed:
             raise InputError(
                 f"{self.name}.angle_offset = {parameters.angle_offset:g} rad: the correction diverges; allowed: less "
