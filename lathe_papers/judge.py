@@ -27,10 +27,10 @@ class Judged:
     effort: float
 
     def settled(self, tolerance: float) -> float:
-        """Return the revolution from which the error stays within a tolerance [µm]; inf if it never does."""
+        """Return the revolution, counted from 1, from which the error stays in tolerance [µm]; inf if it never does."""
         out = np.flatnonzero(~(self.largest <= tolerance))  # not `>`: NaN is out of tolerance, too
-        first = int(out[-1]) + 1 if out.size else 0
-        return float(first) if first < self.largest.size else np.inf
+        first = int(out[-1]) + 2 if out.size else 1
+        return float(first) if first <= self.largest.size else np.inf
 
 
 class Judge:

@@ -112,7 +112,7 @@ class Oval3000Result:
         conditions, laws: names of the encoders and laws.
         tolerance: tolerance of the form error [µm].
         largest: form error of the last ten revolutions outside the keyways [µm]; NaN for a stopped run.
-        settled: revolution from which the error stays within the tolerance; inf if it never does.
+        settled: revolution, counted from 1, from which the error stays within the tolerance; inf if it never does.
         effort: RMS current of the drive [A].
         margin: smallest relative error of the drive's response with which learning diverges, shape (sets, laws,
             drives); NaN for a law without factors of a cycle.
@@ -227,7 +227,7 @@ def entered(base: Scenario, values: cells.Values) -> Scenario:
     before, kind = base.nodes[_NODE], str(values["stage"])
     if kind not in TABLES or not issubclass(table := TABLES[kind], LawParameters):
         known = [name for name in TABLES if issubclass(TABLES[name], LawParameters)]
-        raise InputError(f"no law {kind!r}; allowed: {in_words([*known, 'PACKAGE.MODULE:CLASS'])}")
+        raise InputError(f"no law {kind!r}; allowed: {in_words(known)}")
     shared = {name: getattr(before, name) for name in SharedParameters.model_fields.keys() & before.model_fields_set}
     made = table.read(_NODE, {**shared, "feedback_delay": _DELAY, **values})
     return base.with_node(_NODE, made).with_models_given().named()

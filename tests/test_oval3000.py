@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from lathe_papers import cells, oval3000
 from lathe_papers.adrc import Adrc
-from lathe_papers.judge import Judge
+from lathe_papers.judge import Judge, Judged
 from lathe_rc.cli import main
 from lathe_rc.commands.study import read
 from lathe_rc.errors import InputError
@@ -103,6 +103,7 @@ def test_a_law_that_cannot_enter_is_refused_in_one_line(settings, words):
     assert "\n" not in str(refused.value)
     for word in words:
         assert word in str(refused.value)
+    assert str(refused.value).count("PACKAGE.MODULE:CLASS") <= 1
 
 
 QUIET = {
@@ -129,6 +130,14 @@ def test_adrc_removes_a_constant_force_and_a_part_of_the_keyways():
     assert error({}, **STEADY) < 0.01
     assert error(slow, **STEADY) > 10.0
     assert 1.0 < error({}) < 0.5 * error(slow)
+
+
+@pytest.mark.parametrize(
+    ("errors", "revolution"),
+    [([1.0, 1.0], 1), ([3.0, 1.0, 3.0, 1.0], 4), ([1.0, np.nan, 1.0], 3), ([1.0, 3.0], np.inf)],
+)
+def test_revolutions_until_settled_are_counted_from_1(errors, revolution):
+    assert Judged(np.array(errors), 0.0, 0.0).settled(2.0) == revolution
 
 
 def test_the_scenario_has_the_settings_of_ours():
