@@ -22,6 +22,7 @@ from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.modal_fit import ResponseData, StepData
 from lathe_rc.cli import main
 from lathe_rc.commands import measured as measured_options
+from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
 from lathe_rc.sweep.space import Space, given
 from lathe_rc.transfer import LinearSystem, TransferFunction
@@ -209,6 +210,12 @@ def test_drive_is_found_in_a_step(tmp_path):
     assert_allclose(found.response, TRUE.step(found.time), atol=1e-9)
 
 
+def test_frequencies_of_a_sweeps_end_alone_are_too_few():
+    command = scipy.signal.chirp(np.arange(60_000) * STEP, 3000.0, 3.0, 5.0)
+    with pytest.raises(InputError, match="follows the command at 0 frequencies"):
+        estimate(command, simulated(PLAIN, command), STEP, highest=TURN * 40.0)
+
+
 def test_lines_of_a_command_count_at_their_own_frequencies():
     """A run of the machine commands harmonics of the spindle, which lie between the bins."""
     random, time = np.random.default_rng(10), np.arange(60_000) * STEP
@@ -325,6 +332,32 @@ def test_formats_are_read_as_their_libraries_write_them(tmp_path, kind, columns)
     assert found.clock(None, "command", "response").step == pytest.approx(STEP)
 
 
+def test_damaged_files_are_refused_in_one_line(tmp_path):
+    """A header of another format, and pages that are damaged after a sound header."""
+    (tmp_path / "none.mf4").write_bytes(b"MDF 4.10" * 100)
+    done = lathe(tmp_path, tmp_path / "none.mf4")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert re.fullmatch("lathe: .*none.mf4: no readable MDF file .*\n", done.stderr)
+    columns = np.random.default_rng(9).normal(size=(3, 50))
+    path = written(tmp_path, "parquet", *columns)
+    pages = bytearray(path.read_bytes())
+    pages[4:100] = b"\xff" * 96
+    path.write_bytes(pages)
+    done = lathe(tmp_path, path, "--column", "command=u_set_um", "--column", "response=x_act_um")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert re.fullmatch("lathe: .*record.parquet: damaged after its header; .*\n", done.stderr)
+
+
+@pytest.mark.parametrize("points", [30, 50])
+def test_each_frequency_has_one_coherence(tmp_path, points):
+    frequency = np.linspace(5.0, 2500.0, 40)
+    columns = {"frequency": frequency, "response": PLAIN.response(TURN * frequency), "coherence": np.full(points, 0.9)}
+    scipy.io.savemat(tmp_path / "response.mat", columns)
+    done = lathe(tmp_path, tmp_path / "response.mat")
+    assert done.exit_code == 2
+    assert f"40 of frequency, {points} of coherence; allowed: as many of each" in done.stderr
+
+
 def test_missing_reader_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "nptdms", None)
     (tmp_path / "a.tdms").write_bytes(b"TDSm")
@@ -353,6 +386,8 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
         (HEADER + EVEN + "30,x,1\n", [], ":602: 'x' is not a number"),
         ("\n".join((HEADER + EVEN).splitlines()[:300]), [], r"record: \d+ samples; allowed: 512 or more"),
         (HEADER + EVEN, [], "the response follows the command at"),
+        (HEADER + EVEN, ["--band", "0:5"], "the response follows the command at 0 frequencies .* a wider --band"),
+        (HEADER, [], "time: 0 samples; allowed: 2 or more"),
         (HEADER + EVEN, ["--band", "9:1"], "--band '9:1'; allowed: LOW:HIGH in Hz"),
         ("command,response\n" + "1,1\n" * 3, [], "no time; give --rate HZ"),
         ("frequency,real\n1,1\n", [], "allowed: frequency with magnitude and phase"),

@@ -56,7 +56,7 @@ def frequency_response(
 
 def _change(command: Array) -> int:
     """Return the first sample after a command's only change; 0 if it changes never or more than once."""
-    tolerance = _LEVEL * float(np.ptp(command))
+    tolerance = _LEVEL * float(np.ptp(command)) if command.size else 0.0
     changes = np.flatnonzero(np.abs(np.diff(command)) > tolerance)
     return int(changes[0]) + 1 if changes.size == 1 else 0
 

@@ -283,9 +283,13 @@ def estimate(
     bins = np.arange(1, frequency.size) if period else np.arange(2, frequency.size, 2)
     most = _HIGHEST / step if highest is None else min(highest / (2.0 * np.pi), _MOST_FREQUENCY / step)
     bins = bins[frequency[bins] <= most]
+    if not bins.size:
+        raise _too_few(0)
     sums = _Spectra.of(signals, window, hop, first)
     if not period and sums.sweeps(bins):
         sums, bins = _swept(signals, window, hop, bins)
+        if not bins.size:
+            raise _too_few(0)
     averages = _independent(window, hop, sums.segments) if hop < window.size else float(sums.segments)
     power_u, cross, power_y = sums.power_u, sums.cross, sums.power_y
     bins = bins[power_u[bins] > _LEAST_POWER * power_u[bins].max()]
@@ -301,10 +305,7 @@ def estimate(
     sure &= (np.abs(offset) < _NEXT) & (spread < _FAR)  # otherwise it shows other bins
     bins, coherence, offset, spread = bins[sure], coherence[sure], offset[sure], spread[sure] * width
     if bins.size < LEAST:
-        raise InputError(
-            f"record: the response follows the command at {bins.size} frequencies (coherence from {_LEAST_COHERENCE:g}"
-            f"); allowed: {LEAST} or more (a longer record, or a command that moves at more frequencies)"
-        )
+        raise _too_few(bins.size)
     true = (bins + offset) * width
     cycles = true * step / (2.0 * np.pi)
     return FrequencyResponse(
@@ -316,6 +317,14 @@ def estimate(
         None if period else spread,
         0.0 if hold == "none" else 2.0 * np.pi / step,
         2 if hold == "linear" else 1,
+    )
+
+
+def _too_few(frequencies: int) -> InputError:
+    """Return the error for a record that shows the response at too few frequencies."""
+    return InputError(
+        f"record: the response follows the command at {frequencies} frequencies (coherence from {_LEAST_COHERENCE:g}); "
+        f"allowed: {LEAST} or more (a longer record, a wider --band, or a command that moves at more frequencies)"
     )
 
 
@@ -372,9 +381,7 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
     Raises:
         InputError: a column is missing or out of range.
     """
-    (frequency,), value = measurement.read("frequency"), _values(measurement)
-    if frequency.size != value.size:
-        raise InputError(f"{measurement.name}: {frequency.size} frequencies, {value.size} values; allowed: as many")
+    frequency, value = _values(measurement)
     coherence = _between(measurement, "coherence", 1.0)
     deviation = _between(measurement, "relative_uncertainty", np.inf)
     order = np.argsort(frequency, kind="stable")
@@ -398,25 +405,26 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
         raise InputError(f"{measurement.name}: {error}") from None
 
 
-def _values(measurement: Measurement) -> Complex:
-    """Return the complex response in a file."""
+def _values(measurement: Measurement) -> tuple[Array, Complex]:
+    """Return the frequencies and the complex response in a file, shape (n,) each."""
     if "real" in measurement and "imaginary" in measurement:
-        real, imaginary = measurement.read("real", "imaginary")
-        return np.asarray(real + 1j * imaginary)
+        frequency, real, imaginary = measurement.read("frequency", "real", "imaginary")
+        return frequency, np.asarray(real + 1j * imaginary)
     if "magnitude" in measurement and "phase" in measurement:
-        magnitude, phase = measurement.read("magnitude", "phase")
-        return np.asarray(magnitude * np.exp(1j * phase))
-    value = measurement.read("response")[0] if "response" in measurement else np.empty(0)
-    if value.dtype.kind != "c":
-        raise measurement.lacking("frequency with magnitude and phase, with real and imaginary, or a complex response")
-    return value.astype(np.complex128)
+        frequency, magnitude, phase = measurement.read("frequency", "magnitude", "phase")
+        return frequency, np.asarray(magnitude * np.exp(1j * phase))
+    if "response" in measurement:
+        frequency, value = measurement.read("frequency", "response")
+        if value.dtype.kind == "c":
+            return frequency, value
+    raise measurement.lacking("frequency with magnitude and phase, with real and imaginary, or a complex response")
 
 
 def _between(measurement: Measurement, quantity: str, most: float) -> Array | None:
-    """Return a quantity after checking that it is between 0 and ``most``; None if the measurement lacks it."""
+    """Return a quantity between 0 and ``most``, one value a frequency; None if the measurement lacks it."""
     if quantity not in measurement:
         return None
-    (values,) = measurement.read(quantity)
+    _, values = measurement.read("frequency", quantity)
     outside = np.flatnonzero((values < 0.0) | (values > most))
     if outside.size:
         at = int(outside[0])

@@ -10,6 +10,7 @@ import csv
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -19,7 +20,7 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc import extras, files
-from lathe_rc.errors import InputError, shown
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.table import number
 
 Array = npt.NDArray[np.float64]
@@ -45,6 +46,19 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 _NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
 _LONGEST_HEADER = 2**20  # [B]
 _MOST_COLUMNS = 12  # that an error message lists
+
+
+@contextmanager
+def _readable(what: str) -> Iterator[None]:
+    """Report the errors of the libraries that read a damaged file as one line, which begins with ``what``."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the libraries warn of what they ignore in a file
+            yield
+    except LatheError:
+        raise
+    except Exception as error:  # noqa: BLE001 - the libraries can raise any exception on damaged bytes
+        raise InputError(f"{what} ({shown(error)})") from None
 
 
 class Clock(NamedTuple):
@@ -203,10 +217,11 @@ class Measurement:
         """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
 
         Raises:
-            InputError: a column has no finite numbers, its unit is unknown, or the lengths differ.
+            InputError: a column has no finite numbers, its unit is unknown, the lengths differ, or the file is damaged.
         """
         columns = {quantity: self._columns[quantity] for quantity in quantities}
-        arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
+        with _readable(self._damaged()):
+            arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
         found = []
         for quantity, (column, unit) in columns.items():
             array = np.asarray(arrays[column])
@@ -224,6 +239,9 @@ class Measurement:
             lengths = ", ".join(f"{size} of {name}" for name, size in zip(quantities, sizes, strict=True))
             raise InputError(f"{self.name}: {lengths}; allowed: as many of each")
         return found
+
+    def _damaged(self) -> str:
+        return f"{self.name}: damaged after its header; record or copy it again"
 
     def _in_si(self, quantity: str, column: str, unit: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         named = _unit_of(quantity, column)
@@ -250,7 +268,8 @@ class Measurement:
         if "time" in self:
             return even_clock(self.read("time")[0], f"{self.name}: time")
         columns = [self._columns[quantity].column for quantity in quantities]
-        clocks = [self._source.clock(column) for column in columns]
+        with _readable(self._damaged()):
+            clocks = [self._source.clock(column) for column in columns]
         known = [clock for clock in clocks if clock is not None]
         if not known:
             raise InputError(f"{self.name}: no time; give --rate HZ, or a column by --column time=COLUMN:UNIT")
@@ -482,18 +501,8 @@ def open_file(path: Path) -> Source:
     if path.suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: no format of measurements; allowed: {', '.join(_FORMATS)}, or a bag")
     name, opened = _FORMATS[path.suffix.lower()]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the libraries warn of what they ignore in a file
-            return opened(path)
-    except InputError:
-        raise
-    except _DAMAGED as error:
-        raise InputError(f"{path}: no readable {name} file ({shown(error)})") from None
-
-
-# Errors that the libraries raise for files of other formats and for damaged ones.
-_DAMAGED = (ValueError, OSError, KeyError, IndexError, TypeError, AttributeError, EOFError)
+    with _readable(f"{path}: no readable {name} file"):
+        return opened(path)
 
 
 def read(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
