@@ -98,6 +98,19 @@ def check_place(option: str, path: Path) -> None:
         raise InputError(f"{option} {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
 
 
+def write(path: Path, text: str) -> None:
+    """Write a text file atomically (see `replacing`).
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        with replacing(path) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Write a file atomically: yield a temporary file in the same folder, which replaces ``path`` after the block.

@@ -76,9 +76,30 @@ def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("few")
 def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(main, ["design", "piston", "--margin", "1", "--revolutions", "2"])
+    drive = ("mode_frequency=[5e3]", "mode_damping=[0.002]", "mode_participation=[0.5]")
+    words = [word for each in drive for word in ("--set", f"electrodynamic_actuator.{each}")]
+    done = CliRunner().invoke(main, ["design", "piston", "--margin", "1", "--revolutions", "2", *words])
     assert done.exit_code == 1
     assert "lathe: no law keeps a drive margin of 1; allowed: a smaller --margin" in done.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
+    asked = Design(config("piston"), [{}], 0.3)
+    (drive,) = asked._responses(asked.drives)
+    tried = [values for alike in design.LAWS["inverse, Gaussian Q"].settings(1.9e-3, 0.36e-3) for values in alike]
+    assert max(asked._margin_of(design.LAWS["inverse, Gaussian Q"], values, drive) for values in tried[-40:]) > 0.9
+    assert asked._settings(design.LAWS["inverse, Gaussian Q"])
+
+
+@pytest.mark.usefixtures("few")
+def test_a_cell_that_runs_with_no_law_says_why(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    late = "learning_controller.feedback_delay=4000"
+    done = CliRunner().invoke(main, ["design", "piston", "--margin", "0.01", "--revolutions", "3", "--set", late])
+    assert done.exit_code == 1
+    assert "lathe: no law" in done.output
+    assert "feedback_delay = 4000 samples: at 115.2 rad/s the cycle leaves" in done.output
     assert not list(tmp_path.iterdir())
 
 

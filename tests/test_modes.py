@@ -122,6 +122,23 @@ def test_the_form_error_is_that_of_the_edge_and_the_sensor_reads_its_own_place()
     assert apart.margins == pytest.approx(seen.margins, rel=1e-6)
 
 
+def test_at_an_end_stop_the_edge_apart_from_the_sensor_still_makes_the_chip():
+    """Depth of cut and position of the edge agree, also while the stop holds the sensor."""
+    names = {"frequency": "[5e3]", "damping": "[0.02]", "participation": "[0.02]", "edge": "[0.3]"}
+    changes = [f"loaded_drive.coarse_mode_{name}={value}" for name, value in names.items()]
+    changes += ["loaded_drive.coarse_stroke=1e-5", "loaded_drive.cut_run_out_amplitude=[0.0]", "tool.tolerance=0.0"]
+    changes += ["loaded_drive.cut_gap_start=[]", "loaded_drive.cut_gap_width=[]", "spindle_encoder.revolutions=1"]
+    changes += ["controller.learned_waves=20", "controller.observer_bandwidth=2000"]
+    changes += ["profile.harmonic_amplitude=[9e-6]", "loaded_drive.cut_blank=form"]
+    scenario = lathe_rc.load("robust_cutting", changes)
+    recording = lathe_rc.run(scenario).recording
+    cut, drive, form = (recording.dense[f"/{topic}"] for topic in ("cut", "coarse/state", "reference"))
+    stopped = (abs(drive["measured_position"]) > 0.99e-5) & (cut["depth_of_cut"] > 0.0)
+    chip = cut["depth_of_cut"] + drive["position"] - form["reference"] - cut["allowance"]
+    assert np.count_nonzero(stopped) > 100
+    assert np.ptp(chip[stopped]) < 1e-9
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [

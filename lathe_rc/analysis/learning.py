@@ -86,12 +86,15 @@ def drive_margin(factors: Callable[[Array, float], Complex], highest: float, spe
             beta = np.where(depends, (more * (1.0 + _SCALE * delta) - given) / _SCALE, 0.0)
             square = np.abs(beta) ** 2 - np.abs(delta) ** 2
             half, rest = np.abs(np.conj(given) * beta - delta), 1.0 - np.abs(given) ** 2
-            # The quotient without cancellation; it holds for a square of 0 or below, where one root is positive.
+            # The quotient without cancellation; for a negative square it is the smaller of two positive roots.
             root = rest / (half + np.sqrt(half**2 + square * rest))
         return np.asarray(np.where(root >= 0.0, root, np.where(rest > 0.0, np.inf, 0.0)).min(axis=0))
 
     waves = _waves_up_to(highest)
     near = _near_peaks(waves, -smallest(waves))
+    # Once more around the least, since a resonance may be narrower than the fine grid.
+    least, apart = near[np.argmin(smallest(near))], 2.0 * waves[1] / (_FINE - 1)
+    near = np.clip(np.linspace(least - apart, least + apart, _FINE), 0.0, highest)
     found = smallest(near)
     worst = int(np.argmin(found))
     return DriveMargin(float(found[worst]), float(near[worst]), speed)

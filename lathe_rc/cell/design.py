@@ -10,6 +10,7 @@ of them.
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -23,10 +24,9 @@ from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import SharedParameters, Value
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner, Loop, lag
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Signals
 
 Values = Mapping[str, Value]
@@ -145,9 +145,11 @@ def _rank(candidate: Candidate) -> tuple[bool, float, float]:
 class _Keep:
     """Keeper of form error and effort (see `lathe_rc.cell.batch.Keeper`)."""
 
-    def __init__(self, cell: Cell, samples: int) -> None:
+    def __init__(self, drive: str, cell: Cell, samples: int) -> None:
         self._errors = batch.Errors(cell, samples)
-        self._effort = next(topic for topic, source in cell.dense.items() if source.type == messages.STATE)
+        self._effort = next(
+            topic for topic, source in cell.dense.items() if (source.node, source.type) == (drive, messages.STATE)
+        )
         self.heard: Collection[str] = [*self._errors.heard, f"{self._effort}.effort"]
         self._square, self._samples = 0.0, samples
 
@@ -173,6 +175,7 @@ class Design:
     Attributes:
         node: name of the learning controller.
         drives: parameters of each drive, by ``NODE.PARAM``.
+        refused: the first reason why a setting or a run was rejected or failed; None if there was none.
 
     Raises:
         InputError: the scenario has no tool with a tolerance, or not one learning controller and one drive.
@@ -180,6 +183,7 @@ class Design:
 
     def __init__(self, scenario: Scenario, drives: Sequence[Values], margin: float) -> None:
         self._margin = margin
+        self.refused: LatheError | None = None
         cell = Cell(scenario.nodes)
         learners = [stage for stage in cell.stages.values() if isinstance(stage, Learner)]
         if len(learners) != 1:
@@ -224,9 +228,10 @@ class Design:
     def _responses(self, drives: Sequence[Values]) -> list[Response]:
         found: list[Response] = []
         for values in drives:
-            drive = Cell(self._scenario.varied(values).nodes).stages[self._drive.name]
-            assert isinstance(drive, Drive), "as before"
-            found += drive.responses().values()
+            stages = Cell(self._scenario.varied(values).nodes).stages
+            learner = stages[self.node]
+            assert isinstance(learner, Learner), "as before"
+            found += [response for response, _ in learner.learned(stages.values())]
         return found
 
     def _candidate(self, name: str) -> Candidate:
@@ -252,7 +257,8 @@ class Design:
     def _settings(self, law: Law) -> list[Values]:
         """Return the settings to run: an even choice of those with the margin, with the best lead of each."""
         (response,) = self._responses(self.drives[:1])
-        delay = next((float(value) for name, value in self.drives[0].items() if name.endswith("delay")), 0.0)  # type: ignore[arg-type]
+        known = self._nominal.nodes[self._drive.name].drive_models().values()
+        delay = next((value for each in known if isinstance(value := each.get("delay"), float)), 0.0)
         kept: list[Values] = []
         for alike in law.settings(lag(response), delay):
             tried = [(self._margin_of(law, values, response), values) for values in alike]
@@ -264,7 +270,8 @@ class Design:
     def _margin_of(self, law: Law, values: Values, response: Response) -> float:
         try:
             margin = self._loop(self._with(self._nominal, law, values), [response]).drive_margin()
-        except InputError:  # the filter does not fit into the memory
+        except InputError as error:  # the filter does not fit into the memory
+            self.refused = self.refused or error
             return 0.0
         return margin.error if margin else 0.0
 
@@ -276,9 +283,10 @@ class Design:
 
     def _run(self, scenarios: Sequence[Scenario]) -> list[Found]:
         found = []
-        outcomes: Iterator[batch.Outcome[tuple[FormErrors, float]]] = batch.run_many(scenarios, _Keep)
-        for outcome in outcomes:
+        keep: batch.Make[tuple[FormErrors, float]] = partial(_Keep, self._drive.name)
+        for outcome in batch.run_many(scenarios, keep):
             if outcome.kept is None:
+                self.refused = self.refused or outcome.error
                 found.append(_FAILED)
                 continue
             errors, effort = outcome.kept

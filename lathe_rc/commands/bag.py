@@ -210,12 +210,12 @@ def copy_bags(
 ) -> None:
     """Copy chosen messages of bags to a new one, byte for byte: filter, cut, merge, or convert from SQLite to MCAP.
 
-    The order is that of the log times. Exit code 3: a bag is damaged, and its damaged parts are left out.
+    Several bags are merged in the order of their log times; a single one keeps its order. Exit code 3: a bag is damaged, and its damaged parts are left out.
     """
-    first, known = [], set[str]()
+    first, known = list[int](), set[str]()
     for path in paths:
         with Source(path, partial=True) as source:
-            first.append(source.first_ns)
+            first += [source.first_ns] if any(topic.count for topic in source.topics.values()) else []
             known |= source.topics.keys() | {each.topic for each in source.unread}
     for topic in (*topics, *without):
         if topic not in known:
@@ -224,8 +224,9 @@ def copy_bags(
             )
     if end is not None and end <= start:
         raise InputError(f"--end {end:g} with --start {start:g}; allowed: an end after the start")
-    from_ns = min(first) + round(start * 1e9)
-    to_ns = 2**64 if end is None else min(first) + round(end * 1e9)
+    begin_ns = min(first, default=0)
+    from_ns = begin_ns + round(start * 1e9)
+    to_ns = 2**64 if end is None else begin_ns + round(end * 1e9)
     found = copy_chosen(paths, output, Choice(frozenset(topics), frozenset(without), from_ns, to_ns))
     damage = [f"{each.path}: {what}" for each in found for what in each.damage]
     if as_json:

@@ -55,16 +55,18 @@ def design(
     made = Design(loaded, drives, margin)
     found = made.candidates(lambda law: click.echo(law, err=True) if not as_json else None)
     best = found[0]
-    if best.scenario is not None:
-        with files.replacing(place) as file:
-            file.write(best.scenario.to_yaml(given=True).encode())
+    reason = f"; the first reason: {made.refused}" if made.refused else ""
+    if best.scenario is None:
+        cure = "allowed: a smaller --margin, or another drive"
+        raise LatheError(f"no law keeps a drive margin of {margin:g}; {cure}{reason}")
+    if not math.isfinite(best.worst.largest):
+        raise LatheError(f"no law runs with every drive{reason}")
+    files.write(place, best.scenario.to_yaml(given=True))
     if as_json:
         rows = [_summary(each) for each in found]
-        click.echo(json.dumps({"drives": len(drives), "laws": rows, "scenario": str(place) if best.scenario else None}))
+        click.echo(json.dumps({"drives": len(drives), "laws": rows, "scenario": str(place)}))
     else:
         _show(found, len(drives), place, made.node)
-    if best.scenario is None:
-        raise LatheError(f"no law keeps a drive margin of {margin:g}; allowed: a smaller --margin, or another drive")
 
 
 def _drives(path: Path) -> list["Values"]:
@@ -127,8 +129,6 @@ def _show(found: list["Candidate"], drives: int, place: Path, node: str) -> None
     out.print(
         f"error: largest of the last 10 revolutions; margin, worst, good from and effort: worst of {drives} drives"
     )
-    best = found[0]
-    if best.scenario is not None:
-        for name, value in best.values.items():
-            out.print(f"{node}.{name}: {value:.4g}" if isinstance(value, float) else f"{node}.{name}: {value}")
-        out.print(f"scenario: {place}; lathe run {place}", soft_wrap=True)
+    for name, value in found[0].values.items():
+        out.print(f"{node}.{name}: {value:.4g}" if isinstance(value, float) else f"{node}.{name}: {value}")
+    out.print(f"scenario: {place}; lathe run {place}", soft_wrap=True)

@@ -10,7 +10,8 @@ so that from the command to the sensor W(p) = e^{-pτ}·Σ pj/(1 + 2ζjp/ωj + p
 fitted frequency response (modal superposition; Ewins, Modal Testing, 2000, ch. 2); ej differs from pj where the
 structure gives way between sensor and edge. A force F at the edge deflects a mode by κj times as much as the same force
 of the coil. By reciprocity κj = ej/|pj| if the coil acts where the sensor is: the edge then yields to the force in
-phase. A mode that the sensor does not see (pj = 0) has κj = ±1, the sign of ej: the coil acts at the edge.
+phase. A mode that the sensor does not see (pj = 0) has κj = ±1, the sign of ej: the coil acts at the edge; the current
+of such a drive does not balance a steady force exactly.
 """
 
 from dataclasses import dataclass

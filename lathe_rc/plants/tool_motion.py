@@ -151,7 +151,7 @@ def _chip(
         displacement = x1 + (displacement - x1)
     give = drive.radial * drive.weights.load[tool, 0]
     chip = chip_of(cut, place, angle, cross_position, displacement - met, allowance, stiffness, c, give, 0.0)
-    if not drive.series:
+    if not drive.series and tool == 0:  # an edge apart from the sensor moves on while the stop holds the sensor
         x1 = free[0] + drive.weights.load[0, 0] * (
             kept + drive.radial * cut.process.lag_now * stiffness * max(chip, 0.0)
         )

@@ -60,7 +60,9 @@ def recover(path: Path, target: Path) -> Salvage:
 
 
 def copy(paths: Sequence[Path], target: Path, choice: Choice) -> list[Salvage]:
-    """Copy chosen messages of bags to a new bag, byte for byte, in the order of their log times.
+    """Copy chosen messages of bags to a new bag, byte for byte.
+
+    Several bags are merged in the order of their log times; the messages of a single bag keep their order.
 
     Strings in the metadata, such as the scenario, are copied from a single bag only: two bags have two of them.
 
@@ -88,7 +90,6 @@ def _copied(
     paths: Sequence[Path], target: Path, choice: Choice, about: Callable[[Sequence[Salvage]], dict[str, str]]
 ) -> list[Salvage]:
     refuse_existing(target)
-    path = paths[0]
     try:
         salvages = [Salvage(path) for path in paths]
         writer = BagWriter(target, compression="zstd", chunk_size=_CHUNK, about={}, profile=salvages[0].profile)
@@ -101,7 +102,7 @@ def _copied(
             shutil.rmtree(target)
             raise
     except OSError as error:
-        raise LatheError(f"{path}: cannot be copied ({error.strerror or shown(error)})") from None
+        raise LatheError(f"{', '.join(map(str, paths))}: cannot be copied ({error.strerror or shown(error)})") from None
     return salvages
 
 
