@@ -210,7 +210,8 @@ def copy_bags(
 ) -> None:
     """Copy chosen messages of bags to a new one, byte for byte: filter, cut, merge, or convert from SQLite to MCAP.
 
-    Several bags are merged in the order of their log times; a single one keeps its order. Exit code 3: a bag is damaged, and its damaged parts are left out.
+    Several bags are merged in the order of their log times; a single one keeps its order. Exit code 3: a bag is
+    damaged, and its damaged parts are left out.
     """
     first, known = list[int](), set[str]()
     for path in paths:

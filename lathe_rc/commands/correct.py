@@ -59,12 +59,17 @@ def _forms(scenario: Scenario, node: str | None) -> _Forms:
     return _Forms(corrected, desired, programmed or tables[corrected].form(corrected))
 
 
-def _of_bag(path: Path, last: int) -> list[Revolution]:
+def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
     """Return the newest complete revolutions that a gauge of a recorded cell has read: form errors [m]."""
     recording = reader.read_bag(path)
-    topics = [topic for topic in recording.dense if topic.endswith("gauge/reading")]
+    states = [name for name in recording.dense if recording.types[name] == messages.STATE]
+    topics = [name for name in states if (name == topic if topic else name.endswith("gauge/reading"))]
+    if topic and not topics:
+        raise InputError(f"--topic {topic}: not in {path}; allowed: readings of a gauge, of {', '.join(states)}")
     if not topics or messages.ENCODER not in recording.types.values():
         raise InputError(f"{path}: no readings of a gauge; allowed: a bag of a cell with a gauge, or CSV, or X3P")
+    if len(topics) > 1:
+        raise InputError(f"{path}: readings of {len(topics)} gauges; allowed: --topic with one of {', '.join(topics)}")
     reading, angle = recording.dense[topics[0]], recording.of_type(messages.ENCODER)["angle"]
     there, turn = reading["effort"] > 0.0, np.floor(angle / _TURN).astype(int)
     whole = [k for k in np.unique(turn[there]).tolist() if k < angle[-1] / _TURN - 1.0]
@@ -105,23 +110,23 @@ def _read(
     search: float | None,
     height: float | None,
     last: int,
+    topic: str | None,
 ) -> _Read:
     """Read the records and turn them to the part's angle; angles in degrees."""
     mapping = part_record.parse_columns(columns)
-    around, within = (
+    around, within, sense = (
         np.radians(offset or 0.0),
         np.radians((0.0 if offset is not None else 180.0) if search is None else search),
+        -1.0 if reverse else 1.0,
     )
     even = _TURN * np.arange(_POINTS) / _POINTS
     found, points = _Read([], [], 0.0), []
     for path in records:
         bag = path.is_dir() or path.suffix == ".mcap"
-        revolutions = _of_bag(path, last) if bag else part_record.read(path, mapping)
+        revolutions = _of_bag(path, last, topic) if bag else part_record.read(path, mapping)
         points += [each.angle.size for each in revolutions]
         waves = [
-            form_correction.harmonics(
-                -each.angle if reverse else each.angle, each.radius, highest, f"{path}, revolution {k}"
-            )
+            form_correction.harmonics(sense * each.angle, each.radius, highest, f"{path}, revolution {k}")
             for k, each in enumerate(revolutions, 1)
         ]
         mean = float(np.mean([each[0].real for each in waves]))
@@ -130,10 +135,9 @@ def _read(
                 f"{path}: the mean radius is {mean * 1e3:.4g} mm; allowed: deviations from the radius of the "
                 f"drawing up to {_LARGEST_MEAN * 1e3:g} mm, or --roundness, which leaves the size"
             )
-        turned = np.exp(1j * np.arange(highest + 1) * around)
         if bag or deviation:
             found.alignments.append(Alignment(around))
-            found.deviations.append([-each * turned for each in waves])
+            found.deviations.append([-form_correction.turn(each, around, sense) for each in waves])
             continue
         forms = [
             form_correction.harmonics(even, desired.deviation(even, _height(path, desired, each, height)), highest)
@@ -142,13 +146,14 @@ def _read(
         for amplitudes in (*forms, *waves):
             amplitudes[:lowest] = 0.0
         try:
-            aligned = form_correction.align(forms, waves, around, within)
+            aligned = form_correction.align(forms, waves, around, within, sense)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         _check_likeness(path, aligned)
-        turned = np.exp(1j * np.arange(highest + 1) * aligned.offset)
         found.alignments.append(aligned)
-        found.deviations.append([form - each * turned for form, each in zip(forms, waves, strict=True)])
+        found.deviations.append(
+            [form - form_correction.turn(each, aligned.offset, sense) for form, each in zip(forms, waves, strict=True)]
+        )
     return found._replace(points=float(np.mean(points)))
 
 
@@ -287,6 +292,7 @@ def _show(summary: dict[str, Any], output: Path) -> None:
 @click.option(
     "--last", type=click.IntRange(1), default=_BAG_REVOLUTIONS, show_default=True, help="revolutions of a bag"
 )
+@click.option("--topic", metavar="TOPIC", help="readings of the gauge in a bag; default: the only gauge/reading")
 @options.overrides
 @options.allow_code
 @options.as_json
@@ -305,6 +311,7 @@ def correct(
     guard: float,
     noise: float | None,
     last: int,
+    topic: str | None,
     overrides: tuple[str, ...],
     *,
     deviation: bool,
@@ -332,6 +339,7 @@ def correct(
         search=search,
         height=height,
         last=last,
+        topic=topic,
     )
     revolutions = sum(map(len, found.deviations))
     given = None

@@ -3,6 +3,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +54,7 @@ def design(
     files.check_place("--output", place)
     drives = _drives(measured) if measured else [{}]
     made = Design(loaded, drives, margin)
-    found = made.candidates(lambda law: click.echo(law, err=True) if not as_json else None)
+    found = made.candidates(lambda law: click.echo(law, err=True) if sys.stderr.isatty() else None)
     best = found[0]
     reason = f"; the first reason: {made.refused}" if made.refused else ""
     if best.scenario is None:
