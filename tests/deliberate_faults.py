@@ -86,7 +86,8 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "        if self.phase is None:  # the cell may be running already\n            return False\n",
+        "        if self.phase != Phase.WAITING and self._time < self._join_due:  # the cell may be running already\n"
+        "            return False\n",
         "",
         "a latecomer does not wait for the state of the cell",
     ),

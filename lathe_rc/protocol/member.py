@@ -312,9 +312,7 @@ class MemberProtocol:
         """Return True if only topic matching is missing before the start, so that the node has to call `matched`."""
         if not self.active or self.ready or self._beginning or self.failure or not self.complete:
             return False
-        if self.phase is None:  # the cell may be running already
-            return False
-        if self.phase != Phase.WAITING and self._time < self._join_due:
+        if self.phase != Phase.WAITING and self._time < self._join_due:  # the cell may be running already
             return False
         assert self.master is not None, "the cell is complete"
         return all(self.members[name].state != MemberState.JOINING for name in self.master.members)
