@@ -216,6 +216,23 @@ def test_frequencies_of_a_sweeps_end_alone_are_too_few():
         estimate(command, simulated(PLAIN, command), STEP, highest=TURN * 40.0)
 
 
+def test_step_may_lie_within_its_times():
+    time = np.arange(-200, 400) * STEP
+    fit = modal_fit.fit(StepData(time, PLAIN.step(time)), modes=0)
+    assert_found(fit.drive, PLAIN, 0.1e-6)
+
+
+def test_drive_keeps_a_part_of_its_own(monkeypatch):
+    """No cell takes participations that sum up to 1 or more."""
+    near = ModalDrive(TURN * 300.0, 0.5, 1e-3, (TURN * 60.0,), (0.2,), (0.95,))
+    drives = modal_fit.ModalFit(near, np.diag([0.1] * 6) ** 2, 0.0, ()).drives(32, 0)
+    assert max(sum(drive.mode_participation) for drive in drives) == pytest.approx(1.0 - 0.01 * 0.05)
+    beyond = ModalDrive(TURN * 300.0, 0.5, 0.0, (TURN * 60.0,), (0.2,), (1.3,))
+    monkeypatch.setattr(modal_fit, "_polish", lambda _data, _drive: (beyond, 0.01))
+    with pytest.raises(InputError, match=r"participations of the modes sum up to 1\.3; allowed: below 1"):
+        modal_fit.fit(ResponseData(FrequencyResponse(FREQUENCY, PLAIN.response(FREQUENCY))), modes=0)
+
+
 def test_lines_of_a_command_count_at_their_own_frequencies():
     """A run of the machine commands harmonics of the spindle, which lie between the bins."""
     random, time = np.random.default_rng(10), np.arange(60_000) * STEP
@@ -272,6 +289,18 @@ def test_command_writes_parameters_set_and_points(tmp_path):
     points = measurement_file.read(tmp_path / "drive.points.csv", {})
     again = modal_fit.fit(data(points), modes=2)
     assert_found(again.drive, TRUE, 1e-9)
+
+
+def test_uncertainty_of_a_file_stands_beside_its_coherence(tmp_path):
+    """The coherence has no use then, and no number of averages."""
+    random, path = np.random.default_rng(3), tmp_path / "points.csv"
+    response = measured(PLAIN, random)
+    frequency_response.write_points(path, response, response.deviation, "points")
+    found = frequency_response.of_measurement(measurement_file.read(path, {}))
+    assert_allclose(found.deviation, response.deviation, rtol=1e-9)
+    assert found.averages == 0.0
+    done = lathe(tmp_path, path, "--averages", 32)
+    assert "--averages of a response with a relative_uncertainty; allowed: with a coherence alone" in done.stderr
 
 
 def test_set_of_drives_without_modes_runs_in_a_scenario(tmp_path):
@@ -367,6 +396,10 @@ def test_missing_reader_is_named_with_its_extra(tmp_path, monkeypatch):
 
 
 HEADER = "time_ms,command_um,response_um\n"
+RISE, LATE = (
+    "time,response\n" + "".join(f"{begin + k / 10},{min(k / 9, 1)}\n" for k in range(30)) for begin in (0.0, 12.3)
+)
+POINTS = "frequency,real,imaginary\n" + "".join(f"{k},1,0\n" for k in range(1, 40))
 EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in range(600))
 
 
@@ -388,6 +421,15 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
         (HEADER + EVEN, [], "the response follows the command at"),
         (HEADER + EVEN, ["--band", "0:5"], "the response follows the command at 0 frequencies .* a wider --band"),
         (HEADER, [], "time: 0 samples; allowed: 2 or more"),
+        (HEADER + EVEN, ["--band", "5:9000"], "up to 9000 Hz of a record at 20000 Hz; allowed: up to 8000 Hz"),
+        (HEADER + EVEN, ["--rate", 2e4], "--rate 20000 beside the times in 'time_ms'; leave --rate out"),
+        (RISE, ["--rate", 10], "--rate does not apply to a step response with times; leave it out"),
+        (RISE, ["--band", "0:5"], "--band does not apply to a step response; leave it out"),
+        (RISE, ["--resolution", 1], "--resolution does not apply to a step response; leave it out"),
+        (RISE, ["--averages", 9], "--averages does not apply to a step response; leave it out"),
+        (LATE, [], "step response: times from 12.3 to 15.2 s; allowed: from 0 or before"),
+        (POINTS, ["--rate", 10], "--rate does not apply to a frequency response; leave it out"),
+        (POINTS, ["--averages", 9], "--averages of a response with no coherence; allowed: with a coherence alone"),
         (HEADER + EVEN, ["--band", "9:1"], "--band '9:1'; allowed: LOW:HIGH in Hz"),
         ("command,response\n" + "1,1\n" * 3, [], "no time; give --rate HZ"),
         ("frequency,real\n1,1\n", [], "allowed: frequency with magnitude and phase"),

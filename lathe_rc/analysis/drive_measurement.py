@@ -95,12 +95,26 @@ def data(
     """Return a measurement as data of a fit; ``band`` in rad/s, the others as for `frequency_response`.
 
     Raises:
-        InputError: the measurement is unusable.
+        InputError: the measurement is unusable, or an option does not apply to its kind.
     """
     highest = band[1] if band else None
+    if "frequency" in measurement:
+        _refuse(measurement, "a frequency response", rate=rate, resolution=resolution)
     response = frequency_response(
         measurement, rate=rate, hold=hold, resolution=resolution, averages=averages, highest=highest
     )
     if response is None:
+        _refuse(measurement, "a step response", resolution=resolution, averages=averages, band=band)
+        if "command" not in measurement:
+            _refuse(measurement, "a step response with times", rate=rate)
         return step_response(measurement, rate=rate, hold=hold)
+    if "frequency" not in measurement:
+        _refuse(measurement, "a record", averages=averages)
     return ResponseData(response.within(*band) if band else response)
+
+
+def _refuse(measurement: Measurement, kind: str, **options: object) -> None:
+    """Reject options that a kind of measurement would ignore."""
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"{measurement.name}: --{name} does not apply to {kind}; leave it out")

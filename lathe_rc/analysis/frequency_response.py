@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, at_most
 from lathe_rc.signals.measurement_file import Measurement
 from lathe_rc.signals.table import write_table
 
@@ -40,6 +40,7 @@ AVERAGES = 16.0  #: assumed for a coherence whose number of averages is not give
 
 _LEAST_SAMPLES = 512
 _HIGHEST, _MOST_FREQUENCY = 0.2, 0.4  # of the sampling frequency, without a wish and at most
+_CLOCK_ERROR = 1e-6  # of the sampling frequency, as times in a file are rounded
 _APPROXIMATE = 1e-4  # relative error of the estimate itself: smoothing to second order
 _RESOLUTION = 0.5  # [Hz], the finest without a wish
 _SEGMENTS = 8  # of the record, at least, without a wish
@@ -265,7 +266,8 @@ def estimate(
         highest: highest frequency [rad/s], up to 0.4 of the sampling frequency; None: 0.2 of it.
 
     Raises:
-        InputError: the record is too short, the command is constant, or the response does not follow it.
+        InputError: the record is too short, the command is constant, the response does not follow it, or an option is
+            out of range.
     """
     if command.size < _LEAST_SAMPLES:
         raise InputError(f"record: {command.size} samples; allowed: {_LEAST_SAMPLES} or more")
@@ -281,7 +283,12 @@ def estimate(
         window, hop, first = scipy.signal.get_window("hann", size), size // 4, 0
     frequency = np.arange(window.size // 2 + 1) / (window.size * step)
     bins = np.arange(1, frequency.size) if period else np.arange(2, frequency.size, 2)
-    most = _HIGHEST / step if highest is None else min(highest / (2.0 * np.pi), _MOST_FREQUENCY / step)
+    most = _HIGHEST / step if highest is None else highest / (2.0 * np.pi)
+    if most > _MOST_FREQUENCY / step * (1.0 + _CLOCK_ERROR):
+        raise InputError(
+            f"--band up to {most:.6g} Hz of a record at {1.0 / step:.6g} Hz; allowed: up to "
+            f"{at_most(_MOST_FREQUENCY / step)} Hz ({_MOST_FREQUENCY:g} of the sampling frequency)"
+        )
     bins = bins[frequency[bins] <= most]
     if not bins.size:
         raise _too_few(0)
@@ -345,7 +352,7 @@ def _swept(
 
 
 def _segment(samples: int, step: float, resolution: float | None) -> int:
-    """Return the length of a Hann window, a power of 2."""
+    """Return the length of a Hann window: that of the resolution, or without one a power of 2."""
     if resolution is None:
         most = min(samples // _SEGMENTS, int(1.0 / (_RESOLUTION * step)), _LONGEST)
         return 1 << int(np.log2(max(most, 64)))
@@ -379,27 +386,32 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
         averages: number of averages of the coherence; None: `AVERAGES`.
 
     Raises:
-        InputError: a column is missing or out of range.
+        InputError: a column is missing or out of range, or ``averages`` has no use.
     """
     frequency, value = _values(measurement)
     coherence = _between(measurement, "coherence", 1.0)
-    deviation = _between(measurement, "relative_uncertainty", np.inf)
+    given = _between(measurement, "relative_uncertainty", np.inf)
     order = np.argsort(frequency, kind="stable")
     kept = order[frequency[order] > 0.0]  # the point at 0 Hz of an analyser has no phase
+    if averages is not None and (coherence is None or given is not None):
+        known = "no coherence" if coherence is None else "a relative_uncertainty"
+        raise InputError(f"{measurement.name}: --averages of a response with {known}; allowed: with a coherence alone")
     count = AVERAGES if averages is None else averages
     if coherence is not None:
         kept = kept[coherence[kept] >= _LEAST_COHERENCE]
-    if deviation is not None:
-        deviation = np.maximum(deviation, _LEAST_DEVIATION)
+    if given is not None:
+        deviation = np.maximum(given, _LEAST_DEVIATION)
     elif coherence is not None:
         deviation = deviation_of(np.maximum(coherence, _LEAST_COHERENCE), count)
+    else:
+        deviation = None
     try:
         return FrequencyResponse(
             frequency[kept],
             value[kept],
             None if deviation is None else deviation[kept],
             None if coherence is None else coherence[kept],
-            0.0 if coherence is None else count,
+            0.0 if coherence is None or given is not None else count,
         )
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None

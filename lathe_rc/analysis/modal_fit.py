@@ -5,8 +5,9 @@ Least squares, weighted by the variance of the measurement σ² plus that of the
 the model, is as large as the residuals require: 0 for residuals within σ. So parameters of a model that leaves
 something out do not depend on the few points with the least noise, and their covariance includes its error.
 
-The number of modes is that of the least BIC, -2·ln(likelihood) + k·ln(points): a mode is added where it reduces the
-residual most, then all parameters are fitted again, until a further mode no longer pays.
+The number of modes is that of the least BIC, -2·ln(likelihood) + k·ln(m) with m real numbers, two for each point of a
+frequency response: a mode is added where it reduces the residual most, then all parameters are fitted again, until a
+further mode no longer pays.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,6 +33,7 @@ _LONGEST_DELAY = 0.1  # [s], as the drive's parameter allows
 _DAMPINGS = (1e-4, 20.0)
 _MODE_DAMPINGS = (1e-4, 0.3)  # beyond: no resonance, but a substitute for something else that the model lacks
 _LARGEST_SHARE = 10.0  # of a mode
+_LEAST_PART = 0.01  # of the drive itself in the motion, relative to the fit; without it no cell takes the drive
 _PAYS = 10.0  # least gain of BIC for a further mode: strong evidence (Kass and Raftery 1995)
 _AHEAD = 5  # modes beyond the best number that are tried: with some missing, a fit may be worse than with none
 _COARSE, _FINE = 0.03, 1e-4  # ε while modes are looked for: at first, and at least
@@ -180,7 +182,7 @@ class ResponseData:
         return [drive for _, drive in best[:1] + best[5:6]] + plain
 
     def _corner(self) -> float:
-        """Return the frequency above which the magnitude stays below half of the static gain, or is last [rad/s]."""
+        """Return the first frequency whose magnitude is below 0.3 of the static gain, or the last one [rad/s]."""
         magnitude = np.abs(self.measured.value)
         below = magnitude < 0.3 * np.median(magnitude[:3])
         return float(self.measured.frequency[int(np.argmax(below))] if below.any() else self.measured.frequency[-1])
@@ -191,7 +193,7 @@ class StepData:
     """Response to a unit step at time 0 as data of a fit.
 
     Args:
-        time: increasing times from 0 [s], shape (n,), n at least 16.
+        time: increasing times [s], shape (n,), n at least 16; the first one is at most a step after 0.
         response: response relative to the step [1], shape (n,); ends near 1.
 
     Raises:
@@ -207,6 +209,12 @@ class StepData:
         if falling.size:
             a, b = self.time[falling[0]], self.time[falling[0] + 1]
             raise InputError(f"step response: time {a:g} s is followed by {b:g} s; allowed: increasing times")
+        begin, end = float(self.time[0]), float(self.time[-1])
+        if not begin - 1.5 * (float(self.time[1]) - begin) <= 0.0 < end:
+            raise InputError(
+                f"step response: times from {begin:.6g} to {end:.6g} s; allowed: from 0 or before "
+                "(the step is at 0: subtract its time, or record the command too)"
+            )
         if not _LEAST_GAIN <= self.response[-1] <= _MOST_GAIN:
             raise InputError(
                 f"step response: ends at {self.response[-1]:.4g}; allowed: {_LEAST_GAIN:g} to {_MOST_GAIN:g} (divide "
@@ -318,13 +326,16 @@ class ModalFit:
         """Return the fit and ``count`` drives on the surface of its region of confidence (`COVERED`).
 
         They lie in random directions, in opposite pairs: the worst of them is near the worst drive that the measurement
-        allows, which draws from the inside of the region are not. A delay below 0 is a delay of 0.
+        allows, which draws from the inside of the region are not. A delay below 0 is a delay of 0. An offset that would
+        leave the drive itself no part in the motion is shortened until 1 % of this part is left.
         """
         size = self.covariance.shape[0]
         directions = np.random.default_rng(seed).normal(size=(-(-count // 2), size))
         directions *= np.sqrt(self.limit) / np.linalg.norm(directions, axis=1, keepdims=True)
         root = scipy.linalg.cholesky(self.covariance, lower=True)
         offsets = np.stack((directions, -directions), axis=1).reshape(-1, size)[:count] @ root.T
+        most = (1.0 - _LEAST_PART) * (1.0 - sum(self.drive.mode_participation))
+        offsets *= (most / np.maximum(offsets[:, BASE + EACH - 1 :: EACH].sum(axis=1), most))[:, None]
         places = self.drive.searched() + offsets
         places[:, 2] = np.maximum(places[:, 2], 0.0)
         return [self.drive, *(ModalDrive.of_searched(place) for place in places)]
@@ -482,7 +493,8 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
         report: is called with each number of modes before its fit.
 
     Raises:
-        InputError: the points are too few, or do not determine the parameters.
+        InputError: the points are too few, do not determine the parameters, or show participations that sum up to 1 or
+            more.
     """
     wanted = MOST_MODES if modes is None else modes
     fewest = 2 * (BASE + EACH * (modes or 0))
@@ -517,14 +529,23 @@ def fit(data: Data, *, modes: int | None = None, report: Callable[[int], None] =
         elif error < _COARSE or count - len(chosen.mode_frequency) >= _AHEAD:
             break
     chosen, error = _polish(data, chosen)
+    whole = sum(chosen.mode_participation)
+    if whole >= 1.0:
+        raise InputError(
+            f"fit: the participations of the modes sum up to {whole:.4g}; allowed: below 1 (give fewer --modes, or "
+            "measure lower frequencies too)"
+        )
     return ModalFit(chosen, _covariance(data, chosen, error), error, tuple(bic))
 
 
 def _certain(data: Data, drive: ModalDrive, model_error: float) -> bool:
     """Return whether the points determine each mode: its width, and its participation to a third.
 
-    A mode at the lower end of the band or with the largest damping is a substitute for something else.
+    A mode at the lower end of the band or with the largest damping is a substitute for something else, and so are modes
+    that leave the drive itself no part in the motion.
     """
+    if sum(drive.mode_participation) >= 1.0:
+        return False
     try:
         covariance = _covariance(data, drive, model_error)
     except InputError:

@@ -61,7 +61,7 @@ def _band(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tu
     help="command of a record between samples: linear as in the cell, held by a converter, or an analogue signal",
 )
 @click.option("--resolution", type=options.POSITIVE, help="distance of the bins of a record [Hz]")
-@click.option("--averages", type=options.POSITIVE, help="behind the coherence of a file; default: 16")
+@click.option("--averages", type=options.POSITIVE, help="behind the coherence of a response in a file; default: 16")
 @click.option("--band", callback=_band, metavar="LOW:HIGH", help="frequencies that count [Hz]; default: all")
 @click.option("--modes", type=click.IntRange(0, 24), help="number of modes; default: that of the least BIC")
 @click.option(

@@ -164,7 +164,7 @@ def even_clock(time: Array, what: str) -> Clock:
         at = int(off.argmax())
         raise InputError(
             f"{what}: not in even steps, {time[at]:.9g} s at sample {at} is {off[at]:.3g} s off; allowed: even steps "
-            "(resample the record, or give --rate)"
+            "(resample the record, or give --rate and no column of the time)"
         )
     return Clock(float(time[0]), step)
 
@@ -261,9 +261,13 @@ class Measurement:
         """Return the common sampling of quantities: of ``rate`` [Hz], the column of the time, or stated by the file.
 
         Raises:
-            InputError: nothing states it, it is not even, or it differs between the quantities.
+            InputError: nothing states it, ``rate`` and a column do, it is not even, or it differs between the
+                quantities.
         """
         if rate is not None:
+            if "time" in self:
+                column = self._columns["time"].column
+                raise InputError(f"{self.name}: --rate {rate:g} beside the times in {column!r}; leave --rate out")
             return Clock(0.0, 1.0 / rate)
         if "time" in self:
             return even_clock(self.read("time")[0], f"{self.name}: time")
