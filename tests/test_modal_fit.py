@@ -15,9 +15,10 @@ from numpy.testing import assert_allclose
 from pyarrow import parquet, table
 
 import lathe_rc
+from drive_fit_accuracy import RATE, STEP, TURN, drawn, errors, measured, noisy, simulated
 from lathe_rc.analysis import frequency_response, modal_fit
 from lathe_rc.analysis.drive_measurement import data, step_response
-from lathe_rc.analysis.frequency_response import FrequencyResponse, deviation_of, estimate
+from lathe_rc.analysis.frequency_response import FrequencyResponse, estimate
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.modal_fit import ResponseData, StepData
 from lathe_rc.cli import main
@@ -25,11 +26,7 @@ from lathe_rc.commands import measured as measured_options
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
 from lathe_rc.sweep.space import Space, given
-from lathe_rc.transfer import LinearSystem, TransferFunction
 
-TURN = 2.0 * np.pi
-RATE = 20_000.0
-STEP = 1.0 / RATE
 TRUE = ModalDrive(
     TURN * 165.0, 0.8, 7 * STEP, (TURN * 905.0, TURN * 1620.0), (0.02, 0.018), (0.012, -0.02)
 )  # its delay is one of whole samples
@@ -38,56 +35,9 @@ HOLDS = ("zero", "linear")
 FREQUENCY = TURN * np.linspace(5.0, 2500.0, 800)
 
 
-def drawn(random):
-    """Return a drive near 165 Hz with modes near 900 and 1600 Hz."""
-    return ModalDrive(
-        TURN * 165.0 * random.uniform(0.85, 1.15),
-        random.uniform(0.5, 1.0),
-        random.uniform(0.2e-3, 0.6e-3),
-        tuple(TURN * np.array([900.0, 1600.0]) * random.uniform(0.93, 1.07, 2)),
-        (0.02, 0.02),
-        tuple(random.choice([-1.0, 1.0], 2) * random.uniform(0.005, 0.03, 2)),
-    )
-
-
-def measured(drive, random, averages=32):
-    """Return an H1 estimate of white noise at 60 dB whose coherence falls at the modes."""
-    response, shape = drive.response(FREQUENCY), (averages, FREQUENCY.size)
-    coherence = np.full(FREQUENCY.size, 1.0 / (1.0 + 1e-6))
-    for mode, damping, _ in drive.modes:
-        coherence *= 1.0 - 0.15 / (1.0 + ((FREQUENCY - mode) / (2.0 * damping * mode)) ** 2)
-    u, noise = (random.normal(size=shape) + 1j * random.normal(size=shape) for _ in range(2))
-    y = response * u + np.abs(response) * np.sqrt((1.0 - coherence) / coherence) * noise
-    power, cross = np.sum(np.abs(u) ** 2, axis=0), np.sum(u.conj() * y, axis=0)
-    coherence = np.abs(cross) ** 2 / (power * np.sum(np.abs(y) ** 2, axis=0))
-    return FrequencyResponse(FREQUENCY, cross / power, deviation_of(coherence, averages), coherence, averages)
-
-
-def simulated(drive, command, hold="foh"):
-    """Return the exact response of a drive whose delay is a whole number of samples."""
-    shares = [(drive.natural_frequency, drive.damping, 1.0 - sum(drive.mode_participation)), *drive.modes]
-    position = np.zeros(command.size)
-    for frequency, damping, share in shares:
-        part = np.empty(command.size)
-        bottom = (1.0, 2.0 * damping * frequency, frequency**2)
-        LinearSystem(TransferFunction((frequency**2,), bottom), STEP, hold).block(command, part)
-        position += share * part
-    late = round(drive.delay / STEP)
-    return np.concatenate((np.zeros(late), position[: position.size - late]))
-
-
-def noisy(position, random, ratio=1e-3):
-    return position + ratio * np.std(position) * random.normal(size=position.size)
-
-
 def assert_found(found, true, delay=2e-6):
     """Frequencies within 0.5 %, dampings within 10 %."""
-    assert len(found.mode_frequency) == len(true.mode_frequency)
-    assert_allclose(found.natural_frequency, true.natural_frequency, rtol=5e-3)
-    assert_allclose(found.mode_frequency, true.mode_frequency, rtol=5e-3)
-    assert_allclose(found.damping, true.damping, rtol=0.1)
-    assert_allclose(found.mode_damping, true.mode_damping, rtol=0.1)
-    assert_allclose(found.delay, true.delay, atol=delay)
+    assert np.less_equal(errors(found, true), (5e-3, 0.1, delay)).all(), (found, true)
 
 
 # --- model
@@ -122,7 +72,7 @@ def test_drives_are_found_in_frequency_responses():
     random = np.random.default_rng(44)
     for _ in range(2):
         true = drawn(random)
-        fit = modal_fit.fit(ResponseData(measured(true, random)))
+        fit = modal_fit.fit(ResponseData(measured(true, FREQUENCY, random)))
         assert_found(fit.drive, true)
         assert fit.distance(true) < fit.limit
     drives = fit.drives(32, seed=0)
@@ -294,7 +244,7 @@ def test_command_writes_parameters_set_and_points(tmp_path):
 def test_uncertainty_of_a_file_stands_beside_its_coherence(tmp_path):
     """The coherence has no use then, and no number of averages."""
     random, path = np.random.default_rng(3), tmp_path / "points.csv"
-    response = measured(PLAIN, random)
+    response = measured(PLAIN, FREQUENCY, random)
     frequency_response.write_points(path, response, response.deviation, "points")
     found = frequency_response.of_measurement(measurement_file.read(path, {}))
     assert_allclose(found.deviation, response.deviation, rtol=1e-9)

@@ -62,7 +62,12 @@ def _band(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tu
 )
 @click.option("--resolution", type=options.POSITIVE, help="distance of the bins of a record [Hz]")
 @click.option("--averages", type=options.POSITIVE, help="behind the coherence of a response in a file; default: 16")
-@click.option("--band", callback=_band, metavar="LOW:HIGH", help="frequencies that count [Hz]; default: all")
+@click.option(
+    "--band",
+    callback=_band,
+    metavar="LOW:HIGH",
+    help="frequencies that count [Hz]; default: all, of a record up to 0.2 of its rate",
+)
 @click.option("--modes", type=click.IntRange(0, 24), help="number of modes; default: that of the least BIC")
 @click.option(
     "--drives", type=click.IntRange(1, 4096), default=32, show_default=True, help="of the set, beside the fit"
