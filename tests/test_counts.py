@@ -298,6 +298,24 @@ def test_an_edge_after_its_reading_is_an_error():
         timed(np.array([10]), np.array([1]), np.array([20]))
 
 
+@pytest.mark.parametrize("change", [lambda ns: ns - 1_000_000, lambda ns: ns - 10 * 10**9, lambda ns: ns // 1000])
+def test_edge_times_of_another_clock_or_unit_are_an_error(change):
+    times, shown, edges = read_out(STEP_NS)
+    allowed = (
+        r"^last edge at .* of a count that had not come at \d+ ns; allowed: from -?\d+ ns on .* edge_clock = 1e-06 s"
+    )
+    with pytest.raises(LatheError, match=allowed):
+        timed(times, shown, change(edges))
+
+
+@given(st.integers(0, CLOCK_NS - 1))
+def test_the_edge_of_a_new_count_may_be_rounded_to_before_the_last_reading(late):
+    """The reading comes at any time of the clock's tick, the edge directly after it."""
+    times = np.array([0, 10 * CLOCK_NS + late, 30 * CLOCK_NS])
+    angle = timed(times, np.array([0, 0, 1]), np.array([0, 0, 10 * CLOCK_NS]))
+    assert 1.0 <= angle.angle * COUNTS / TURN < 2.0
+
+
 def test_lines_and_files_have_a_third_column_with_the_edge(path):
     text = b"time_ns,counts,edge_ns\n10,1,8\n20; 2; 15\n"
     assert list(LineReader(io.BytesIO(text), "line", timed=True).read()) == [(10, 1, 8), (20, 2, 15)]

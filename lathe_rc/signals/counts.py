@@ -5,6 +5,7 @@ A reading is a time [ns], the counter value at that time and, from some encoders
 `lathe_rc.signals.edge_time`). Between two readings the angle is linear.
 """
 
+import math
 import os
 import re
 import stat
@@ -261,23 +262,24 @@ class CountedAngle:
             raise LatheError(f"counter of {count:.6g} at {time_ns} ns; allowed: finite numbers up to 2^64")
         if edge_ns is not None and edge_ns > time_ns:
             raise LatheError(f"last edge at {edge_ns} ns in a reading at {time_ns} ns; allowed: not after the reading")
-        if self._newest is None:
+        before = self._newest
+        if before is None:
             self._start_ns, self._newest = time_ns, (time_ns, count)
             self._turned = self._highest = float((count * self._sign) % self._counts)
             if edge_ns is not None:
                 self._edges.last[[STAMP, COUNT]] = (edge_ns - time_ns) * 1e-9, self._turned
             self._keep(edge_ns)
             return
-        if time_ns <= self._newest[0]:
+        if time_ns <= before[0]:
             self.late += 1
             return
-        since = time_ns - self._newest[0]
+        since = time_ns - before[0]
         if since > self._max_gap_ns:
             raise LatheError(
                 f"no counts from {self.time:.9g} to {self.time + since * 1e-9:.9g} s, for {since * 1e-6:.4g} ms; "
                 f"allowed: up to max_gap = {self._max_gap_ns * 1e-6:.4g} ms"
             )
-        moved = count - self._newest[1]  # between integers, before any rounding
+        moved = count - before[1]  # between integers, before any rounding
         if self._wraps:
             moved = ((2 * moved + self._wraps) % (2 * self._wraps) - self._wraps) / 2
         self._newest = time_ns, count
@@ -287,6 +289,15 @@ class CountedAngle:
                 f"the encoder has gone back by {back:.6g} counts at {self.time:.9g} s; allowed: up to max_reverse = "
                 f"{self._max_reverse:g}, a spindle that turns one way (inverted turns the sign)"
             )
+        if edge_ns is not None and self._turned > self._highest:
+            # The edge of a new count comes after the reading before; both times are rounded to nanoseconds.
+            least = before[0] - math.ceil(self._edges.clock * 1e9) - 1
+            if edge_ns < least:
+                raise LatheError(
+                    f"last edge at {edge_ns} ns of a count that had not come at {before[0]} ns; allowed: from {least} "
+                    f"ns on (times of edges by the clock and in the unit of the readings, edge_clock = "
+                    f"{self._edges.clock:g} s)"
+                )
         self._highest = max(self._highest, self._turned)
         self._keep(edge_ns)
 
