@@ -147,6 +147,16 @@ def test_the_correction_learns_no_keyway_and_can_be_frozen_and_cleared():
     assert not state["measured_position"][turn == 5][:SAMPLES].any()
 
 
+@pytest.mark.parametrize("points", [64, 512])
+def test_the_correction_lies_at_the_angle_of_its_readings(points):
+    """Mean reading and interpolation are even: only their amplitude depends on the number of points."""
+    made = stage(gain=1.0, points_per_revolution=points, cutoff=8.0, events=["sample 15360: freeze"])
+    angle, state, _ = advance(made, lambda angle: np.sin(3 * angle))
+    rows = slice(-2 * SAMPLES // 3, -SAMPLES // 3)  # a wave far from the first and the last reading
+    wave = np.mean(state["measured_position"][rows] * np.exp(-3j * angle[rows]))
+    assert np.angle(wave / 0.5j) == pytest.approx(0.0, abs=3 * TURN / SAMPLES)
+
+
 def test_the_other_fields_are_those_of_the_drive():
     measured = np.linspace(0.0, 1e-4, 6 * SAMPLES)
     _, state, _ = advance(stage(), lambda angle: np.zeros(angle.size), measured=measured)
@@ -161,6 +171,10 @@ def test_the_other_fields_are_those_of_the_drive():
     (
         lambda: Cell(config("gauged", "gauge.angle_offset=0.2").nodes).check(),
         r"^gauge.angle_offset = 0.2 rad: the correction diverges; allowed: less than 0.00\d+ rad, or more",
+    ),
+    (
+        lambda: Cell(config("gauged", "gauge.points_per_revolution=4096").nodes).check(),
+        r"^gauge.points_per_revolution = 4096: a revolution takes 37\d\d .*: 2048 or fewer, or a sample_rate of \d+",
     ),
     (lambda: stage(dropouts_per_revolution=1e4), r"^gauge.dropouts_per_revolution = 10000; allowed: below 3840"),
     (

@@ -29,7 +29,7 @@ from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage, WiredCell
 from lathe_rc.control.interpolation import read
-from lathe_rc.errors import InputError, at_most
+from lathe_rc.errors import InputError, at_least, at_most
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.messages import Samples
 from lathe_rc.signals.noise import Sensor, SensorTable, quantise
@@ -38,6 +38,7 @@ _TURN = 2.0 * np.pi
 _CORRECTED = "gauge/state"  # topic
 _NOTHING = 1e-9  # a smaller part of a reading does not count in any run
 _GRID = 4096  # recorded points per revolution
+_LEAST_POINTS = 64  # of the correction per revolution
 _SPREAD = float(np.sqrt(2.0 * np.log(2.0)))  # standard deviation of the filter [rad], for a cut-off of 1
 _TAIL = 5.0  # standard deviations at which the filter ends
 # Indices in the integer state: next grid point of the record, its first one, whether it has begun; current point of the
@@ -72,7 +73,7 @@ class GaugeParameters(NodeParameters):
     gain: NonNegative = parameter(
         0.0, "part of a revolution's readings that the correction takes up; 0: the largest without overshoot"
     )
-    points_per_revolution: Annotated[int, Ge(64), Le(4096)] = parameter(
+    points_per_revolution: Annotated[int, Ge(_LEAST_POINTS), Le(4096)] = parameter(
         512, "points of the correction per revolution, a power of 2"
     )
     tool_delay: Annotated[int, Ge(1), Le(2**16)] = parameter(
@@ -171,7 +172,8 @@ def _end_point(m: Memory) -> None:
 def _learn(m: Memory, angle: float, reading: float, there: bool) -> None:  # noqa: FBT001 - a kernel's arguments
     """Add a reading to its point of the correction."""
     whole, real = m.whole, m.real
-    point = int(np.floor(angle * (m.correction.size / _TURN)))
+    # A point lies in the middle of its readings.
+    point = int(np.floor(angle * (m.correction.size / _TURN) + 0.5))
     if not whole[_BEGUN]:
         whole[_BEGUN], whole[_POINT], whole[_SINCE] = 1, point, point
         real[_SUM] = real[_COUNT] = 0.0
@@ -337,13 +339,28 @@ class Gauge(Stage):
                 f"than {at_most(allowed, 3)} rad, or more with a smaller cutoff than {parameters.cutoff:g}"
             )
 
-    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
-        """Check that a place has been recorded when its reading is due, and that a correction in use converges."""
-        super().check_cell(cell, cures=cures)
+    def _check_points(self, fastest: float) -> None:
+        """Check that each point of the correction gets a reading in a revolution at the highest speed [rad/s]."""
         parameters = self.parameters
+        samples, points = _TURN / (fastest * parameters.step), parameters.points_per_revolution
+        if samples >= points:
+            return
+        most = 2 ** int(np.log2(samples))
+        fewer = f"{most} or fewer, or " if most >= _LEAST_POINTS else ""
+        rate = at_least(points * fastest / _TURN)
+        raise InputError(
+            f"{self.name}.points_per_revolution = {points}: a revolution takes {samples:.4g} samples at {fastest:.4g} "
+            f"rad/s; allowed: {fewer}a sample_rate of {rate} Hz or more"
+        )
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """Check that a place is recorded when its reading is due, and that a correction in use can be learned."""
+        super().check_cell(cell, cures=cures)
+        parameters, fastest = self.parameters, cell.speed_range[1]
         if cell.reader_names(remapped(self.shared, _CORRECTED)):
+            self._check_points(fastest)
             self._check_convergence()
-        turned = parameters.tool_delay * parameters.step * cell.speed_range[1] + 2.0 * _TURN / _GRID
+        turned = parameters.tool_delay * parameters.step * fastest + 2.0 * _TURN / _GRID
         room = _TURN * parameters.revolutions_late - max(parameters.angle_offset, 0.0)
         if turned > room:
             raise InputError(
