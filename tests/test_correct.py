@@ -79,9 +79,10 @@ def test_what_cannot_be_aligned_or_judged_is_refused(make, message):
     assert_refused(make, message)
 
 
-def test_an_oval_is_aligned_by_a_search_around_a_known_angle():
-    record = OVAL * np.exp(-2j * 0.7)
-    assert align([OVAL], [record], 0.6, 0.5).offset == pytest.approx(0.7, abs=1e-6)
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_an_oval_is_aligned_by_a_search_around_a_known_angle(sense):
+    record = OVAL * np.exp(-2j * sense * 0.7)
+    assert align([OVAL], [record], 0.6, 0.5, sense).offset == pytest.approx(0.7, abs=1e-6)
 
 
 # --- the guard against learning noise
@@ -175,6 +176,16 @@ def test_revolutions_are_told_apart_by_number_height_or_angle(tmp_path):
     assert [each.height for each in part_record.read(heights, columns)] == pytest.approx([5e-3, 10e-3, 15e-3])
 
 
+@pytest.mark.parametrize("first", [0.0, 10.0, 180.0])
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, sense, goes_on):
+    angle = first + sense * 4.0 * np.arange(270)
+    columns = (angle if goes_on else angle % 360, np.repeat([1.0, 2.0, 3.0], 90))
+    found = part_record.read(table(tmp_path / "r.csv", "angle_deg,radius_um", columns), {})
+    assert [set(np.rint(1e6 * each.radius)) for each in found] == [{1.0}, {2.0}, {3.0}]
+
+
 @pytest.mark.parametrize(
     ("text", "given", "said"),
     [
@@ -189,6 +200,7 @@ def test_revolutions_are_told_apart_by_number_height_or_angle(tmp_path):
         ("angle_deg,radius_um\n0,nan\n", [], r"r.csv:2: 'nan'; allowed: finite numbers"),
         ("angle_deg,radius_um\n0,1\n9,1\n18,1\n", [], r"no complete revolution: 3 points over 18°; allowed"),
         ("# nothing\n", [], r"no rows; allowed: a header"),
+        ("angle_deg,radius_um\n", [], r"no complete revolution: 0 points over 0°; allowed"),
         ("angle_deg,radius_um\n", ["diameter=d:mm"], r"--column 'diameter=d:mm'; allowed: QUANTITY=COLUMN"),
         ("angle_deg,radius_um\n", ["angle="], r"--column 'angle='; allowed: QUANTITY=COLUMN"),
     ],
@@ -316,6 +328,24 @@ def test_a_bag_with_a_gauge_is_a_record(tmp_path):
     assert "--output" in said
 
 
+def test_one_of_several_gauges_is_named(tmp_path):
+    """The second one reads 0.5 rad ahead: the revolution in which its readings begin is none."""
+    cell = config("gauged", BLIND, "spindle_encoder.revolutions=6.0", "gauge.noise_rms=0.0")
+    remap = [f"gauge/{name}:=second/gauge/{name}" for name in ("reading", "state")]
+    second = cell.nodes["gauge"].model_copy(update={"stage": "gauge", "remap": remap, "angle_offset": 0.5})
+    harness.run(type(cell)("two", {**cell.nodes, "second": second}), bag=tmp_path / "part")
+    options = (tmp_path / "part", "--scenario", "gauged", "-o", tmp_path / "f.csv")
+    said = lathe(*options, code=2)
+    assert re.search(r"readings of 2 gauges; allowed: --topic with one of /gauge/reading, /second/gauge/reading", said)
+    assert "--topic /tool: not in" in lathe(*options, "--topic", "/tool", code=2)
+    found, angle = [], even(512)
+    for topic in ("/gauge/reading", "/second/gauge/reading"):
+        lathe(*options, "--guard", 0, "--last", 3, "--topic", topic)
+        change = read_profile(tmp_path / "f.csv").deviation(angle, 0.0) - desired(angle)
+        found.append(np.mean(change * np.exp(-1j * angle)))
+    assert np.angle(found[1] / found[0]) == pytest.approx(0.5, abs=0.2)  # the cell settles
+
+
 def test_a_roundness_record_leaves_size_and_centre_and_a_reversed_one_is_turned(tmp_path):
     angle = even(720)
     lobe = desired(angle) + 30e-6 + 10e-6 * np.cos(angle) - 2e-6 * np.sin(5 * angle + 0.3)
@@ -328,6 +358,24 @@ def test_a_roundness_record_leaves_size_and_centre_and_a_reversed_one_is_turned(
     assert found["harmonics"][5]["change"] == pytest.approx(2.0, rel=0.01)
     told = read_profile(tmp_path / "f.csv")
     assert_allclose(told.deviation(angle, 0.0), desired(angle) + 2e-6 * np.sin(5 * angle + 0.3), atol=0.05e-6)
+
+
+@pytest.mark.parametrize(
+    "options", [("--offset", 70), ("--offset", 60, "--search", 20), (), ("--offset", 70, "--deviation")]
+)
+@pytest.mark.parametrize("sense", [1, -1])
+def test_the_offset_is_the_angle_of_the_record_at_angle_0_of_the_part(tmp_path, options, sense):
+    """With the record's angle against that of the part, too."""
+    angle = even(720)
+    lobe = 2e-6 * np.sin(5 * angle + 0.3) + (0.0 if "--deviation" in options else desired(angle))
+    noise = 0.02e-6 * np.random.default_rng(2).standard_normal((2, 720))
+    turned = np.degrees(sense * angle + np.radians(70)) % 360
+    record = table(tmp_path / "r.csv", "angle_deg,radius_um", (np.tile(turned, 2), 1e6 * (lobe + noise).ravel()))
+    way = ("--reverse",) if sense < 0 else ()
+    found = lathe(record, "--scenario", "gauged", *options, *way, "-o", tmp_path / "f.csv", "--json")
+    assert found["records"][0]["offset_deg"] == pytest.approx(70.0, abs=0.01)
+    told = read_profile(tmp_path / "f.csv").deviation(angle, 0.0)
+    assert_allclose(told, desired(angle) - 2e-6 * np.sin(5 * angle + 0.3), atol=0.05e-6)
 
 
 @pytest.mark.parametrize(

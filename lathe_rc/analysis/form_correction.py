@@ -90,7 +90,20 @@ class Alignment:
     scale: float = np.nan
 
 
-def align(form: Sequence[Complex], record: Sequence[Complex], around: float, within: float) -> Alignment:
+def turn(amplitudes: Complex, offset: float, sense: float = 1.0) -> Complex:
+    """Turn the harmonics of a record to the part's angle.
+
+    Args:
+        amplitudes: harmonics of the record, over its angle times ``sense``, shape (n,).
+        offset: angle of the record at which the part's angle 0 lies [rad].
+        sense: 1 for a record whose angle runs with that of the part, -1 for one against it.
+    """
+    return np.asarray(amplitudes * np.exp(1j * sense * offset * np.arange(amplitudes.size)))
+
+
+def align(
+    form: Sequence[Complex], record: Sequence[Complex], around: float, within: float, sense: float = 1.0
+) -> Alignment:
     """Find the angle of a record by its cross-correlation with the form, without the mean radius.
 
     Args:
@@ -98,6 +111,7 @@ def align(form: Sequence[Complex], record: Sequence[Complex], around: float, wit
         record: harmonics of these revolutions.
         around: middle of the searched angles [rad].
         within: search to each side [rad]; 0: the offset is ``around``.
+        sense: see `turn`.
 
     Raises:
         InputError: form or record are round, or look alike at several angles of the search.
@@ -106,7 +120,7 @@ def align(form: Sequence[Complex], record: Sequence[Complex], around: float, wit
     squares = [sum(float(np.sum(np.abs(a[1:]) ** 2)) for a in both) for both in (form, record)]
     power = float(np.sqrt(np.prod(squares)))
     cross[0] = 0.0
-    order = np.arange(cross.size)
+    order = sense * np.arange(cross.size)
 
     def correlation(offset: Array) -> Array:
         return np.asarray((np.exp(1j * np.outer(offset, order)) @ cross).real)

@@ -129,7 +129,7 @@ def read_csv(path: Path, columns: Mapping[str, tuple[str, str]]) -> list[Revolut
 
 
 def _split(path: Path, values: Mapping[str, Array]) -> list[Revolution]:
-    """Split rows into revolutions: by their number, by height, or where the angle goes on or begins anew."""
+    """Split rows into revolutions: by their number, by height, or after each turn from the first row, either way."""
     angle = values["angle"]
     known = "height" in values
     heights = values.get("height", np.zeros(angle.size))
@@ -137,10 +137,10 @@ def _split(path: Path, values: Mapping[str, Array]) -> list[Revolution]:
         number = values["revolution"]
     elif np.unique(heights).size > 1:
         number = heights
-    elif angle.size and np.ptp(angle) > 1.01 * _TURN:
-        number = np.floor(angle / _TURN + 1e-9)
     else:
-        number = np.cumsum(np.append(0, np.diff(angle) < -_WHOLE * _TURN))
+        goes_on = angle.size and np.ptp(angle) > 1.01 * _TURN
+        turned = (angle if goes_on else np.unwrap(angle)) - angle[:1]
+        number = np.floor(np.abs(turned) / _TURN + 1e-9)
     found = []
     for each in dict.fromkeys(number.tolist()):
         rows = number == each

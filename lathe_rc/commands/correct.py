@@ -25,6 +25,7 @@ _TURN = 2.0 * np.pi
 _POINTS = 1024  # angles of the file
 _ROWS, _LEFT = 8, 2  # corrected and other harmonics in the table
 _BAG_REVOLUTIONS = 10  # of a bag, the last ones
+_LATE = 1e-3  # [rev] after the begin of a complete revolution at most comes the first reading of all
 _LEAST_CORRELATION = 0.5  # of a record with the form
 _LARGEST_SCALE = 3.0  # of the form in a record, and its inverse: others are in another unit
 _LARGEST_MEAN = 1e-3  # [m] of a record: larger ones are radii
@@ -72,7 +73,8 @@ def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
         raise InputError(f"{path}: readings of {len(topics)} gauges; allowed: --topic with one of {', '.join(topics)}")
     reading, angle = recording.dense[topics[0]], recording.of_type(messages.ENCODER)["angle"]
     there, turn = reading["effort"] > 0.0, np.floor(angle / _TURN).astype(int)
-    whole = [k for k in np.unique(turn[there]).tolist() if k < angle[-1] / _TURN - 1.0]
+    begun, end = angle[there].min(initial=np.inf) / _TURN - _LATE, angle[-1] / _TURN - 1.0
+    whole = [k for k in np.unique(turn[there]).tolist() if begun <= k < end]
     found = []
     for k in whole[-last:]:
         rows = there & (turn == k)
