@@ -378,6 +378,7 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
         (RISE, ["--resolution", 1], "--resolution does not apply to a step response; leave it out"),
         (RISE, ["--averages", 9], "--averages does not apply to a step response; leave it out"),
         (LATE, [], "step response: times from 12.3 to 15.2 s; allowed: from 0 or before"),
+        (POINTS, ["--band", "50:60"], r"record\.csv: --band: frequency response: 0 points; allowed: 16 or more"),
         (POINTS, ["--rate", 10], "--rate does not apply to a frequency response; leave it out"),
         (POINTS, ["--averages", 9], "--averages of a response with no coherence; allowed: with a coherence alone"),
         (HEADER + EVEN, ["--band", "9:1"], "--band '9:1'; allowed: LOW:HIGH in Hz"),

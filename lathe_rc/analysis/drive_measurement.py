@@ -110,7 +110,10 @@ def data(
         return step_response(measurement, rate=rate, hold=hold)
     if "frequency" not in measurement:
         _refuse(measurement, "a record", averages=averages)
-    return ResponseData(response.within(*band) if band else response)
+    try:
+        return ResponseData(response.within(*band) if band else response)
+    except InputError as error:
+        raise InputError(f"{measurement.name}: --band: {error}") from None
 
 
 def _refuse(measurement: Measurement, kind: str, **options: object) -> None:
