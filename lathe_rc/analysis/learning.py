@@ -59,7 +59,7 @@ class DriveMargin(NamedTuple):
 
     def __str__(self) -> str:
         """Return the error and the frequency where learning is lost."""
-        return f"{self.error:.4g} at {self.waves:.4g} waves ({self.waves * self.speed / (2.0 * np.pi):.4g} Hz)"
+        return f"{self.error:.4g} at {self.waves:.3g} waves ({self.waves * self.speed / (2.0 * np.pi):.3g} Hz)"
 
 
 def drive_margin(factors: Callable[[Array, float], Complex], highest: float, speed: float) -> DriveMargin:
