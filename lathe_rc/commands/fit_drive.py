@@ -114,8 +114,8 @@ def drive(
     if isinstance(data, ResponseData):
         places["points"] = output.with_suffix(".points.csv")
     comment = f"{measured}: {_count(fit)}"
-    _write(places["parameters"], _parameter_file(fit, comment))
-    _write(places["drives"], _drives_file(fit.drives(drives, seed)))
+    files.write(places["parameters"], _parameter_file(fit, comment))
+    files.write(places["drives"], _drives_file(fit.drives(drives, seed)))
     if isinstance(data, ResponseData):
         frequency_response.write_points(places["points"], _unsmoothed(data, fit), _uncertainty(data, fit), comment)
     _draw(figure, data, fit)
@@ -129,14 +129,6 @@ def drive(
 def _count(fit: ModalFit) -> str:
     count = len(fit.drive.mode_frequency)
     return f"{count} {'mode' if count == 1 else 'modes'}"
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        with files.replacing(path) as file:
-            file.write(text.encode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def _parameter_file(fit: ModalFit, comment: str) -> str:
