@@ -28,8 +28,8 @@ GRIDS: dict[str, dict[str, list[object]]] = {
     },
     "AFC": {"highest_order": [8, 12, 16], "rate": [4.0, 8.0, 12.0, 16.0, 24.0]},
     "ADRC": {
-        "observer_bandwidth": [300.0, 700.0, 1000.0, 1500.0, 2000.0, 2500.0, 3000.0, 4000.0],
-        "control_bandwidth": [1000.0, 1500.0, 2000.0, 2500.0, 3000.0],
+        "observer_bandwidth": [1000.0, 1500.0, 1750.0, 2000.0, 2250.0, 2500.0, 3000.0],
+        "control_bandwidth": [1000.0, 1250.0, 1500.0, 1750.0, 2000.0, 2250.0, 2500.0],
     },
     "ours": {
         "learned_waves": [6.0, 7.5, 9.0, 11.0], "learning_bandwidth": [3000.0, 8000.0],

@@ -4,22 +4,23 @@
 An extended state observer of third order estimates position z0, velocity z1 and disturbance z2 of the drive model
 x'' + 2ζωn·x' + ωn²·x = ωn²·u(t - τ) + f from the measured position x, with all poles at -ωo:
 
-    z0' = z1 + 3ωo·(x - z0)
-    z1' = z2 + ωn²·(u - z0) - 2ζωn·z1 + 3ωo²·(x - z0)
-    z2' = ωo³·(x - z0)
+    z0' = z1 + l0·(x - z0)                                  l0 = 3ωo - 2ζωn
+    z1' = z2 + ωn²·(u - z0) - 2ζωn·z1 + l1·(x - z0)         l1 = 3ωo² - ωn² - 2ζωn·l0
+    z2' = l2·(x - z0)                                       l2 = ωo³
     command = u_form + ((ωc² - ωn²)·(r - z0) + 2·(ωc - ζωn)·(r' - z1) - z2)/ωn²
 
-The model is discretised exactly for a command that is linear between samples; 3ωo, 3ωo² and ωo³ times the sampling
-step correct its prediction. The position is ``feedback_delay`` samples old, so the observer uses the command u that had
-reached the drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed
-forward through the inverse of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at
--ωc.
+The model is discretised exactly for a command that is linear between samples. The gains that correct its prediction
+place the poles of the discrete observer at exp(-ωo·T), with the sampling step T; for a short step they approach T times
+l0, l1 and l2. The position is ``feedback_delay`` samples old, so the observer uses the command u that had reached the
+drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through
+the inverse of the model (`lathe_rc.cell.stages.form_law`); the feedback gives the error two poles at -ωc.
 
 Source: Wu, Chen, Design and analysis of precision active disturbance rejection control for noncircular turning
 process, IEEE Trans. Industrial Electronics 56 (2009), for the structure: observer, feedback of its states, and
 acceleration feed-forward. The model inside the observer, its command of the past, and the settings are our own.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -93,6 +94,17 @@ def sample(memory: Memory, now: Now) -> float:
     return command
 
 
+def observer_gains(transition: Array, pole: float) -> Array:
+    """Return the gains l [1, 1/s, 1/s²] that place all poles of (1 - l·c)·F at ``pole``, by Ackermann's formula.
+
+    Args:
+        transition: F of the difference equation of z0 [m], z1 [m/s] and z2 [m/s²], shape (3, 3); c·z is z0.
+        pole: triple pole of the discrete observer [1].
+    """
+    seen = np.vstack([transition[0], transition[0] @ transition, transition[0] @ transition @ transition])
+    return np.linalg.matrix_power(transition - pole * np.eye(3), 3) @ np.linalg.solve(seen, np.array([0.0, 0.0, 1.0]))
+
+
 class Adrc(FormLaw):
     """Law that feeds the form forward, observes the disturbance as a third state, and feeds the states back.
 
@@ -108,7 +120,7 @@ class Adrc(FormLaw):
     def start(self) -> Memory:
         """Return the initial state of the law, before the first sample."""
         parameters, forward = self.parameters, self.make_forward()
-        observer, control, step = parameters.observer_bandwidth, parameters.control_bandwidth, parameters.step
+        control, step = parameters.control_bandwidth, parameters.step
         square = 1.0 / forward.a2
         a = np.array([[0.0, 1.0, 0.0], [-square, -square * forward.a1, 1.0], [0.0, 0.0, 0.0]])
         delay = parameters.model_delay + parameters.feedback_delay * step
@@ -119,7 +131,7 @@ class Adrc(FormLaw):
             transition=model.transition,
             weights=model.weights,
             age=model.delay,
-            gains=step * np.array([3.0 * observer, 3.0 * observer**2, observer**3]),
+            gains=observer_gains(model.transition, math.exp(-parameters.observer_bandwidth * step)),
             stiffness=forward.a2 * control**2 - 1.0,
             damping=2.0 * forward.a2 * control - forward.a1,
             commands=np.zeros(1 << (model.delay + 3).bit_length()),

@@ -66,7 +66,7 @@ LAWS: dict[str, cells.Values] = {
         "proportional": 1.0, "integral": 10.0, "derivative": 0.0, "derivative_bandwidth": 1600.0,
     },
     "AFC": {**_ANY, "stage": "resonant_controller", "highest_order": 12, "rate": 12.0},
-    "ADRC": {**_ANY, "stage": "adrc", "observer_bandwidth": 1000.0, "control_bandwidth": 2000.0},
+    "ADRC": {**_ANY, "stage": "adrc", "observer_bandwidth": 2000.0, "control_bandwidth": 1750.0},
     "ours": {
         **_ANY, "stage": "disturbance_controller", "identification_bandwidth": 3000.0,
         "learned_waves": 7.5, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from lathe_papers import cells, oval3000
 from lathe_papers.adrc import Adrc
 from lathe_papers.judge import Judge, Judged
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
 from lathe_rc.commands.study import read
 from lathe_rc.errors import InputError
@@ -119,17 +120,35 @@ STEADY = {
 def test_adrc_removes_a_constant_force_and_a_part_of_the_keyways():
     """With its model exact ADRC leaves nothing of the form or of a constant force, and something of each keyway."""
     base = cells.load("oval3000", spindle_encoder={"revolutions": 15.0})
+    forward = {"stage": "compound_controller", "proportional": 0.0, "integral": 0.0, "derivative": 0.0}
 
     def error(law, **changes):
-        cell = oval3000.entered(base, {**oval3000.LAWS["ADRC"], **law}).varied({**QUIET, **changes})
+        cell = oval3000.entered(base, {**oval3000._ANY, **law}).varied({**QUIET, **changes})
         (judged,) = cells.kept([cell], Judge, untracked)
         return judged.largest[6:14].max()
 
-    slow = {"observer_bandwidth": 1e-3}
-    assert error(slow, **STEADY, **{"loaded_drive.radial_ratio": 0.0}) < 0.01
-    assert error({}, **STEADY) < 0.01
-    assert error(slow, **STEADY) > 10.0
-    assert 1.0 < error({}) < 0.5 * error(slow)
+    adrc = oval3000.LAWS["ADRC"]
+    assert error(adrc, **STEADY, **{"loaded_drive.radial_ratio": 0.0}) < 0.01
+    assert error(adrc, **STEADY) < 0.01
+    assert error(forward, **STEADY) > 10.0
+    assert 1.0 < error(adrc) < 0.5 * error(forward)
+
+
+@pytest.mark.parametrize("bandwidth", [300.0, 1000.0, 4000.0])
+def test_poles_of_the_observer_are_at_its_bandwidth(bandwidth):
+    """The error of the discrete observer decays by exp(-ωo·T) per sample, with a triple pole."""
+    law = oval3000.entered(cells.load("oval3000"), {**oval3000.LAWS["ADRC"], "observer_bandwidth": bandwidth})
+    memory = Cell(law.nodes).stages["controller"].start()
+    decay = memory.transition - np.outer(memory.gains, memory.transition[0])
+    pole = np.exp(-bandwidth * memory.step)
+    np.testing.assert_allclose(np.poly(decay), np.poly([pole] * 3), rtol=0.0, atol=1e-12)
+    # for a short step the gains are those of the continuous observer
+    frequency, damping = 1036.7, 0.7
+    first = 3.0 * bandwidth - 2.0 * damping * frequency
+    second = 3.0 * bandwidth**2 - frequency**2 - 2.0 * damping * frequency * first
+    np.testing.assert_allclose(
+        memory.gains / memory.step, [first, second, bandwidth**3], rtol=2.0 * bandwidth * memory.step
+    )
 
 
 @pytest.mark.parametrize(
