@@ -128,7 +128,7 @@ class RobustResult:
         seeds: number of seeds.
         tolerance: tolerance of the form error [µm].
         largest, rms: form error of the last ten revolutions, outside gaps in the material [µm]; NaN for a stopped run.
-        settled: revolution from which the error stays within the tolerance; inf if it never does.
+        settled: revolution from which the error stays within the tolerance, counted from 1; inf if it never does.
         effort: RMS current of the drive [A].
         margin: margin of the loop, shape (laws, drives): 1 - sup|factor per revolution| for a learning law, minimum
             |1 + L| for a time-domain law.
@@ -170,7 +170,7 @@ class RobustResult:
             (f"Largest form error of the last 10 revolutions [µm], {worst}", worst_of(self.largest)),
             ("RMS form error [µm], told drive", self.rms[..., 0]),
             (f"RMS form error [µm], {worst}", worst_of(self.rms)),
-            (f"Revolutions until within ±{self.tolerance:g} µm, {worst}; -: not at all", worst_of(self.settled)),
+            (f"Revolution from which within ±{self.tolerance:g} µm, {worst}; -: not at all", worst_of(self.settled)),
             (f"Effort: RMS current [A], {worst}", worst_of(self.effort)),
         ):
             rows = [(name, *map(figure_of, row)) for name, row in zip(self.conditions, values, strict=True)]
