@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 
 Array = npt.NDArray[np.float64]
 
-LAST = 10  #: number of evaluated revolutions, the last ones of a run
 _TURN = 2.0 * np.pi
 
 
@@ -28,9 +28,7 @@ class Judged:
 
     def settled(self, tolerance: float) -> float:
         """Return the revolution, counted from 1, from which the error stays in tolerance [µm]; inf if it never does."""
-        out = np.flatnonzero(~(self.largest <= tolerance))  # not `>`: NaN is out of tolerance, too
-        first = int(out[-1]) + 2 if out.size else 1
-        return float(first) if first <= self.largest.size else np.inf
+        return float(judge(self.largest, tolerance).since or np.inf)
 
 
 class Judge:

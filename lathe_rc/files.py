@@ -98,19 +98,6 @@ def check_place(option: str, path: Path) -> None:
         raise InputError(f"{option} {path}: {'is a folder' if path.is_dir() else 'no such folder'}; name a file")
 
 
-def write(path: Path, text: str) -> None:
-    """Write a text file atomically (see `replacing`).
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    try:
-        with replacing(path) as file:
-            file.write(text.encode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
-
-
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Write a file atomically: yield a temporary file in the same folder, which replaces ``path`` after the block.
@@ -139,6 +126,26 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     finally:
         if beside:
             beside.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[BinaryIO]:
+    """Write a file that a user names atomically, as `replacing` does.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        with replacing(path) as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file atomically; see `written`."""
+    with written(path) as file:
+        file.write(text.encode())
 
 
 def _umask() -> int:

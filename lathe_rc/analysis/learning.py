@@ -6,7 +6,7 @@ In one cycle the loop multiplies the component of the memory at ν waves per rev
 up to the grid's Nyquist limit. Q, Z and the interpolators are modelled as implemented, not as their continuous ideals.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -62,7 +62,9 @@ class DriveMargin(NamedTuple):
         return f"{self.error:.4g} at {self.waves:.3g} waves ({self.waves * self.speed / (2.0 * np.pi):.3g} Hz)"
 
 
-def drive_margin(factors: Callable[[Array, float], Complex], highest: float, speed: float) -> DriveMargin:
+def drive_margin(
+    factors: Callable[[Array, Sequence[float]], Sequence[Complex]], highest: float, speed: float
+) -> DriveMargin:
     """Compute the smallest relative error Δ of the drive with which a factor of a cycle reaches the magnitude 1.
 
     A factor of a linear law is a quotient (F0 + βΔ)/(1 + δΔ) in the response of the drive at one frequency, for Q - γZ
@@ -73,13 +75,13 @@ def drive_margin(factors: Callable[[Array, float], Complex], highest: float, spe
     which for δ = 0 is m = (1 - |F0|)/|β|. F0, β and δ follow from the factors with three drives.
 
     Args:
-        factors: factors of a cycle at ``waves`` per revolution, with the drive scaled by a real number, shape (k, n).
+        factors: factors of a cycle at ``waves`` per revolution, shape (k, n), for each of some scales of the drive.
         highest: highest waves per revolution.
         speed: speed of the spindle [rad/s].
     """
 
     def smallest(waves: Array) -> Array:
-        given, more, less = (factors(waves, 1.0 + scale) for scale in (0.0, _SCALE, -_SCALE))
+        given, more, less = factors(waves, (1.0, 1.0 + _SCALE, 1.0 - _SCALE))
         with np.errstate(all="ignore"):
             depends = np.abs(more - less) > _ROUNDING
             delta = np.where(depends, (2.0 * given - more - less) / (_SCALE * (more - less)), 0.0)
@@ -194,8 +196,13 @@ class LearningLoop:
 
     def operator(self, waves: Array, speed: float) -> Complex:
         """Compute the factor Q - γZ of a cycle at ``waves`` per revolution, shape (n,)."""
-        q = self.q.response(2 * np.pi * waves / self.grid)
-        return np.asarray(q - self.gain * self.corrected_drive(waves, speed))
+        (operator,) = self.operators(waves, speed, (1.0,))
+        return operator
+
+    def operators(self, waves: Array, speed: float, scales: Sequence[float]) -> list[Complex]:
+        """Compute `operator` with the drive scaled by each of some numbers; Q and Z are computed once."""
+        q, z = self.q.response(2 * np.pi * waves / self.grid), self.corrected_drive(waves, speed)
+        return [np.asarray(q - self.gain * scale * z) for scale in scales]
 
     def worst(self, speed: float) -> tuple[float, float]:
         """Compute the supremum of |Q - γZ| at ``speed`` [rad/s], and the waves per revolution at which it occurs.

@@ -19,7 +19,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import DriveMargin, Response
-from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import SharedParameters, Value
 from lathe_rc.cell.scenario import TABLES, Scenario
@@ -290,8 +290,6 @@ class Design:
                 found.append(_FAILED)
                 continue
             errors, effort = outcome.kept
-            out = np.flatnonzero(errors.largest > self._tolerance)
-            settled = float(out[-1] + 2) if out.size else 1.0
-            settled = settled if settled <= errors.largest.size else np.inf
+            settled = float(judge(errors.largest, self._tolerance).since or np.inf)
             found.append(Found(float(errors.largest[-LAST:].max()), settled, effort))
         return found

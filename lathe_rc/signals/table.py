@@ -117,8 +117,5 @@ def write_table(path: Path, header: str, rows: Array, comment: str = "", *, digi
     """
     if comment:
         header = f"# {' '.join(comment.split())}\n{header}"
-    try:
-        with files.replacing(path) as file:
-            np.savetxt(file, rows, fmt=f"%.{digits}g", delimiter=",", header=header, comments="", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+    with files.written(path) as file:
+        np.savetxt(file, rows, fmt=f"%.{digits}g", delimiter=",", header=header, comments="", encoding="utf-8")

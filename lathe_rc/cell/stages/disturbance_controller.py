@@ -7,6 +7,7 @@ angle and reads it ahead, and compensates the rest with a disturbance observer. 
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from itertools import product
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -96,6 +97,14 @@ def sample(memory: Memory, now: Now) -> float:
     return command
 
 
+@lru_cache(maxsize=64)
+def _passed(learned_waves: float, points: int, waves: bytes) -> Array:
+    """Return the response of the filter S at waves per revolution given as bytes, cached: each margin asks again."""
+    taps = smoothing(learned_waves, points)
+    places = np.arange(taps.size) - taps.size // 2
+    return np.asarray(np.cos(2 * np.pi / points * np.outer(np.frombuffer(waves), places)) @ taps)
+
+
 class DisturbanceController(FormLaw):
     """Law that feeds the form forward, learns the disturbance and observes the rest.
 
@@ -168,16 +177,11 @@ class DisturbanceController(FormLaw):
             inside = error * np.exp(-p * late) / (1.0 + p / parameters.observer_bandwidth) ** 3
         if not parameters.learning_gain:
             return inside[None]
-        smooth, stages = self._smoothed(waves), 1.0 + p / parameters.learning_bandwidth
+        smooth = _passed(parameters.learned_waves, parameters.points_per_revolution, waves.tobytes())
+        stages = 1.0 + p / parameters.learning_bandwidth
         learned = parameters.learning_gain * smooth * np.exp(3.0 * p / parameters.learning_bandwidth) / stages**3
         factor = 1.0 - LEAK * (1.0 - smooth) - learned * (1.0 + error) / (1.0 + inside)
         return np.stack((inside, factor))
-
-    def _smoothed(self, waves: Array) -> Array:
-        points = self.parameters.points_per_revolution
-        taps = smoothing(self.parameters.learned_waves, points)
-        places = np.arange(taps.size) - taps.size // 2
-        return np.asarray(np.cos(2 * np.pi / points * np.outer(waves, places)) @ taps)
 
     def highest_waves(self, speed: float) -> float:
         """Return the Nyquist limit of the memory [waves per revolution]."""

@@ -3,7 +3,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -93,10 +93,17 @@ class Learner(Obedient):
         if (highest := self._highest(drive, speed)) is None:
             return None
 
-        def factors(waves: Array, scale: float) -> Complex:
-            return self._known(lambda frequency: np.asarray(scale * drive(frequency)), waves, speed)
+        def factors(waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
+            return self.scaled_factors(drive, waves, speed, scales)
 
         return drive_margin(factors, highest, speed)
+
+    def scaled_factors(self, drive: Response, waves: Array, speed: float, scales: Sequence[float]) -> Sequence[Complex]:
+        """Return the `factors` for the drive scaled by each of some numbers."""
+        return [
+            self._known(lambda frequency, scale=scale: np.asarray(scale * drive(frequency)), waves, speed)  # type: ignore[misc]
+            for scale in scales
+        ]
 
     def _highest(self, drive: Response, speed: float) -> float | None:
         if self.factors(drive, np.zeros(1), speed) is None:

@@ -137,6 +137,10 @@ class LearningController(Learner):
         """Return Q - γZ, shape (1, n)."""
         return self.loop(drive).operator(waves, speed)[None]
 
+    def scaled_factors(self, drive: Response, waves: Array, speed: float, scales: Sequence[float]) -> Sequence[Complex]:
+        """Return Q - γZ for the drive scaled by each of some numbers; Q and Z are computed once."""
+        return [operator[None] for operator in self.loop(drive).operators(waves, speed, scales)]
+
     def highest_waves(self, speed: float) -> float:
         """Return the Nyquist limit of grid and sampling [waves per revolution]."""
         return highest_waves(self.parameters.points_per_revolution, self.parameters.step, speed)
