@@ -73,7 +73,7 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "            if other.state not in established:  # an established namesake would answer in turn, without end\n"
+        "            if not established:  # an established namesake would answer in turn, without end\n"
         "                self.announce()\n",
         "            self.announce()\n",
         "two established namesakes answer each other",

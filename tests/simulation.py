@@ -246,6 +246,9 @@ class Process:
                 known = protocol.members.get(message.name)
                 if known and known.process != message.process:
                     self.look()
+                identity = f"{message.name} {message.pid}"
+                if message.name == self.design.name and message.pid and identity not in self.cell.processes:
+                    return  # of this member's previous process
                 protocol.hear_member(message, now)
             elif isinstance(message, CellState):
                 protocol.hear_cell_state(message, now)
@@ -384,11 +387,13 @@ class Process:
             self._keep()
 
     def _keep(self) -> None:
-        """Store the state; a new process resumes from the state of one window ago."""
+        """Store the state; a new process resumes from a state that no reader has passed."""
+        delays = [delay for each in self.cell.designs for name, delay in each.inputs if name == self.design.name]
+        behind = self.cell.window + max(delays, default=0)
         kept = self.cell.files.setdefault(self.design.name, deque())
         queues = {name: (order.end, order.received, list(self.taken[name])) for name, order in self.orders.items()}
         kept.append((self.blocks, list(self.values), queues))
-        while len(kept) > 1 and kept[1][0] <= self.blocks - self.cell.window:
+        while len(kept) > 1 and kept[1][0] <= self.blocks - behind:
             kept.popleft()
 
     def _resume(self) -> None:
@@ -676,6 +681,14 @@ class Schedule:
     def _launch(self, design: Design) -> None:
         self.cell.start(design)
 
+    def _relaunch(self, design: Design) -> None:
+        """Start another process of a member, once the one that is shutting down has left."""
+        process = self._process(design)
+        if process and not process.protocol.active:
+            self.cell.at(self.cell.now + 0.1, partial(self._relaunch, design))
+        elif process is None:
+            self.cell.start(design)
+
     def _running(self) -> bool:
         """Return True if block 0 has been released."""
         return any(event == "block0" for _, _, event, _ in self.cell.reports)
@@ -701,9 +714,12 @@ class Schedule:
     def _slow(self, design: Design, seconds: float, other: Design) -> None:
         if process := self._process(design):
             process.cost = min(seconds, 0.02)
-            messages_per_report = (len(design.inputs) + 1) * process.protocol.progress_step
-            if self.cell.stalls == "safe" and process.cost * messages_per_report > 0.2:
-                self.cell.culprits.add(design.name)  # it reports nothing for longer than ``stall_time``
+            blocks = (len(design.inputs) + 1) * process.protocol.progress_step
+            announcements = 2 * len(self.cell.designs)  # in the safe state, on top of the blocks
+            if self.cell.stalls == "safe" and process.cost * (blocks + announcements) > 0.2:
+                # It reports nothing for longer than ``stall_time``; a slow time master reads no reports for as long.
+                slow = [design] if design.name != self.cell.master else self.cell.designs
+                self.cell.culprits |= {each.name for each in slow}
 
     def _pause(self, design: Design, seconds: float, other: Design) -> None:
         """Deactivate a node, and activate it again."""
@@ -742,7 +758,7 @@ class Schedule:
     def _bring_back(self, design: Design, seconds: float) -> None:
         """Restart a member: the harness, if the member can resume; an operator, any member before the run."""
         if design.restarts or not self._running():
-            self.cell.at(self.cell.now + min(seconds, 0.5), partial(self._launch, design))
+            self.cell.at(self.cell.now + min(seconds, 0.5), partial(self._relaunch, design))
 
     def _interrupt(self, design: Design, seconds: float, other: Design) -> None:
         """End a process by SIGTERM."""
@@ -762,7 +778,7 @@ class Schedule:
             process._step()
             if not self._running():
                 self.cell.killed[design.name] = self.cell.now
-                self.cell.at(self.cell.now + 1.2 + min(seconds, 0.5), partial(self._launch, design))
+                self.cell.at(self.cell.now + 1.2 + min(seconds, 0.5), partial(self._relaunch, design))
 
     def _clean_up(self, design: Design, seconds: float, other: Design) -> None:
         if (process := self._process(design)) and not process.protocol.takes_part and not self._running():

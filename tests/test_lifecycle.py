@@ -5,6 +5,7 @@ import contextlib
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +22,7 @@ from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.liveliness import this_host
+from lathe_rc.nodes.liveliness import has_ended, this_host
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement
@@ -174,3 +175,13 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
             watch.look()
             assert list(watch.silent) == silent
         child.kill()
+
+
+def test_an_ended_process_is_known_by_its_announcement():
+    """A late announcement of the previous process of a restarted member is none of a namesake."""
+    with subprocess.Popen(["sleep", "100"]) as process:
+        announced = Announcement("run", "/tool", "tool", host=this_host(), pid=process.pid)
+        assert not has_ended(announced)
+        process.kill()
+    assert has_ended(announced)
+    assert not has_ended(replace(announced, host="another machine"))

@@ -37,7 +37,7 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare, graph
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.liveliness import Watch, liveliness, this_host
+from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
@@ -400,6 +400,8 @@ class CellNode(LifecycleNode):
         known = self.protocol.members.get(member.name)
         if known and known.process != member.process:
             self._look()  # the previous process may have ended
+        if member.name == self.protocol.own.name and has_ended(member):
+            return  # the last announcement of this member's previous process is no namesake
         self.protocol.hear_member(member, time.monotonic())
 
     def _on_cell_state(self, message: Any) -> None:

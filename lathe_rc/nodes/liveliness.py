@@ -50,6 +50,22 @@ def liveliness() -> QoSProfile:
     )
 
 
+def has_ended(member: Announcement) -> bool:
+    """Return True if the process of an announcement is known to have ended; False for those of other machines."""
+    if member.host != this_host():
+        return False
+    try:
+        process = os.pidfd_open(member.pid)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):  # no process number
+        return False
+    try:
+        return bool(select.select([process], [], [], 0)[0])
+    finally:
+        os.close(process)
+
+
 class Watch:
     """Monitor of the liveliness of cell members in other processes.
 

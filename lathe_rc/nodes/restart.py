@@ -2,8 +2,9 @@
 """Restart of a node in mid-run: the node stores its state in a file, and a new process resumes from it.
 
 The newest blocks of a process may be lost when it dies, since DDS then repeats no message. No reader is more than one
-window behind, so the state in the file is at least one window old, and the new process sends the blocks since then
-again. The state is at most two windows old: publishers, which may be one window ahead, keep a little more than three.
+window and its feedback delay behind, so the state in the file is at least that old, and the new process sends the
+blocks since then again. The state is at most another window old: publishers, which may be one window ahead, keep a
+little more than three.
 """
 
 from collections import deque
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING
 from lathe_rc.cell import state_file
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.events import Trigger
+from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
@@ -41,21 +44,27 @@ class Restart:
                 f"{role.node.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''"
             )
         self.keep_at = 0
+        self._behind = self._window  # blocks that a reader may be behind
         # The newest states: number of blocks, state, and events scheduled since.
         self._states: deque[tuple[int, bytes, list[tuple[str, float]]]] = deque()
 
     def begin(self, *, joins: bool) -> None:
         """Begin at block 0, or resume from the state of another process."""
+        protocol, published = self._node.protocol, self._role.stage.outputs
+        assert protocol.master is not None, "it has announced all members"
+        cell = Cell(*self._node.announced(protocol.master.members))
+        delays = [port.delay for out in published for port in cell.inputs(remapped(self._node.table, out.topic))]
+        self._behind = self._window + -(-max(delays, default=0) // self._node.table.block_size)
         if joins:
             self._resume()
         self.keep()
 
     def keep(self) -> None:
-        """Keep the current state in memory, and write the state of one window ago to the file."""
+        """Keep the current state in memory, and write one that no reader has passed to the file."""
         blocks = self._role.blocks
         self.keep_at = blocks + self._window
         self._states.append((blocks, state_file.dump(self._kept()), []))
-        while len(self._states) > 1 and self._states[1][0] <= blocks - self._window:
+        while len(self._states) > 1 and self._states[1][0] <= blocks - self._behind:
             self._states.popleft()
         self._write()
 

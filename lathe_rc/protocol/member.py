@@ -254,11 +254,13 @@ class MemberProtocol:
         Raises:
             ForeignMessage: the other process is the newcomer.
         """
-        established = (MemberState.READY, MemberState.SAFE)
         if self.failure or self.done:
             return
-        if self.ready or (other.state not in established and self.own.process < other.process):
-            if other.state not in established:  # an established namesake would answer in turn, without end
+        established = other.state in (MemberState.READY, MemberState.SAFE)
+        # Both may be ready: a second time master in a cell that runs, or another process of a member that can resume.
+        stays = self.own.process < other.process if established == self.ready else self.ready
+        if stays:
+            if not established:  # an established namesake would answer in turn, without end
                 self.announce()
             why = f"this node, process {self.own.pid}, has that name"
             raise ForeignMessage("members", other.name, other.run_id, why)

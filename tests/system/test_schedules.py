@@ -7,11 +7,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
+from bags import sized
 from deliberate_faults import FAULTS
 from simulation import play
 
 pytestmark = pytest.mark.system
-SCHEDULES, PIECE = 12_000, 500
+SCHEDULES, PIECE = sized(100_000), 500
 
 
 def _broken(first: int) -> list[str]:
