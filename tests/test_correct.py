@@ -19,6 +19,7 @@ from lathe_rc.analysis import form_correction, part_record
 from lathe_rc.analysis.form_correction import align, correction, evaluate, harmonics
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measured_profile import read_csv as read_profile
 
 TURN = 2 * np.pi
@@ -157,7 +158,7 @@ def test_columns_and_units_of_any_csv_are_mapped(tmp_path, header, given, scale,
     angle = even(360)
     radius = 1e-4 * np.sin(3 * angle)
     path = table(tmp_path / "r.csv", header, (angle * scale[0], radius * scale[1]), separator, comma=separator == ";")
-    (found,) = part_record.read(path, part_record.parse_columns(given))
+    (found,) = part_record.read(path, measurement_file.parse_mapping(given))
     assert_allclose(found.angle, angle, atol=1e-8)
     assert_allclose(found.radius, radius, atol=1e-12)
 
@@ -165,7 +166,7 @@ def test_columns_and_units_of_any_csv_are_mapped(tmp_path, header, given, scale,
 def test_revolutions_are_told_apart_by_number_height_or_angle(tmp_path):
     angle = np.degrees(np.tile(even(90), 3))
     number = np.repeat([1.0, 2.0, 3.0], 90)
-    columns = part_record.parse_columns([])
+    columns = measurement_file.parse_mapping([])
     going_on = table(tmp_path / "a.csv", "angle_deg,radius_um", (angle + 360 * (number - 1), number))
     anew = table(tmp_path / "b.csv", "angle_deg,radius_um", (angle, number))
     numbered = table(tmp_path / "c.csv", "revolution,angle_deg,radius_um", (number, angle, number))
@@ -189,17 +190,14 @@ def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, s
 @pytest.mark.parametrize(
     ("text", "given", "said"),
     [
-        (
-            "phi,radius_um\n0,1\n",
-            [],
-            r"no column 'angle_deg' for the angle; allowed: --column angle=COLUMN:UNIT with one",
-        ),
-        ("phi,radius_um\n0,1\n", ["angle=phi"], r"no unit of angle in column 'phi'; allowed: --column angle=phi:UNIT"),
+        ("phi,radius_um\n0,1\n", [], r"columns 'phi', 'radius_um'; allowed: angle and radius, with units"),
+        ("phi,radius_um\n0,1\n", ["angle=phi"], r"column 'phi' has no unit; allowed for angle: deg, °, rad, rev"),
+        ("angle_deg,angle_rad,radius_um\n0,0,1\n", [], r"'angle_deg' and 'angle_rad' are both angle; allowed: one"),
         ("angle_deg,radius_um\n0,x\n", [], r"r.csv:2: 'x' is not a number"),
-        ("angle_deg,radius_um\n0\n", [], r"r.csv:2: no value in column 'radius_um'"),
+        ("angle_deg,radius_um\n0\n", [], r"r.csv:2: 1 values; allowed: 2, as in the header"),
         ("angle_deg,radius_um\n0,nan\n", [], r"r.csv:2: 'nan'; allowed: finite numbers"),
         ("angle_deg,radius_um\n0,1\n9,1\n18,1\n", [], r"no complete revolution: 3 points over 18°; allowed"),
-        ("# nothing\n", [], r"no rows; allowed: a header"),
+        ("# nothing\n", [], r"no columns of numbers; allowed: angle and radius"),
         ("angle_deg,radius_um\n", [], r"no complete revolution: 0 points over 0°; allowed"),
         ("angle_deg,radius_um\n", ["diameter=d:mm"], r"--column 'diameter=d:mm'; allowed: QUANTITY=COLUMN"),
         ("angle_deg,radius_um\n", ["angle="], r"--column 'angle='; allowed: QUANTITY=COLUMN"),
@@ -208,7 +206,7 @@ def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, s
 def test_a_record_that_cannot_be_used_is_one_line(tmp_path, text, given, said):
     path = tmp_path / "r.csv"
     path.write_text(text)
-    assert_refused(lambda: part_record.read(path, part_record.parse_columns(given)), said)
+    assert_refused(lambda: part_record.read(path, measurement_file.parse_mapping(given)), said)
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="x3pio needs Python 3.11")

@@ -15,10 +15,11 @@ from lathe_rc.analysis.form_correction import Alignment, Complex, Correction, Re
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.form import FormParameters
-from lathe_rc.commands import completers, options, tables
+from lathe_rc.commands import completers, measured, options, tables
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError
 from lathe_rc.files import check_place
+from lathe_rc.signals import measurement_file
 from lathe_rc.signals.profile import Profile
 
 _TURN = 2.0 * np.pi
@@ -115,7 +116,7 @@ def _read(
     topic: str | None,
 ) -> _Read:
     """Read the records and turn them to the part's angle; angles in degrees."""
-    mapping = part_record.parse_columns(columns)
+    mapping = measurement_file.parse_mapping(columns)
     around, within, sense = (
         np.radians(offset or 0.0),
         np.radians((0.0 if offset is not None else 180.0) if search is None else search),
@@ -124,7 +125,7 @@ def _read(
     even = _TURN * np.arange(_POINTS) / _POINTS
     found, points = _Read([], [], 0.0), []
     for path in records:
-        bag = path.is_dir() or path.suffix == ".mcap"
+        bag = measured.is_bag(path)
         revolutions = _of_bag(path, last, topic) if bag else part_record.read(path, mapping)
         points += [each.angle.size for each in revolutions]
         waves = [
@@ -264,8 +265,8 @@ def _show(summary: dict[str, Any], output: Path) -> None:
     "columns",
     multiple=True,
     metavar="QUANTITY=COLUMN[:UNIT]",
-    help="of a CSV file: angle, radius, height or revolution; repeatable; default: angle_deg, radius_um, height_mm, "
-    "revolution",
+    help="of a file of columns: angle, radius, height or revolution; repeatable; default: names with units, as "
+    "angle_deg, radius_um, height_mm, revolution",
 )
 @click.option("--deviation", is_flag=True, help="the record is the deviation from the form, as lathe measure writes it")
 @click.option("--reverse", is_flag=True, help="the record's angle runs against that of the spindle")
@@ -323,8 +324,9 @@ def correct(
 ) -> None:
     """Correct the programmed form of the next part, from RECORDs of finished parts.
 
-    A RECORD is a CSV file, an X3P file, or a bag of a cell with a gauge. Harmonics are corrected that stand out of the
-    noise, which is the scatter between the revolutions and the records (docs/metrology.md).
+    A RECORD is a file of columns (CSV, Parquet, MATLAB, TDMS, MDF), an X3P file, or a bag of a cell with a gauge.
+    Harmonics are corrected that stand out of the noise, which is the scatter between the revolutions and the records
+    (docs/metrology.md).
     """
     check_place("--output", output)
     forms = _forms(scenarios.load(scenario, overrides), node)

@@ -22,6 +22,11 @@ columns = click.option(
 )
 
 
+def is_bag(path: Path) -> bool:
+    """Return True for the path of a recording."""
+    return path.is_dir() or path.suffix in _BAGS
+
+
 def opened(path: Path, given: Sequence[str]) -> Measurement:
     """Open a file or a bag with the columns that the options name.
 
@@ -30,7 +35,7 @@ def opened(path: Path, given: Sequence[str]) -> Measurement:
         LatheError: the package that reads the format is not installed.
     """
     mapping = measurement_file.parse_mapping(given)
-    if path.is_dir() or path.suffix in _BAGS:
+    if is_bag(path):
         from lathe_rc.bag.reading import bag_columns
 
         return bag_columns.measurement(path, mapping)

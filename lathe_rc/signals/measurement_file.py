@@ -3,7 +3,8 @@
 
 All commands that read measurements use one format of columns. A column is named by its quantity, with its unit after
 it: ``time_ms``, ``time [ms]``, ``command_um``, ``response``, ``frequency_hz``. Without a unit in its name it has the
-unit that the file states for it, otherwise the SI unit. A mapping of columns gives names and units that differ.
+unit that the file states for it, otherwise the SI unit; records of parts need a unit. A mapping of columns gives names
+and units that differ.
 """
 
 import csv
@@ -25,7 +26,8 @@ from lathe_rc.signals.table import number
 
 Array = npt.NDArray[np.float64]
 
-_LENGTH = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "": 1.0, "1": 1.0}
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 25.4e-3}
+_LENGTH = {**_LENGTHS, "": 1.0, "1": 1.0}
 _RATIO = {"": 1.0, "1": 1.0, "%": 1e-2, "pct": 1e-2}
 _DECIBEL = "db"
 _TURN = 2.0 * np.pi
@@ -42,6 +44,10 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "imaginary": _RATIO,
     "coherence": _RATIO,
     "relative_uncertainty": _RATIO,
+    "angle": {"deg": _TURN / 360.0, "°": _TURN / 360.0, "rad": 1.0, "rev": _TURN},
+    "radius": _LENGTHS,
+    "height": _LENGTHS,
+    "revolution": {"": 1.0, "1": 1.0},
 }  #: factors to SI units [s, m, rad/s, 1, rad] by quantity and unit; "": no unit known
 _NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
 _LONGEST_HEADER = 2**20  # [B]
@@ -178,25 +184,23 @@ class Measurement:
         mapping: columns of quantities that are not named by them.
 
     Raises:
-        InputError: a column of the mapping does not exist, or two columns are named by the same quantity.
+        InputError: a column of the mapping does not exist.
     """
 
     def __init__(self, name: str, source: Source, mapping: Mapping[str, Mapped]) -> None:
         self.name, self._source = name, source
         self._columns: dict[str, Mapped] = {}
+        self._doubles: dict[str, list[str]] = {}  # columns that are named by the same quantity
         for quantity, (column, unit) in mapping.items():
             if column not in source.units:
                 raise InputError(f"--column {quantity}={column}: {name} has no such column; it has {self._listed()}")
             self._columns[quantity] = Mapped(column, unit)
         for quantity in UNITS.keys() - mapping.keys():
             fitting = [column for column in source.units if _is_of(quantity, column)]
-            if len(fitting) > 1:
-                raise InputError(
-                    f"{name}: {fitting[0]!r} and {fitting[1]!r} are both {quantity}; allowed: one (--column "
-                    f"{quantity}={fitting[0]})"
-                )
             if fitting:
                 self._columns[quantity] = Mapped(fitting[0], "")
+            if len(fitting) > 1:
+                self._doubles[quantity] = fitting
 
     def _listed(self) -> str:
         names = list(self._source.units)
@@ -217,8 +221,14 @@ class Measurement:
         """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
 
         Raises:
-            InputError: a column has no finite numbers, its unit is unknown, the lengths differ, or the file is damaged.
+            InputError: a column has no finite numbers, its unit is unknown, two columns are named by a quantity, the
+                lengths differ, or the file is damaged.
         """
+        for quantity in self._doubles.keys() & set(quantities):
+            one, other, *_ = self._doubles[quantity]
+            raise InputError(
+                f"{self.name}: {one!r} and {other!r} are both {quantity}; allowed: one (--column {quantity}={one})"
+            )
         columns = {quantity: self._columns[quantity] for quantity in quantities}
         with _readable(self._damaged()):
             arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
@@ -249,8 +259,9 @@ class Measurement:
         factor = _factor(quantity, unit)
         if factor is None:
             known = ", ".join(each for each in UNITS[quantity] if each)
+            has = f"the unit {shown(unit)!r}" if unit else "no unit"
             raise InputError(
-                f"{self.name}: column {column!r} has the unit {shown(unit)!r}; allowed for {quantity}: {known} (or the "
+                f"{self.name}: column {column!r} has {has}; allowed for {quantity}: {known} (or the "
                 f"SI value of 1, --column {quantity}={column}:NUMBER)"
             )
         if _plain(unit) == _DECIBEL:
@@ -376,7 +387,8 @@ class _Csv:
                 raise InputError(
                     f"{self._path}:{line}: {len(row)} values; allowed: {len(self._names)}, as in the header{decimals}"
                 )
-            rows.append([number(row[place].replace(self._decimal, "."), self._path, line) for place in places])
+            point = "," if self._delimiter != "," else "."  # also if the first row has whole numbers
+            rows.append([number(row[place].replace(point, "."), self._path, line) for place in places])
         return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
 
     def clock(self, name: str) -> Clock | None:
