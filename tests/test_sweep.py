@@ -152,6 +152,11 @@ def test_what_is_no_space_is_refused_in_a_line(piston, of, said):
         cells(piston, **of)
 
 
+def test_a_sweep_of_nothing_is_refused():
+    done = CliRunner().invoke(main, ["sweep", "piston"])
+    assert (done.exit_code, "nothing varies; allowed: --vary" in done.output) == (2, True)
+
+
 def test_cells_of_a_file(piston, tmp_path):
     (tmp_path / "cells.csv").write_text(f"{LEAD}, block_size\n1e-3,64\n2e-3,128\n")
     (tmp_path / "cells.yaml").write_text(f"- {{{LEAD}: 1e-3, block_size: 64}}\n- {LEAD}: 2e-3\n  block_size: 128\n")

@@ -101,4 +101,5 @@ def _show(shown: Demo, revolutions: float, folder: Path) -> None:
         console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
     for fact in outcome.facts(result):
         console.print(fact, highlight=False)
-    console.print(f"bag:    {place}\nfigure: {drawn}", highlight=False, soft_wrap=True)
+    ends = {"bag": place, "figure": drawn, "page": f"lathe report {place}", "view": f"lathe view {place}"}
+    console.print("\n".join(f"{name + ':':8}{end}" for name, end in ends.items()), highlight=False, soft_wrap=True)

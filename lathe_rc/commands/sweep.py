@@ -140,6 +140,8 @@ def run(
 
     check_crew(scheduler, workers)
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
+    if not (vary or draw or cells or seeds > 1):
+        raise InputError("nothing varies; allowed: --vary, --draw, --cells or --seeds (lathe run computes one cell)")
     space = space_of(vary, draw, tie, sample, seeds, cells)
     place = out or Path(f"sweep-{loaded.name}")
     with SweepWatch(place, quiet=as_json) as watch:
