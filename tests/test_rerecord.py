@@ -9,7 +9,8 @@ import pytest
 import rclpy
 from bags import JAZZY
 from cells import refusals, scenario, started
-from rclpy.qos import QoSProfile
+from rclpy.duration import Infinite
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
@@ -21,6 +22,7 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
+from lathe_rc.nodes import publisher_info
 
 LATCHED = "transient_local"
 TOPICS = {
@@ -213,9 +215,20 @@ def test_what_cannot_be_recorded_is_refused(domain, tmp_path):
 
 
 def test_a_type_that_is_not_installed_is_refused():
-    from lathe_rc.nodes import publisher_info
-
     with pytest.raises(InputError, match="message type nowhere_msgs/msg/Thing is not installed"):
         publisher_info.installed("nowhere_msgs/msg/Thing")
     store = publisher_info.installed("sensor_msgs/msg/JointState")
     assert store.hash_rihs01("sensor_msgs/msg/JointState") == JAZZY.hash_rihs01("sensor_msgs/msg/JointState")
+
+
+def test_a_recorder_tells_the_qos_of_a_publisher_that_differs_from_our_nodes():
+    from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+    ours = offered_qos(224, LATCHED)
+    for_ever = dict.fromkeys(("deadline", "lifespan", "liveliness_lease_duration"), Infinite)
+    alike, other = (
+        TopicEndpointInfo(qos_profile=QoSProfile(depth=1, durability=each, liveliness=LivelinessPolicy.AUTOMATIC, **for_ever))
+        for each in (DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE)
+    )
+    assert publisher_info.offered_or(ours, []) == publisher_info.offered_or(ours, [alike]) == ours
+    assert publisher_info.offered_or(ours, [alike, other]).durability.name == "VOLATILE"

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import signal
+from collections import Counter
 from pathlib import Path
 
 import leading
@@ -152,7 +153,21 @@ def test_state_of_the_cell_is_in_each_snapshot(recorded):
         with AnyReader([path]) as bags:
             states = [each for each in bags.messages() if each[0].topic == "/cell_state"]
             assert bags.deserialize(states[0][2], states[0][0].msgtype).state == 1  # RUNNING
+            assert [(each.depth, each.durability.name) for each in states[0][0].ext.offered_qos_profiles] == [
+                (1, "TRANSIENT_LOCAL")
+            ]
         assert states[0][1] >= START_NS + told(path)["first_sample"] * STEP_NS
+
+
+def test_an_inspector_of_mcap_finds_no_fault(recorded):
+    """Statistics name the channels that have messages, and no two metadata records have one name."""
+    for path in (recorded.bag, *recorded.snapshots):
+        with (path / f"{path.name}.mcap").open("rb") as stream:
+            found = make_reader(stream)
+            counted = Counter(message.channel_id for _, _, message in found.iter_messages())
+            assert found.get_summary().statistics.channel_message_counts == counted
+            names = [record.name for record in found.iter_metadata()]
+            assert len(set(names)) == len(names) > 1
 
 
 @settings(max_examples=20)

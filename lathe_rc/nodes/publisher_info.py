@@ -65,6 +65,14 @@ def offered(publisher: TopicEndpointInfo) -> Qos:
     )
 
 
+def offered_or(assumed: Qos, publishers: Iterable[TopicEndpointInfo]) -> Qos:
+    """Return the first offered QoS that differs from an assumed one in what DDS transmits; else the assumed one."""
+    found = (offered(publisher) for publisher in publishers)
+    return next(
+        (qos for qos in found if qos._replace(history=assumed.history, depth=assumed.depth) != assumed), assumed
+    )
+
+
 def asked(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
     """Return the strictest QoS that all publishers offer; with a full queue, reliable publishers wait."""
     reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)

@@ -20,15 +20,16 @@ from lathe_rc.bag.snapshot import Snapshot
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
-from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Output, offered_qos
+from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Durability, Output, offered_qos
 from lathe_rc.cell.block import Block
-from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.cell.host_topics import HOST_TOPICS, signal_depth
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.nodes import publisher_info
 from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.exchange import Run
@@ -39,6 +40,7 @@ _HOST_TOPICS = {
     "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
     "cell_state": (CellState, latched_qos(4)),
 }
+_OFFERED = {topic.name: topic for topic in HOST_TOPICS}
 
 
 class _Encoders(dict[tuple[str, str, str, int], Encoder]):
@@ -118,7 +120,9 @@ class RecorderRole(Role):
         self.node.create_service(Trigger, "~/snapshot", self._on_snapshot)
         for topic, (kind, qos) in _HOST_TOPICS.items():
             full = self.node.topic(topic)
-            self._open.add_topic(full, self._type_name(kind), offered_qos(qos.depth, "volatile"))
+            offered = _OFFERED[topic]
+            durability = cast("Durability", offered.durability.replace(" ", "_"))
+            self._open.add_topic(full, self._type_name(kind), offered_qos(offered.depth, durability))
             callback = self.node.guarded(partial(self._on_host, kind, full))
             self.node.create_subscription(kind, full, callback, qos, raw=True)
 
@@ -218,7 +222,9 @@ class RecorderRole(Role):
             self._open.tell(provenance.tell(Scenario(self.table.run_id or "cell", tables), host))
 
     def _subscribe(self, topic: str, msgtype: str, source: str, *, sparse: bool, in_cell: bool) -> None:
-        self._open.add_topic(topic, msgtype, offered_qos(self._depth, "transient_local"))
+        assumed = offered_qos(self._depth, "transient_local")
+        qos = publisher_info.offered_or(assumed, self.node.get_publishers_info_by_topic(topic))
+        self._open.add_topic(topic, msgtype, qos)
         if sparse:
             self._sparse[topic] = source
             period = self.node.protocol.parameter(source, "joint_state_period")

@@ -9,8 +9,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from uv import uv
 
-import installer
 import workplace
 from lathe_rc import __version__
 from lathe_rc.cell.beside import BESIDE
@@ -18,20 +18,9 @@ from lathe_rc.cell.scenario import TABLES
 
 pytestmark = pytest.mark.system
 
-UV = workplace.PYTHON.with_name("uv")
 LOCK = workplace.REQUIREMENTS / "python.lock"
 EXECUTABLES = {*TABLES.own, *BESIDE, "container", "launch_plan"}  # of `ros2 run`
 NOT_COPIED = shutil.ignore_patterns(".git", ".lathe", ".*_cache", ".hypothesis", "bags")
-
-
-def uv(*words: str | Path) -> None:
-    """Run uv with the settings that the user has made for pip."""
-    listed = subprocess.run(
-        [workplace.PYTHON, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True
-    )
-    settings = installer.uv_environment(listed.stdout, os.environ)
-    settings["UV_LINK_MODE"] = "hardlink"  # nothing here is changed, and copies of 500 MB take their time
-    subprocess.run([UV, *words], env=settings, check=True)
 
 
 @pytest.fixture(scope="module")

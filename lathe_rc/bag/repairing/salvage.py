@@ -277,7 +277,7 @@ class Salvage:
         try:
             if opcode == Opcode.METADATA:
                 metadata = parsed(Metadata, content)
-                if metadata.name == "lathe_rc":
+                if metadata.name.partition(" ")[0] == "lathe_rc":  # the further records are numbered
                     self._describe(metadata.metadata)
                 elif metadata.name != "rosbag2":  # the new bag has its own
                     self.copied(opcode, content)

@@ -272,7 +272,12 @@ class McapFile:
         )
 
     def add_metadata(self, name: str, values: Mapping[str, str], *, last: bool = False) -> None:
-        """Append strings as a metadata record; with ``last``, use the disk space reserved for completing the file."""
+        """Append strings as a metadata record; with ``last``, use the disk space reserved for completing the file.
+
+        The second and further records of a name are numbered, because some readers find a record by its name.
+        """
+        before = sum(each.name.partition(" ")[0] == name for each in self._metadata)
+        name = f"{name} {before + 1}" if before else name
         content = _encoded(records.Metadata(name=name, metadata=dict(values)))[HEAD.size :]
         self.copy_record(Opcode.METADATA, content, last=last)
 
@@ -312,7 +317,8 @@ class McapFile:
         statistics = records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
-            channel_message_counts=self.counts,
+            # Channels without a message are left out, as readers that count messages expect.
+            channel_message_counts={channel: count for channel, count in self.counts.items() if count},
             chunk_count=self._chunks,
             message_count=sum(self.counts.values()),
             metadata_count=len(self._metadata),
