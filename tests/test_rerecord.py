@@ -227,7 +227,9 @@ def test_a_recorder_tells_the_qos_of_a_publisher_that_differs_from_our_nodes():
     ours = offered_qos(224, LATCHED)
     for_ever = dict.fromkeys(("deadline", "lifespan", "liveliness_lease_duration"), Infinite)
     alike, other = (
-        TopicEndpointInfo(qos_profile=QoSProfile(depth=1, durability=each, liveliness=LivelinessPolicy.AUTOMATIC, **for_ever))
+        TopicEndpointInfo(
+            qos_profile=QoSProfile(depth=1, durability=each, liveliness=LivelinessPolicy.AUTOMATIC, **for_ever)
+        )
         for each in (DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE)
     )
     assert publisher_info.offered_or(ours, []) == publisher_info.offered_or(ours, [alike]) == ours
