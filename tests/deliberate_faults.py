@@ -73,10 +73,9 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "            if not established:  # an established namesake would answer in turn, without end\n"
-        "                self.announce()\n",
-        "            self.announce()\n",
-        "two established namesakes answer each other",
+        "self.own.process < other.process if established == self.ready else self.ready\n",
+        "self.ready\n",
+        "two established namesakes both stay",
     ),
     Fault(
         "member",

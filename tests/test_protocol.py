@@ -242,13 +242,17 @@ def test_a_second_time_master_is_a_stranger(tool):
         tool.hear_member(member("/second", stage="spindle_encoder", members=("/second", "/tool")), 0.0)
 
 
-def test_two_established_namesakes_do_not_answer_each_other_without_end(tool):
-    """On two machines both are accepted: each answered the announcement of the other by its own."""
-    tool.ready = True
-    tool.actions.clear()
+def test_one_of_two_established_namesakes_stays(tool):
+    """Both may be ready, on two machines or as two processes that resumed; the other one hears it and gives up."""
+    other = member("/tool", MemberState.READY, host="elsewhere", pid=6)
+    protocol = MemberProtocol(other, 64, masters=MASTERS)
+    tool.ready = protocol.ready = True
     with pytest.raises(ForeignMessage, match="this node, process 7, has that name"):
-        tool.hear_member(member("/tool", MemberState.READY, host="elsewhere"), 0.0)
-    assert not tool.actions
+        tool.hear_member(other, 0.0)
+    answer = next(action.member for action in tool.actions if isinstance(action, actions.Announce))
+    protocol.hear_member(replace(answer, state=MemberState.READY), 0.0)
+    assert protocol.done
+    assert "/tool: process 7 of another machine has this name already" in str(protocol.failure)
 
 
 def test_the_newcomer_of_two_namesakes_gives_up_and_names_the_other(tool):

@@ -260,8 +260,7 @@ class MemberProtocol:
         # Both may be ready: a second time master in a cell that runs, or another process of a member that can resume.
         stays = self.own.process < other.process if established == self.ready else self.ready
         if stays:
-            if not established:  # an established namesake would answer in turn, without end
-                self.announce()
+            self.announce()  # the other one hears it and gives up
             why = f"this node, process {self.own.pid}, has that name"
             raise ForeignMessage("members", other.name, other.run_id, why)
         place = f"process {other.pid}" + ("" if other.host == self.own.host else " of another machine")

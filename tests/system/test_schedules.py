@@ -20,6 +20,7 @@ def _broken(first: int) -> list[str]:
     return [f"schedule {seed}: {text}" for seed in range(first, first + PIECE) for text in play(seed)[1]]
 
 
+@pytest.mark.timeout(1500)
 def test_cells_keep_their_promises_under_many_schedules():
     with ProcessPoolExecutor() as pool:
         broken = [text for texts in pool.map(_broken, range(3000, 3000 + SCHEDULES, PIECE)) for text in texts]
