@@ -26,7 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array
+from lathe_rc.analysis.learning import Array, Complex, Response
 from lathe_rc.cell.parameters import Positive, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
@@ -116,6 +116,7 @@ class Adrc(FormLaw):
     Parameters = AdrcParameters
     parameters: AdrcParameters
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+    remedy = "a smaller observer_bandwidth or control_bandwidth"
 
     def start(self) -> Memory:
         """Return the initial state of the law, before the first sample."""
@@ -137,3 +138,17 @@ class Adrc(FormLaw):
             commands=np.zeros(1 << (model.delay + 3).bit_length()),
             state=np.zeros(3),
         )
+
+    def characteristic(self, drive: Response, frequency: Array, speed: float) -> tuple[Complex, Complex]:
+        """Return D and F of the characteristic function at frequencies [rad/s], shape (n,) each.
+
+        With the difference equation z = (1 - l·c)·(F·z/ζ + w·u) + l·x of the observer, ζ = e^{jωT}, and u = -k·z.
+        """
+        memory, back = self.start(), np.exp(-1j * frequency * self.parameters.step)
+        gains = memory.gains[:, None]
+        left = np.eye(3) - gains @ np.eye(1, 3)
+        ages = back[:, None] ** (memory.age + np.arange(3))
+        given = np.stack((ages @ (left @ memory.weights).T, np.broadcast_to(memory.gains, (back.size, 3))), axis=-1)
+        states = np.linalg.solve(np.eye(3) - (left @ memory.transition) * back[:, None, None], given)
+        fed = np.array([memory.stiffness, memory.damping, memory.forward.a2]) @ states
+        return np.asarray(1.0 + fed[:, 0]), np.asarray(drive(frequency) * fed[:, 1] * back**memory.forward.late)

@@ -20,10 +20,8 @@ from lathe_papers.judge import Array, Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.compound_controller import CompoundController
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
-from lathe_rc.cell.stages.resonant_controller import ResonantController
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
@@ -249,8 +247,9 @@ def _margin(scenario: Scenario) -> float:
     response, nominal = drive.responses()["coarse/command"], scenario.shared.nominal_speed
     margins = []
     for speed in (0.9 * nominal, nominal, 1.1 * nominal):
-        if isinstance(law, CompoundController | ResonantController):
-            margins.append(float(np.abs(1.0 + law.open_loop(response, _FREQUENCIES, speed)).min()))
+        if parts := law.characteristic(response, _FREQUENCIES, speed):
+            own, fed = parts
+            margins.append(float(np.abs(1.0 + fed / own).min()))
         elif (worst := law.worst(response, speed)) is not None:
             margins.append(1.0 - worst[0])
     return min(margins)

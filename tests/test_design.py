@@ -88,7 +88,7 @@ def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
     asked = Design(config("piston"), [{}], 0.3)
     (drive,) = asked._responses(asked.drives)
     tried = [values for alike in design.LAWS["inverse, Gaussian Q"].settings(1.9e-3, 0.36e-3) for values in alike]
-    assert max(asked._margin_of(design.LAWS["inverse, Gaussian Q"], values, drive) for values in tried[-40:]) > 0.9
+    assert max(asked._margin_of(design.LAWS["inverse, Gaussian Q"], values, [drive]) for values in tried[-40:]) > 0.9
     assert asked._settings(design.LAWS["inverse, Gaussian Q"])
 
 

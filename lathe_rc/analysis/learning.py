@@ -63,7 +63,10 @@ class DriveMargin(NamedTuple):
 
 
 def drive_margin(
-    factors: Callable[[Array, Sequence[float]], Sequence[Complex]], highest: float, speed: float
+    factors: Callable[[Array, Sequence[float]], Sequence[Complex]],
+    highest: float,
+    speed: float,
+    points: Array | None = None,
 ) -> DriveMargin:
     """Compute the smallest relative error Δ of the drive with which a factor of a cycle reaches the magnitude 1.
 
@@ -78,6 +81,7 @@ def drive_margin(
         factors: factors of a cycle at ``waves`` per revolution, shape (k, n), for each of some scales of the drive.
         highest: highest waves per revolution.
         speed: speed of the spindle [rad/s].
+        points: waves per revolution that are evaluated, those of a measurement, shape (n,), n above 0; None: all.
     """
 
     def smallest(waves: Array) -> Array:
@@ -92,11 +96,14 @@ def drive_margin(
             root = rest / (half + np.sqrt(half**2 + square * rest))
         return np.asarray(np.where(root >= 0.0, root, np.where(rest > 0.0, np.inf, 0.0)).min(axis=0))
 
-    waves = _waves_up_to(highest)
-    near = _near_peaks(waves, -smallest(waves))
-    # Once more around the least, since a resonance may be narrower than the fine grid.
-    least, apart = near[np.argmin(smallest(near))], 2.0 * waves[1] / (_FINE - 1)
-    near = np.clip(np.linspace(least - apart, least + apart, _FINE), 0.0, highest)
+    if points is None:
+        waves = _waves_up_to(highest)
+        near = _near_peaks(waves, -smallest(waves))
+        # Once more around the least, since a resonance may be narrower than the fine grid.
+        least, apart = near[np.argmin(smallest(near))], 2.0 * waves[1] / (_FINE - 1)
+        near = np.clip(np.linspace(least - apart, least + apart, _FINE), 0.0, highest)
+    else:
+        near = points
     found = smallest(near)
     worst = int(np.argmin(found))
     return DriveMargin(float(found[worst]), float(near[worst]), speed)

@@ -192,8 +192,9 @@ class Design:
             )
         self.node = learners[0].name
         learned = learners[0].learned(cell.stages.values())
-        if len(learned) != 1:
-            raise InputError(f"design of {scenario.name}: {self.node} commands {len(learned)} drives; allowed: one")
+        commanded = {drive.name for _, drive in learned}
+        if len(commanded) != 1:
+            raise InputError(f"design of {scenario.name}: {self.node} commands {len(commanded)} drives; allowed: one")
         self._drive = learned[0][1]
         self._tolerance = max(
             getattr(scenario.nodes[name], "tolerance", 0.0) for name in [*scenario.of_kind("tool"), self.node]
@@ -256,20 +257,20 @@ class Design:
 
     def _settings(self, law: Law) -> list[Values]:
         """Return the settings to run: an even choice of those with the margin, with the best lead of each."""
-        (response,) = self._responses(self.drives[:1])
+        responses = self._responses(self.drives[:1])
         known = self._nominal.nodes[self._drive.name].drive_models().values()
         delay = next((value for each in known if isinstance(value := each.get("delay"), float)), 0.0)
         kept: list[Values] = []
-        for alike in law.settings(lag(response), delay):
-            tried = [(self._margin_of(law, values, response), values) for values in alike]
+        for alike in law.settings(max(map(lag, responses)), delay):
+            tried = [(self._margin_of(law, values, responses), values) for values in alike]
             margin, best = max(tried, key=lambda pair: pair[0])
             kept += [best] if margin >= self._margin else []
         chosen = sorted({round(k) for k in np.linspace(0, len(kept) - 1, _RUNS)}) if kept else []
         return [kept[k] for k in chosen]
 
-    def _margin_of(self, law: Law, values: Values, response: Response) -> float:
+    def _margin_of(self, law: Law, values: Values, responses: Collection[Response]) -> float:
         try:
-            margin = self._loop(self._with(self._nominal, law, values), [response]).drive_margin()
+            margin = self._loop(self._with(self._nominal, law, values), responses).drive_margin()
         except InputError as error:  # the filter does not fit into the memory
             self.refused = self.refused or error
             return 0.0

@@ -316,9 +316,9 @@ class Cell:
 
     @property
     def drive_margins(self) -> dict[str, DriveMargin]:
-        """Return the drive margin of each learning controller that provides its factors."""
+        """Return the drive margin of each learning controller that provides its factors or characteristic function."""
         found: dict[str, DriveMargin] = {}
         for name, loops in self.loops.items():
-            margins = [loop.drive_margin() for loop in loops] if name in self.factors else []
-            found |= {name: margin} if (margin := min(filter(None, margins), default=None)) else {}
+            margins = filter(None, (loop.drive_margin() for loop in loops))
+            found |= {name: margin} if (margin := min(margins, default=None)) else {}
         return found

@@ -230,7 +230,8 @@ def compute(
         row["reason"] = str(error)
     if cell is not None and cell.factors:
         row["margin"] = 1.0 - max(cell.factors.values())
-        row["drive_margin"] = min(margin.error for margin in cell.drive_margins.values())
+    if cell is not None and (margins := cell.drive_margins):
+        row["drive_margin"] = min(margins.values()).error
     row["seconds"] = time.perf_counter() - start
     return row
 

@@ -72,6 +72,7 @@ class CompoundController(FormLaw):
     Parameters = CompoundControllerParameters
     parameters: CompoundControllerParameters
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+    remedy = "smaller gains of its PID"
 
     def start(self) -> Memory:
         """Return the initial state of the law, before the first sample."""
@@ -86,9 +87,11 @@ class CompoundController(FormLaw):
             np.zeros(3),
         )
 
-    def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
-        """Return the open-loop response at frequencies [rad/s], shape (n,)."""
-        parameters, p = self.parameters, 1j * frequency
-        derived = p * parameters.derivative / (1.0 + p / parameters.derivative_bandwidth)
-        pid = parameters.proportional + parameters.integral / p + derived
-        return np.asarray(drive(frequency) * pid * np.exp(-p * parameters.feedback_delay * parameters.step))
+    def characteristic(self, drive: Response, frequency: Array, speed: float) -> tuple[Complex, Complex]:
+        """Return D and F of the characteristic function at frequencies [rad/s], shape (n,) each."""
+        parameters, back = self.parameters, np.exp(-1j * frequency * self.parameters.step)
+        memory = self.start()
+        lag = 1.0 - memory.keep * back
+        own = (1.0 - back) / lag
+        pid = memory.proportional * own + memory.integral / lag + memory.derivative * (1.0 - memory.keep) * own**2
+        return own, np.asarray(drive(frequency) * pid * back**parameters.feedback_delay)

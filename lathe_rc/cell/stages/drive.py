@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.cell.parameters import NodeParameters, Positive, parameter
 from lathe_rc.cell.stage import Sparse, Stage
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED, Clipping, LimitedCommand
@@ -87,6 +88,10 @@ class Drive(Stage):
     @abstractmethod
     def responses(self) -> Mapping[str, Response]:
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
+
+    def measured(self) -> Mapping[str, MeasuredDrive]:
+        """Measured response of the displacement to a command, by topic before remapping; empty: none is given."""
+        return {}
 
     def limits(self) -> Mapping[str, Limits]:
         """Limits of the drive by state topic before remapping, for a drive that follows the whole profile."""

@@ -3,11 +3,14 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Ge, Le
 
+from lathe_rc import resources
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.measured_drive import MeasuredDrive, read_points
 from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.command_limits import limited
@@ -37,6 +40,29 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         [], "their parts in the motion of the position sensor; the part of the drive itself is the rest to 1", "1"
     )
     mode_edge: list[float] = parameter([], "their parts in the motion of the edge; empty: as at the sensor", "1")
+
+    response_file: str = parameter(
+        "",
+        "measured frequency response of the drive, in the formats of lathe fit drive: the checks and the drive margin "
+        "then hold for its points as well",
+        path=True,
+    )
+
+    def measured(self, node: str, model: Response, prefix: str = "") -> Mapping[str, MeasuredDrive]:
+        """Return the measured response by topic; ``prefix`` precedes the parameter in a composed table.
+
+        Args:
+            node: name of the node.
+            model: response outside of the measured range.
+            prefix: prefix of the parameters.
+
+        Raises:
+            InputError: the file cannot be used.
+        """
+        if not self.response_file:
+            return {}
+        with about(node, f"{prefix}response_file"):
+            return {"coarse/command": MeasuredDrive(*read_points(resources.find(Path(self.response_file))), model)}
 
     def modes(self, node: str, prefix: str = "") -> Modes:
         """Return the modes of a node; ``prefix`` precedes its parameters in a composed table."""
@@ -71,9 +97,11 @@ class ElectrodynamicActuator(SingleDrive):
     """Coarse electrodynamic drive in air (see `lathe_rc.plants.electrodynamic`).
 
     Attributes:
+        parameters: parameter table of the node.
         drive: machine of the drive.
     """
 
+    parameters: ElectrodynamicActuatorParameters
     kind = "electrodynamic_actuator"
     Parameters = ElectrodynamicActuatorParameters
     step = staticmethod(step)
@@ -93,3 +121,7 @@ class ElectrodynamicActuator(SingleDrive):
     def responses(self) -> Mapping[str, Response]:
         """Response of the sensor's position to the command, by topic."""
         return {"coarse/command": self.drive.plant.response}
+
+    def measured(self) -> Mapping[str, MeasuredDrive]:
+        """Measured response of the sensor's position to the command, by topic."""
+        return self.parameters.measured(self.name, self.drive.plant.response)

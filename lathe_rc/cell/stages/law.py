@@ -215,6 +215,20 @@ class Law(Sampled, Learner):
         """
         return None
 
+    def characteristic(self, drive: Response, frequency: Array, speed: float) -> tuple[Complex, Complex] | None:
+        """Return D and F of the loop's characteristic function D + F, for a law that acts without a cycle.
+
+        The open-loop response is L = F/D; F is proportional to ``drive``, and neither has unstable poles or a pole at
+        one of the frequencies: an integral k/p of the error gives D = p/(p + k) and F = drive·k/(p + k). The check
+        before a start requires a stable loop, and the drive margin is min |D + F|/|F|.
+
+        Args:
+            drive: response of the drive's position to its command at frequencies [rad/s].
+            frequency: frequencies above 0 up to the Nyquist frequency [rad/s], shape (n,).
+            speed: speed of the spindle [rad/s].
+        """
+        return None
+
     def highest_waves(self, speed: float) -> float:
         """Return the highest waves per revolution checked by `contraction`, at ``speed`` [rad/s]: the Nyquist limit."""
         return float(np.pi / (self.parameters.step * speed))

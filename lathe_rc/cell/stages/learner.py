@@ -10,7 +10,9 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le
 
+from lathe_rc.analysis.feedback import feedback_margin
 from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response, drive_margin, supremum
+from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.cell.parameters import (
     NonNegative,
     ObedientParameters,
@@ -78,6 +80,19 @@ class Learner(Obedient):
             Factors of shape (k, n); None if the controller does not provide them.
         """
 
+    def characteristic(self, drive: Response, frequency: Array, speed: float) -> tuple[Complex, Complex] | None:
+        """Return D and F of the characteristic function of a feedback loop; see `lathe_rc.analysis.feedback`.
+
+        Args:
+            drive: response of the drive's position to its command.
+            frequency: frequencies up to the Nyquist frequency [rad/s], shape (n,).
+            speed: speed of the spindle [rad/s].
+
+        Returns:
+            Both of shape (n,); None if the controller provides `factors` instead, or nothing.
+        """
+        return None
+
     @abstractmethod
     def highest_waves(self, speed: float) -> float:
         """Return the highest waves per revolution of the factors, at ``speed`` [rad/s]."""
@@ -86,17 +101,41 @@ class Learner(Obedient):
         """Return the largest magnitude of `factors`, and the waves per revolution where it occurs."""
         if (highest := self._highest(drive, speed)) is None:
             return None
+        if isinstance(drive, MeasuredDrive):
+            waves = drive.waves(highest, speed)
+            size = np.abs(self._known(drive, waves, speed)).max(axis=0)
+            worst = int(np.argmax(np.where(np.isnan(size), np.inf, size)))
+            return float(size[worst]), float(waves[worst])
         return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest)
 
     def drive_margin(self, drive: Response, speed: float) -> DriveMargin | None:
-        """Return the smallest error of the drive's response with which learning diverges; None if unknown."""
+        """Return the smallest error of the drive's response with which the loop diverges; None if unknown.
+
+        Of a measured drive, the measured points count.
+        """
+        measured = drive if isinstance(drive, MeasuredDrive) else None
         if (highest := self._highest(drive, speed)) is None:
-            return None
+            return self._feedback_margin(drive, speed, measured)
 
         def factors(waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
             return self.scaled_factors(drive, waves, speed, scales)
 
-        return drive_margin(factors, highest, speed)
+        return drive_margin(factors, highest, speed, measured.waves(highest, speed) if measured else None)
+
+    def _feedback_margin(self, drive: Response, speed: float, measured: MeasuredDrive | None) -> DriveMargin | None:
+        step, points = self.shared.step, np.zeros(0)
+
+        def characteristic(frequency: Array) -> tuple[Complex, Complex]:
+            found = self.characteristic(drive, frequency, speed)
+            assert found is not None, "as before"
+            return found
+
+        with code_of_others(f"{self.name}: characteristic"):
+            if self.characteristic(drive, points, speed) is None:
+                return None
+            if measured:
+                points = measured.waves(np.pi / (step * speed), speed) * speed
+            return feedback_margin(characteristic, speed, step, points)
 
     def scaled_factors(self, drive: Response, waves: Array, speed: float, scales: Sequence[float]) -> Sequence[Complex]:
         """Return the `factors` for the drive scaled by each of some numbers."""
@@ -172,13 +211,14 @@ class Learner(Obedient):
         cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
-        """Return the commanded drives and their responses."""
+        """Return the commanded drives and their responses, of a drive that is measured both the model and this."""
         commands = {remapped(self.shared, output.topic) for output in self.outputs}
         return [
             (response, drive)
             for drive in stages
             if isinstance(drive, Drive)
-            for topic, response in drive.responses().items()
+            for responses in (drive.responses(), drive.measured())
+            for topic, response in responses.items()
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
 
@@ -212,11 +252,12 @@ class Learner(Obedient):
         cell.loops.setdefault(self.name, []).append(loop)
         for response, drive in learned:
             self._check_reach(drive)
+            name = f"{drive.name} as measured" if isinstance(response, MeasuredDrive) else drive.name
             told = [(worst, speed) for speed in dict.fromkeys(speeds) if (worst := self.worst(response, speed))]
             if broken := next(((worst, speed) for worst, speed in told if math.isnan(worst[0])), None):
                 (_, waves), speed = broken
                 raise InputError(
-                    f"{self.name}: {self.factor} with {drive.name} is not a number at {waves:.4g} waves and "
+                    f"{self.name}: {self.factor} with {name} is not a number at {waves:.4g} waves and "
                     f"{speed:.4g} rad/s; allowed: finite numbers; see contraction of the law and response of the drive"
                 )
             if told:
@@ -226,8 +267,15 @@ class Learner(Obedient):
                     where = f"{waves * speed:.5g} rad/s ({waves:.4g} waves at {speed:.4g} rad/s)"
                     remedy = " or ".join(loop.cures() if cures else []) or self.remedy
                     raise InputError(
-                        f"{self.name}: learning diverges with {drive.name}: {self.factor} = {largest:.4g} at {where} "
+                        f"{self.name}: learning diverges with {name}: {self.factor} = {largest:.4g} at {where} "
                         f"with {self.settings()}; allowed: below 1 ({remedy}; or set allow_unstable)"
+                    )
+            elif margins := [found for speed in speeds if (found := self.drive_margin(response, speed))]:
+                least = min(margins)
+                if least.error == 0.0 and not self.parameters.allow_unstable:
+                    raise InputError(
+                        f"{self.name}: the loop with {name} is unstable at {least.speed:.4g} rad/s; allowed: a stable "
+                        f"one ({self.remedy}; or set allow_unstable)"
                     )
             else:
                 untold.append(f"{self.name}: {self.kind} tells no factor of a cycle: nobody knows if it converges")

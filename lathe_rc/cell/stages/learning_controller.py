@@ -12,6 +12,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Array, Complex, LearningLoop, Response, highest_waves
+from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
 from lathe_rc.cell.stages.learner import Learner
@@ -147,6 +148,10 @@ class LearningController(Learner):
 
     def worst(self, drive: Response, speed: float) -> tuple[float, float]:
         """Return sup|Q - γZ|, and the waves per revolution where it occurs."""
+        if isinstance(drive, MeasuredDrive):
+            found = super().worst(drive, speed)
+            assert found is not None, "it provides its factors"
+            return found
         return self.loop(drive).worst(speed)  # cached for equal loops
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:

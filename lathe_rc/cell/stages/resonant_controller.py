@@ -85,6 +85,7 @@ class ResonantController(FormLaw):
     Parameters = ResonantControllerParameters
     parameters: ResonantControllerParameters
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
+    remedy = "a smaller rate, fewer orders, or a model nearer to the drive"
 
     def start(self) -> Memory:
         """Return the initial state of the law, before the first sample."""
@@ -96,16 +97,20 @@ class ResonantController(FormLaw):
             np.zeros((2, parameters.highest_order + 1)),
         )
 
-    def open_loop(self, drive: Response, frequency: Array, speed: float) -> Complex:
-        """Return the open-loop response at frequencies [rad/s] and a constant ``speed`` [rad/s], shape (n,)."""
-        parameters, p = self.parameters, 1j * frequency
+    def characteristic(self, drive: Response, frequency: Array, speed: float) -> tuple[Complex, Complex]:
+        """Return D and F of the characteristic function at a constant ``speed`` [rad/s], shape (n,) each."""
+        parameters, back = self.parameters, np.exp(-1j * frequency * self.parameters.step)
         late = parameters.feedback_delay * parameters.step
         a1, a2 = parameters.inverse
-        sum_of_orders = parameters.rate / p
+        turn = speed * parameters.step
+        # With t = k·turn, the sum of Re C·e^{jtn}/zⁿ over n is (Re C - Re(C·e^{-jt})/z)/(1 - 2·cos(t)/z + 1/z²).
+        own, orders = (1.0 - back) / (1.0 - np.exp(-turn) * back), 1.0 / (1.0 - back)
         for k in range(1, parameters.highest_order + 1):
             order = k * speed
             inverse = (1.0 + 1j * a1 * order - a2 * order**2) * np.exp(1j * order * (parameters.model_delay + late))
-            along = p * inverse.real - order * inverse.imag
-            # cos(kΩt - θ) has the transform (p·cos θ + kΩ·sin θ)/(p² + (kΩ)²), θ = -arg 1/Wi
-            sum_of_orders = sum_of_orders + 2.0 * parameters.rate * along / (p * p + order**2)
-        return np.asarray(drive(frequency) * np.exp(-p * late) * sum_of_orders)
+            resonance = 1.0 - 2.0 * np.cos(k * turn) * back + back**2
+            resonance = np.where(resonance == 0.0, np.finfo(float).tiny, resonance)
+            own = own * resonance / (1.0 - np.exp(-k * turn) * back) ** 2
+            orders = orders + 2.0 * (inverse.real - (inverse * np.exp(-1j * k * turn)).real * back) / resonance
+        adapted = parameters.rate * parameters.step * orders * own
+        return own, np.asarray(drive(frequency) * adapted * back**parameters.feedback_delay)

@@ -10,6 +10,7 @@ from pydantic import create_model
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.command_limits import LimitedCommand, limited
@@ -115,10 +116,11 @@ class CoupledDrive(Drive):
     drive: ToolDrive
     _retraction: OwnRetraction
     _set_point: SetPoint | None = None  # of the piezo drive
+    _coarse: ElectrodynamicActuatorParameters
 
     def _equip(self, coarse: ElectrodynamicActuatorParameters, fine: PiezoActuatorParameters | None) -> None:
         """Set limits, retraction, commands and sensors from the tables of the drives."""
-        name, seed = self.name, self.shared.seed
+        name, seed, self._coarse = self.name, self.shared.seed, coarse
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke)
         self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
@@ -133,6 +135,10 @@ class CoupledDrive(Drive):
         """Responses of the motions to the commands, in air, without active limits."""
         coarse = {"coarse/command": self.drive.coarse_response}
         return {**coarse, "fine/command": self.drive.fine_response} if self._set_point else coarse
+
+    def measured(self) -> Mapping[str, MeasuredDrive]:
+        """Measured response of the carriage to its command."""
+        return self._coarse.measured(self.name, self.drive.coarse_response, "coarse_")
 
 
 class SeriesDriveStage(CoupledDrive):
