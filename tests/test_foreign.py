@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of others, in plain rclpy, take part in a cell beside ours: those of examples/, and what they may say wrong."""
+"""Nodes of others take part in a cell beside ours: those of examples/, and what they may say wrong."""
 
 import contextlib
 import math
+import os
 import re
+import shutil
 import subprocess
 import sys
+import sysconfig
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +19,7 @@ from cells import scenario
 
 pytest.importorskip("rclpy")
 
+from ament_index_python.packages import get_package_prefix, get_packages_with_prefixes
 
 from lathe_rc import harness, messages
 from lathe_rc.analysis.form_errors import form_errors
@@ -30,9 +34,9 @@ from lathe_rc.protocol import Announcement
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PROGRAMS = {
-    "learning_controller": (EXAMPLES / "controller.py",),
-    "electrodynamic_actuator": (EXAMPLES / "drive.py",),
-    "listener": (EXAMPLES / "listener.py",),
+    "learning_controller": (sys.executable, EXAMPLES / "controller.py"),
+    "electrodynamic_actuator": (sys.executable, EXAMPLES / "drive.py"),
+    "listener": (sys.executable, EXAMPLES / "listener.py"),
 }
 DELAY = 3200
 MISSING = "not checked: the parameters of electrodynamic_actuator are not known here: whether"
@@ -60,7 +64,7 @@ def cell(domain, bag, foreign, together, **nodes):
         processes = stack.enter_context(harness.Processes(Scenario("test", ours), groups, domain=domain))
         theirs = {}
         for name in foreign:
-            command = [sys.executable, *PROGRAMS[name], "--ros-args", "-p", "run_id:=test"]
+            command = [*PROGRAMS[name], "--ros-args", "-p", "run_id:=test"]
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
             theirs[name] = stack.enter_context(process)
             stack.callback(process.kill)
@@ -175,7 +179,7 @@ def test_a_command_that_is_not_finite_loses_its_reader_and_not_the_container(dom
 
     The foreign member answers that it cannot go on without the drive.
     """
-    monkeypatch.setitem(PROGRAMS, "learning_controller", ("-c", SPOILED, EXAMPLES))
+    monkeypatch.setitem(PROGRAMS, "learning_controller", (sys.executable, "-c", SPOILED, EXAMPLES))
     foreign, together = ["learning_controller"], ["electrodynamic_actuator", "tool", "recorder"]
     with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=ENDLESS) as (processes, theirs):
         nan = (
@@ -189,8 +193,80 @@ def test_a_command_that_is_not_finite_loses_its_reader_and_not_the_container(dom
     assert [line for line in wrong if not line.startswith("/coarse/command: ")] == []
 
 
-KNOWN = ElectrodynamicActuatorParameters(damping=0.5)
 DRIVE = "electrodynamic_actuator"
+#: What rclcpp needs and the wheels do not have, as repositories name it.
+RCLCPP = ("rcl_interfaces/statistics_msgs", "libstatistics_collector", "rclcpp/rclcpp")
+#: Libraries that the wheels' CMake files ask for, and that are inside the wheels under other names.
+STALE = re.compile(r";/usr/lib64/libtinyxml2\.so|lttng-ust;")
+
+
+def mended(wheels, place):
+    """The CMake files of the wheels without the paths of the machine that built them."""
+    (place / "lib").mkdir(parents=True)
+    for name in ("include", "bin"):
+        (place / name).symlink_to(wheels / name)
+    for library in (wheels / "lib").glob("*.so*"):
+        (place / "lib" / library.name).symlink_to(library)
+    for name in ("fastrtps", "tracetools"):
+        shutil.copytree(wheels / "share" / name, place / "share" / name)
+    for file in place.glob("share/*/cmake/*.cmake"):
+        file.write_text(STALE.sub("", file.read_text()))
+    return place
+
+
+@pytest.fixture(scope="module")
+def cpp_drive(tmp_path_factory):
+    """Command of the drive of examples/cpp, with the rclcpp of a sourced ROS 2 or built from RCLCPP_SOURCE."""
+    place, environ = tmp_path_factory.mktemp("cpp"), dict(os.environ)
+    environ["COLCON_HOME"] = str(place)  # the user's own defaults are for the user's own builds
+    packages, needed = [EXAMPLES.parent / "msg_defs", EXAMPLES / "cpp"], []
+    if "rclcpp" not in get_packages_with_prefixes():
+        if "RCLCPP_SOURCE" not in os.environ:
+            pytest.skip("no rclcpp: source a ROS 2 that has it, or set RCLCPP_SOURCE (CONTRIBUTING.md)")
+        packages += [Path(os.environ["RCLCPP_SOURCE"], part).resolve() for part in RCLCPP]
+        wheels = Path(get_package_prefix("rclpy"))
+        environ["CMAKE_PREFIX_PATH"] = f"{mended(wheels, place / 'mended')}:{wheels}"
+        # Libraries of the wheels need that of Python.
+        folder, version = (sysconfig.get_config_var(name) for name in ("LIBDIR", "LDVERSION"))
+        needed = [f"-DCMAKE_EXE_LINKER_FLAGS=-L{folder} -Wl,-rpath,{folder},--no-as-needed -lpython{version}"]
+    python = [f"-D{name}_EXECUTABLE={sys.executable}" for name in ("Python3", "PYTHON")]
+    build = [
+        *(sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install", "--executor", "sequential"),
+        *("--base-paths", *packages),
+        *("--cmake-args", "-GNinja", "-DBUILD_TESTING=OFF", *python, *needed),
+        *("-DCMAKE_UNITY_BUILD=ON", "-DCMAKE_UNITY_BUILD_BATCH_SIZE=8"),
+    ]
+    subprocess.run(build, cwd=place, env=environ, check=True)
+    libraries = f"LD_LIBRARY_PATH={place / 'install' / 'lib'}:{environ.get('LD_LIBRARY_PATH', '')}"
+    return "env", libraries, place / "install" / "lib" / "lathe_rc_cpp_example" / "drive"
+
+
+@pytest.mark.system
+@pytest.mark.timeout(3600)
+def test_a_drive_in_rclcpp_gives_the_digests_of_ours(domain, tmp_path, monkeypatch, cpp_drive):
+    """The drive of examples/cpp takes part for 1000 blocks, with the digests of the run offline."""
+    monkeypatch.setitem(PROGRAMS, DRIVE, cpp_drive)
+    long = {"revolutions": 17.0}
+    with cell(domain, tmp_path / "bag", [DRIVE], ["tool", "recorder"], spindle_encoder=long) as (processes, theirs):
+        assert processes.wait_for_end()["complete"]["blocks"] >= 1000
+        assert theirs[DRIVE].wait() == 0
+    ours = dict(harness.run(scenario(spindle_encoder=long)).digest)
+    del ours[f"/{DRIVE}/joint_states"]  # which it does not publish
+    assert reader.read_bag(tmp_path / "bag").digests() == ours
+
+
+@pytest.mark.system
+@pytest.mark.timeout(3600)
+def test_a_drive_in_rclcpp_says_why_it_fails(domain, tmp_path, monkeypatch, cpp_drive):
+    monkeypatch.setitem(PROGRAMS, DRIVE, cpp_drive)
+    other = {"sample_rate": 62500}
+    with cell(domain, tmp_path / "bag", [DRIVE], ["tool", "recorder"], shared=other) as (processes, theirs):
+        with pytest.raises(LatheError, match=f"{DRIVE} failed: has the difference equation for sample_rate = 64000"):
+            processes.wait_for_end()
+        assert theirs[DRIVE].wait() == 1
+
+
+KNOWN = ElectrodynamicActuatorParameters(damping=0.5)
 
 
 @pytest.mark.parametrize(
