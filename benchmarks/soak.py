@@ -40,7 +40,7 @@ _PAGE = os.sysconf("SC_PAGESIZE")
 _GROWTH = 32 * 2**20  # [B] that a process may grow after the first tenth of a run
 _STOPPED = 0.3  # [s] at most that a node is stopped
 _SOON = 0.1  # [s] within which a death or a stall should be noticed
-_AWAY = 25.0  # [s] the long stops; DDS by default forgets who is silent for 20 s
+_AWAY = 25.0  # [s] the long stops; DDS drops a participant that is silent for 10 s
 
 
 def memory(pid: int) -> int:

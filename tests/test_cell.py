@@ -3,6 +3,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,34 @@ def test_a_stopped_process_changes_no_bit(offline, tmp_path):
             os.kill(processes.pids[node], signal.SIGCONT)
         processes.wait_for_end()
     assert reader.read_bag(tmp_path / "bag").digests() == offline
+
+
+@pytest.mark.system
+def test_the_graph_forgets_who_is_killed_or_stopped_for_long_and_the_stopped_one_goes_on(
+    offline, ghost, domain, tmp_path
+):
+    """A process that the others have dropped, since it was stopped for more than 10 s, goes on without another bit."""
+
+    def wait_until_gone(name):
+        begun = time.monotonic()
+        while name in ghost.get_node_names():
+            assert time.monotonic() < begun + 20.0
+            time.sleep(0.05)
+
+    cell = harness.with_recorder(piston("spindle_encoder.speed_factor=0.2"), tmp_path / "bag", keep=True)
+    with harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes:
+        processes.wait_for("cycle")
+        os.kill(processes.pids["tool"], signal.SIGSTOP)
+        wait_until_gone("tool")
+        os.kill(processes.pids["tool"], signal.SIGCONT)
+        processes.wait_for_end()
+    assert reader.read_bag(tmp_path / "bag").digests() == offline
+    with harness.Processes(cell, [["spindle_encoder"]], domain=domain) as processes:
+        processes.wait_for("active")
+        while "spindle_encoder" not in ghost.get_node_names():
+            time.sleep(0.05)
+        os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
+        wait_until_gone("spindle_encoder")
 
 
 def signal_messages(bag: Path) -> list[tuple[str, int, bytes]]:

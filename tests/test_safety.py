@@ -28,6 +28,7 @@ from lathe_rc.cell.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.protocol import MemberState, Phase
 from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Clearance, Lookout, Monitor, below, growth, index_pulses, rate, threshold
 from lathe_rc.safety.rules import walk
@@ -35,6 +36,19 @@ from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
 
 STEP = 1.0 / 64000
 CONFIG = SCENARIOS[0].parent
+
+
+def test_constants_of_the_messages_are_those_of_the_code():
+    """A node that reads SafetyStatus.REACTION_HOLD compares with what the supervisor sends."""
+    types = messages.store().fielddefs
+    told = {
+        name: {constant: value for constant, _, value in types[f"{messages.PACKAGE}/msg/{name}"][0]}
+        for name in ("SafetyStatus", "CellState", "Member")
+    }
+    states, reactions = ({f"{kind.__name__.upper()}_{each.name}": each for each in kind} for kind in (State, Reaction))
+    assert told["SafetyStatus"] == states | reactions
+    assert told["CellState"] == Phase.__members__
+    assert told["Member"] == MemberState.__members__
 
 
 # ---- bounded motions
