@@ -15,7 +15,7 @@ STAGES = re.findall(r'^    "(\w+)": "\w+:\w+",$', (HERE / "lathe_rc/cell/stages/
 NODES = [*STAGES, "recorder"]
 PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
 STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
-ALONE = ["container", "replayer", "rerun_bridge", "topic_recorder"]
+ALONE = ["container", "machine_state", "replayer", "rerun_bridge", "topic_recorder"]
 EXECUTABLES = {
     **{name: f"lathe_rc.nodes.executables:{name}" for name in (*NODES, *ALONE)},
     "launch_plan": "lathe_rc.harness.launch_plan:main",
@@ -55,7 +55,7 @@ def shared_files() -> list[tuple[str, list[str]]]:
     """Return what goes to share/: the ament index marker, the manifest, launch files and scenarios."""
     folders = defaultdict(list, {"share/ament_index/resource_index/packages": ["resource/lathe_rc"]})
     folders["share/lathe_rc"].append("package.xml")
-    for path in sorted([*HERE.glob("launch/*.launch.py"), *HERE.glob("config/**/*.*")]):
+    for path in sorted([*HERE.glob("launch/*.launch.py"), *HERE.glob("config/**/*.*"), *HERE.glob("urdf/*.urdf")]):
         relative = path.relative_to(HERE)
         folders[f"share/lathe_rc/{relative.parent}"].append(str(relative))
     return list(folders.items())

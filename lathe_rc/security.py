@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lathe_rc import harness
-from lathe_rc.cell.beside import REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
+from lathe_rc.cell.beside import MACHINE_STATE, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -19,6 +19,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace
+from lathe_rc.view.machine_state import source as machine_source
 from lathe_rc.view.rerun_signals import is_drawn
 
 OPERATOR = "operator"  #: user of the ROS command-line tools, who may read every topic and call every service
@@ -42,6 +43,7 @@ _LIFECYCLE = (
 )
 _SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # services of some kinds of nodes
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
+_OF_THE_MACHINE = {"joint_states", "wrench"}  # topics of the node machine_state
 _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create
 
 
@@ -127,14 +129,20 @@ class _Maker:
         """Return the profile of the Rerun bridge, which reads the signals shown in a scene."""
         return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
 
+    def machine_state(self) -> Profile:
+        """Return the profile of the publisher of standard messages, which reads joints and force of the machine."""
+        heard = [topic for topic, origin in self._signals.items() if machine_source(topic, origin.type)]
+        return self._node(MACHINE_STATE, publish=_OF_THE_MACHINE, subscribe=heard, logs=False)
+
     def replayer(self) -> Profile:
         """Return the profile of the replayer, the only publisher of a recorded cell's topics."""
         topics = [*self._signals, *_RECORDED, _CLOCK]
         return self._node(REPLAYER, publish=topics, services=_SERVICES[REPLAYER], logs=False)
 
     def topic_recorder(self) -> Profile:
-        """Return the profile of the topic recorder, which reads every topic of the cell."""
-        return self._node(TOPIC_RECORDER, subscribe=self._published() - {_LOG, _PARAMETER_EVENTS}, logs=False)
+        """Return the profile of the topic recorder, which reads every topic of the cell and of its machine."""
+        topics = (self._published() | _OF_THE_MACHINE) - {_LOG, _PARAMETER_EVENTS}
+        return self._node(TOPIC_RECORDER, subscribe=topics, logs=False)
 
     def operator(self) -> Profile:
         """Return the profile for the ROS command-line tools, which generate their own node names."""
@@ -156,6 +164,7 @@ _BESIDE: Mapping[str, Callable[[_Maker], Profile]] = {
     REPLAYER: _Maker.replayer,
     RERUN_BRIDGE: _Maker.rerun_bridge,
     TOPIC_RECORDER: _Maker.topic_recorder,
+    MACHINE_STATE: _Maker.machine_state,
 }
 BESIDE = tuple(_BESIDE)  #: tools that can be given permissions in addition to the members of a cell
 

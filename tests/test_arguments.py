@@ -16,7 +16,12 @@ from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import declare, executables
 
-ALONE = ["replayer", "topic_recorder", *(["rerun_bridge"] if importlib.util.find_spec("rerun") else [])]
+ALONE = [
+    "machine_state",
+    "replayer",
+    "topic_recorder",
+    *(["rerun_bridge"] if importlib.util.find_spec("rerun") else []),
+]
 
 
 def run(monkeypatch, capsys, executable, *words):

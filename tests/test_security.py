@@ -23,7 +23,7 @@ from rclpy.node import NodeNameNonExistentError
 
 from lathe_rc import cli, harness, process_launcher, security
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.beside import REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
+from lathe_rc.cell.beside import MACHINE_STATE, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.nodes.ports import latched_qos
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -313,11 +313,12 @@ def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_p
     rerun = [RERUN_BRIDGE] if importlib.util.find_spec("rerun") else []
     options = {
         TOPIC_RECORDER: ["-p", f"bag:={tmp_path / 'any'}"],
+        MACHINE_STATE: [],
         RERUN_BRIDGE: ["-p", "output:=save", "-p", f"file:={tmp_path / 'live.rrd'}"],
     }
     words = ["--group", "learning_controller+electrodynamic_actuator", "--group", "spindle_encoder+tool"]
     words += ["--namespace", "/shop/left"]
-    for kind in [TOPIC_RECORDER, *rerun]:
+    for kind in [TOPIC_RECORDER, MACHINE_STATE, *rerun]:
         words += ["--with", kind]
     root = parsed(made("piston", *words))
     commands = list(members(scenarios.load(CONFIG / "piston.yaml", ENDLESS), root, tmp_path))

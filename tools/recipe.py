@@ -81,7 +81,7 @@ class Recipe:
         )
         self._messages_key = digest([self._packages_key], sources(ROOT / "msg_defs"))
         # lathe_rc is installed as links: only a new file that is not a module needs a new installation.
-        linked = [path for folder in ("config", "launch") for path in sources(ROOT / folder)]
+        linked = [path for folder in ("config", "launch", "urdf") for path in sources(ROOT / folder)]
         self._package_key = digest(
             [self._messages_key, *sorted(map(str, linked))],
             [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],

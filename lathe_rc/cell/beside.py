@@ -8,6 +8,7 @@ from annotated_types import Ge, Gt, Le
 from lathe_rc.cell.parameters import NonNegative, Table, parameter
 
 REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER = "replayer", "rerun_bridge", "topic_recorder"  #: kinds of node
+MACHINE_STATE = "machine_state"  #: kind of node
 REPLAYED_FILES = "lathe-replay-"  #: prefix of the temporary folder that contains the files of a replayed bag
 RERUN_RATE = 2000.0  #: points of a curve per second
 RERUN_PORT = 9090  #: port of the web page
@@ -46,6 +47,13 @@ class RerunBridgeParameters(Table):
     once: bool = parameter(default=False, doc="end when the first run is over")
 
 
+class MachineStateParameters(Table):
+    """Standard messages of a cell: `joint_states` of the machine and `wrench`, the force on its edge."""
+
+    rate: Annotated[float, Gt(0), Le(1e5)] = parameter(50.0, "messages per second of simulated time, at most", "1/s")
+    frame_prefix: str = parameter("", "in front of the frames, as that of robot_state_publisher; for several cells")
+
+
 class TopicRecorderParameters(Table):
     """Topics to be recorded in any ROS system, and the clock for them."""
 
@@ -66,4 +74,5 @@ BESIDE: dict[str, type[Table]] = {
     REPLAYER: ReplayerParameters,
     RERUN_BRIDGE: RerunBridgeParameters,
     TOPIC_RECORDER: TopicRecorderParameters,
+    MACHINE_STATE: MachineStateParameters,
 }

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands ``lathe node`` and ``lathe container``: nodes in this process, as with ``ros2 run``."""
 
+import sys
 from collections.abc import Sequence
 
 import click
 
+from lathe_rc.cell.beside import MACHINE_STATE, MachineStateParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
@@ -33,6 +35,10 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     """Run one node, as ``ros2 run lathe_rc NAME`` does; --help lists its parameters."""
     own, _, kind = name.partition(":")
     kind = kind or own
+    if name == MACHINE_STATE:
+        if not help_or_refusal(f"lathe node {name}", name, MachineStateParameters, arguments):
+            sys.exit(load(f"lathe_rc.nodes.{name}").run({}, arguments))
+        return
     if kind not in TABLES:
         raise InputError(f"no node {kind!r}; {TABLES.instead(kind)}")
     if not help_or_refusal(f"lathe node {name}", own, TABLES[kind], arguments):

@@ -49,7 +49,7 @@ def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
     names = set(zipfile.ZipFile(wheel).namelist())
     prefix = f"lathe_rc-{__version__}.data/data"
     data = f"{prefix}/share"
-    shared = {"package.xml", *files("config"), *files("launch")}
+    shared = {"package.xml", *files("config"), *files("launch"), *files("urdf")}
     expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")} | files("lathe_papers")
     expected |= {f"lathe_rc/{name}" for name in MESSAGES}
     expected |= {f"{data}/lathe_rc/{name}" for name in shared}

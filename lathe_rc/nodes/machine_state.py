@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executable: ``machine_state``, which publishes a cell as ROS's standard messages without taking part in it.
+
+Like the ``rerun_bridge``, it is no member, and its subscriptions are best effort and volatile: no node waits for it.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import islice
+from typing import NoReturn
+
+from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import uninstall_signal_handlers
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+
+from lathe_rc import messages
+from lathe_rc.cell.beside import MACHINE_STATE as KIND
+from lathe_rc.cell.beside import MachineStateParameters
+from lathe_rc.cell.wire import Decoder
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes import arguments, standalone_node
+from lathe_rc.nodes.ports import message_class
+from lathe_rc.view.machine_state import BED, EDGE, JOINTS, Force, Joints, Machine, source
+
+_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1024,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
+_BURST = 16  # messages
+_PERIOD = 0.01  # [s] between polls of messages
+_LOOK = 0.2  # [s] between polls of the graph
+
+
+class MachineState:
+    """Publisher of ``joint_states`` and ``wrench``, from the signals of a cell.
+
+    Args:
+        node: node in the namespace of the cell.
+        parameters: rate and names of frames.
+
+    Attributes:
+        joints, wrench: publishers.
+        inlets: subscription, source of `Machine` and decoder, by topic.
+        stopped: set from outside to end the work.
+    """
+
+    def __init__(self, node: Node, parameters: MachineStateParameters) -> None:
+        self._node, self._prefix = node, parameters.frame_prefix
+        self._machine = Machine(parameters.rate)
+        self.inlets: dict[str, tuple[Subscription, str, Decoder]] = {}
+        self.joints = node.create_publisher(JointState, "joint_states", 100)
+        self.wrench = node.create_publisher(WrenchStamped, "wrench", 100)
+        self.stopped = threading.Event()
+
+    def run(self) -> None:
+        """Publish until stopped.
+
+        Raises:
+            LatheError: a malformed block.
+        """
+        due = 0.0
+        while not self.stopped.is_set():
+            if (now := time.monotonic()) >= due:
+                due = now + _LOOK
+                self._look()
+            self._hear()
+            self.stopped.wait(_PERIOD)
+        if self._machine.left_out:
+            self._node.get_logger().warning(f"{self._machine.left_out} instants are left out: blocks did not arrive")
+
+    def _look(self) -> None:
+        """Subscribe to new topics of the cell."""
+        namespace = self._node.get_namespace().rstrip("/") + "/"
+        for topic, kinds in self._node.get_topic_names_and_types():
+            origin = source(topic, kinds[0]) if topic.startswith(namespace) else None
+            if origin is None or topic in self.inlets or not self._node.count_publishers(topic):
+                continue
+            inlet = self._node.create_subscription(message_class(kinds[0]), topic, _nothing, _QOS, raw=True)
+            self.inlets[topic] = inlet, origin, Decoder(kinds[0])
+            if origin != "cut":
+                self._machine.sources.add(origin)
+            self._node.get_logger().info(f"listens to {topic}")
+
+    def _hear(self) -> None:
+        """Take the received blocks in turns, a few per topic, since instants wait only briefly for late topics."""
+        busy = True
+        while busy:
+            busy = False
+            for topic, (inlet, origin, decoder) in self.inlets.items():
+                take = partial(inlet.handle.take_message, inlet.msg_type, inlet.raw)
+                for data, _ in islice(iter(take, None), _BURST):
+                    busy = True
+                    try:
+                        block = decoder.decode(data)
+                    except ValueError as error:
+                        raise LatheError(f"{topic}: {error}") from None
+                    for found in self._machine.take(origin, block):
+                        self._publish(found)
+
+    def _publish(self, found: Joints | Force) -> None:
+        stamp = messages.header(found.sample, found.step_ns).stamp
+        header = Header(frame_id=self._prefix + (BED if isinstance(found, Joints) else EDGE))
+        header.stamp.sec, header.stamp.nanosec = stamp.sec, stamp.nanosec
+        if isinstance(found, Joints):
+            positions = {"position": list(found.position), "velocity": list(found.velocity)}
+            self.joints.publish(JointState(header=header, name=list(JOINTS), **positions))
+        else:
+            self.wrench.publish(WrenchStamped(header=header, wrench=Wrench(force=Vector3(y=found.newton))))
+
+
+def _nothing(_: bytes) -> None:
+    """Unused callback of the subscriptions: blocks are taken without an executor."""
+
+
+def _work(node: Node, parameters: MachineStateParameters) -> None:
+    state = MachineState(node, parameters)
+    uninstall_signal_handlers()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: state.stopped.set())
+    state.run()
+
+
+def run(values: Mapping[str, object], args: Sequence[str]) -> int:
+    """Publish until stopped (see `standalone_node.run`)."""
+    return standalone_node.run(KIND, MachineStateParameters, _work, values, args)
+
+
+def main() -> NoReturn:
+    """Run the node, and exit."""
+    arguments.executable(KIND, MachineStateParameters, partial(run, {}))
+
+
+if __name__ == "__main__":
+    main()
