@@ -41,7 +41,8 @@ _LIFECYCLE = (
     "get_state",
     "get_transition_graph",
 )
-_SERVICES = {RECORDER: ("snapshot",), REPLAYER: ("pause", "resume", "toggle_paused")}  # services of some kinds of nodes
+_PLAYER = "burst get_rate is_paused pause play_next resume seek set_rate stop toggle_paused"
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split())}  # services of some kinds of nodes
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
 _OF_THE_MACHINE = {"joint_states", "wrench"}  # topics of the node machine_state
 _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create

@@ -2,13 +2,18 @@
 """Replay over real DDS: what was recorded comes again, in order and complete, and can be recorded again."""
 
 import functools
+import os
+import re
 import shutil
+import subprocess
+import sys
 import threading
 
 import pytest
 import rclpy
 import yaml
 from bags import JAZZY, mcap_writer
+from builtin_interfaces.msg import Time
 from cells import refusals, scenario, started
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
@@ -17,13 +22,18 @@ from rclpy.task import Future
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.errors import InputError
 from lathe_rc.nodes import replayed_qos, replayer
+
+try:
+    from rosbag2_interfaces import srv
+except ImportError:
+    srv = None
 
 COUNT = 1500
 
@@ -88,10 +98,11 @@ class Listener:
         with self.news:
             assert self.news.wait_for(what, timeout=60.0)
 
-    def call(self, service):
-        client = self.node.create_client(Trigger, service)
+    def call(self, service, **request):
+        kind = getattr(srv, "".join(part.title() for part in service.split("_")))
+        client = self.node.create_client(kind, f"/replayer/{service}")
         assert client.wait_for_service(timeout_sec=60.0)
-        future, done = client.call_async(Trigger.Request()), threading.Event()
+        future, done = client.call_async(kind.Request(**request)), threading.Event()
         future.add_done_callback(lambda _: done.set())
         assert done.wait(60.0)
         return future.result()
@@ -109,21 +120,40 @@ def listener(domain):
     rclpy.shutdown()
 
 
-def test_a_bag_of_others_can_be_paused_and_comes_whole(strange, listener):
-    with started("replay", strange, "--rate", "0.05", "--loop"):
-        listener.wait_for(lambda: len(listener.heard["/a"]) >= 3)
-        assert listener.call("/replayer/pause").message == "paused"
-        before = len(listener.heard["/a"])
-        assert listener.call("/replayer/toggle_paused").message == "playing"
-        listener.wait_for(lambda: len(listener.heard["/a"]) >= before + 3)
-    assert listener.heard["/a"] == sorted(listener.heard["/a"])
+@pytest.mark.skipif(srv is None, reason="no rosbag2_interfaces")
+def test_the_services_of_rosbag2_control_a_replay(strange, listener):
+    """Pause, steps, bursts, seek, rate, resume and stop, under other names and from the first message on."""
+    options = ["--start-paused", "--remap", "/b:=/a", "--rate", "0.01"]
+    with started("replay", strange, *options) as process:
+        assert listener.call("is_paused").paused
+        assert not listener.call("seek", time=Time(sec=6, nanosec=500_000_000)).success
+        assert listener.call("play_next").success
+        assert listener.call("burst", num_messages=3).actually_burst == 3
+        listener.wait_for(lambda: listener.heard["/a"] == [0.0, 1.0, 2.0, 3.0])
+        assert listener.call("seek", time=Time(sec=6)).success
+        assert listener.call("burst", num_messages=2).actually_burst == 2
+        listener.wait_for(lambda: listener.heard["/a"][4:] == [1000.0, 1001.0])
+        assert not listener.call("set_rate", rate=0.0).success
+        assert listener.call("set_rate", rate=0.5).success
+        assert listener.call("get_rate").rate == 0.5
+        listener.call("resume")
+        listener.wait_for(lambda: len(listener.heard["/a"]) > 20)
+        listener.call("toggle_paused")
+        assert listener.call("is_paused").paused
+        listener.call("stop")
+        assert process.wait(60.0) == 0
+    assert listener.heard["/a"][4:] == [float(n) for n in range(1000, 996 + len(listener.heard["/a"]))]
+    assert listener.heard["/b"] == []
+
+
+def test_a_reader_that_is_there_gets_the_first_message(strange, listener):
+    with started("replay", strange, "--rate", "0") as process:
+        assert process.wait(60.0) == 0
+    listener.wait_for(lambda: sum(map(len, listener.heard.values())) == COUNT)
 
 
 def test_every_message_comes_in_order_with_the_clock(strange, listener):
-    """Every message comes in order with the clock; to a late reader in the next round.
-
-    Volatile topics reach those who are there; so the first round may lack its beginning, the second may not.
-    """
+    """Every message comes in order with the clock, in each round."""
     with started("replay", strange, "--rate", "0", "--loop"):
         whole = {"/a": [float(n) for n in range(0, COUNT, 2)], "/b": [float(n) for n in range(1, COUNT, 2)]}
         listener.wait_for(lambda: all(len(heard) >= 3 * len(whole[topic]) for topic, heard in listener.heard.items()))
@@ -191,6 +221,8 @@ def test_what_cannot_be_replayed_is_refused(domain, strange, tmp_path):
         (strange, "--topics /clock", "replayer.topics: /clock is not in the bag; allowed: /a, /b"),
         (strange, "--start 2", "replayer.start = 2 s, end = 0 s: nothing to send; allowed: a start up to 1.499 s"),
         (strange, "--start 1 --end 1", "replayer.start = 1 s, end = 1 s: nothing to send"),
+        (strange, "--remap /c:=/d", "replayer.remap: '/c' is not replayed; did you mean /clock?"),
+        (strange, "--remap /a=/d", "replayer.remap: '/a=/d'; allowed: /topic:=/other"),
         (strange, "--as-cell", "the bag holds no scenario"),
         (strange, "--as-cell --loop", "a cell is replayed whole and once"),
         (strange, "--rate -1", "-1"),
@@ -213,7 +245,6 @@ def test_a_bag_of_odd_topics_is_replayed_as_far_as_it_goes(domain, tmp_path):
     cases = [
         ("", "4 messages sent"),
         ("--start 0.5 --end 5", "2 messages sent"),
-        ("--end 5", "/mixed: its publishers offered different QoS; sent reliable and volatile"),
         ("--end 5", "not sent: /json std_msgs/msg/String, 0 messages serialized as 'json', not 'cdr'"),
     ]
     fast = ["--rate", "0", "--topics", "/latched", "--topics", "/mixed"]
@@ -242,15 +273,66 @@ OFFERS = {
     "by number": ("- {durability: 1, reliability: 1, history: 1, depth: 3}", True, 3),
     "all are kept": (f"{LATCHED}, history: keep_all}}", True, 512),
     "all are kept, by number": ("- {durability: 1, history: 2, depth: 0}", True, 512),
-    "latched and volatile": (f"{LATCHED}}}\n- {{durability: volatile}}", False, None),
-    "best effort and reliable": (f"{LATCHED}}}\n{LATCHED}, reliability: best_effort}}", False, None),
+    "latched and volatile": (f"{LATCHED}}}\n- {{durability: volatile, depth: 9}}", True, 2),
+    "best effort and reliable": (f"{LATCHED}}}\n{LATCHED}, reliability: best_effort}}", True, 4),
+    "volatile": ("- {durability: volatile, depth: 9}", False, 1),
 }
 
 
 @pytest.mark.parametrize("kind", OFFERS)
-def test_publishers_differ_only_in_what_one_publisher_cannot_offer(kind):
+def test_the_offered_qos_serves_readers_of_every_publisher(kind):
     text, latched, kept = OFFERS[kind]
     recorded = metadata.qos_of_text(text)
-    assert replayed_qos.differ(recorded) is not latched
-    assert (replayed_qos.of(recorded).durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
-    assert kept is None or replayed_qos.kept(recorded) == kept
+    offered = replayed_qos.of(recorded)
+    assert offered.reliability == ReliabilityPolicy.RELIABLE
+    assert (offered.durability == DurabilityPolicy.TRANSIENT_LOCAL) is latched
+    assert replayed_qos.kept(recorded) == kept
+
+
+def test_qos_is_overridden_by_topic(tmp_path):
+    file = tmp_path / "qos.yaml"
+    file.write_text("/a: {reliability: best_effort, depth: 7}\n")
+    given = replayed_qos.overrides(file, ["/a", "/b"])["/a"]
+    offered = replayed_qos.of(metadata.qos_of_text(f"{LATCHED}}}"), given)
+    assert (offered.reliability, offered.depth) == (ReliabilityPolicy.BEST_EFFORT, 7)
+    assert offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    for text, said in {
+        "/c: {depth: 1}": "topic '/c' is not replayed; allowed: /a, /b",
+        "/a: {reliable: true}": "/a: policy 'reliable'; allowed: history, depth, reliability, durability",
+        "/a: {durability: latched}": "/a: durability 'latched'; allowed: volatile, transient_local",
+        "/a: {depth: 0}": "/a: depth '0'; allowed: a whole number from 1 on",
+        "/a": "allowed",
+        "/a: [": "allowed: a YAML file of topics with their policies",
+    }.items():
+        file.write_text(text)
+        with pytest.raises(InputError, match=re.escape(said)):
+            replayed_qos.overrides(file, ["/a", "/b"])
+
+
+def test_keys_of_a_terminal_are_told_and_its_settings_come_back():
+    master, terminal = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", KEYS], stdin=terminal, stdout=subprocess.PIPE, start_new_session=True
+    ) as process:
+        assert process.stdout.readline() == b"listening\n"
+        os.write(master, b" \x1b[Cx\x1b[A\x1b[B")
+        assert process.stdout.read() == b"space right up down\n"
+    assert process.returncode == 0
+    os.close(master)
+    os.close(terminal)
+
+
+KEYS = """
+import fcntl, termios, time
+from lathe_rc.nodes import keys
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+before = termios.tcgetattr(0)
+with keys.listening() as pressed:
+    print("listening", flush=True)
+    told = []
+    while len(told) < 4:
+        told += pressed()
+        time.sleep(0.01)
+    print(*told)
+assert termios.tcgetattr(0) == before
+"""

@@ -25,6 +25,14 @@ class ReplayerParameters(Table):
     start: NonNegative = parameter(0.0, "where to begin, counted from the bag's first message", "s")
     end: NonNegative = parameter(0.0, "where to end, counted from the bag's first message; 0: its end", "s")
     topics: list[str] = parameter([], "fully qualified; none: all but /clock")
+    remap: list[str] = parameter([], "other names of topics: /topic:=/other")
+    delay: NonNegative = parameter(0.0, "wait before the first message, in each round", "s")
+    start_paused: bool = parameter(
+        default=False, doc="wait for ~/resume, ~/play_next or a key before the first message"
+    )
+    qos_overrides: str = parameter(
+        "", "YAML file of topics with the history, depth, reliability and durability to offer", path=True
+    )
     wait: Annotated[int, Ge(0)] = parameter(0, "readers that each topic must have before the first message is sent")
     as_cell: bool = parameter(
         default=False,

@@ -5,7 +5,8 @@ import json
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import partial
 from itertools import chain
@@ -19,10 +20,11 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.limits import MOST_BEFORE, MOST_SENT
@@ -37,8 +39,9 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
-from lathe_rc.nodes import arguments, replayed_qos, standalone_node
+from lathe_rc.nodes import arguments, keys, replayed_qos, standalone_node
 from lathe_rc.nodes.ports import latched_qos, message_class
+from lathe_rc.nodes.replay_services import ReplayServices
 from lathe_rc.nodes.replayed_qos import DEPTH
 from lathe_rc.nodes.standalone_node import StandaloneNode
 
@@ -50,6 +53,7 @@ _CLOCK_END = 2**31 * 10**9  # [ns] first time beyond the range of a ROS time
 _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the system clock may be set back without harm
 _LONG = 10.0  # [s] of wall time until the next message, from which on the wait is reported
+_SETTLED = 0.5  # [s] of wall time without a new reader or node, after which the replay begins
 _LOOK = 0.05  # [s] of wall time between polls of services and signals
 
 
@@ -63,17 +67,21 @@ class _Pace:
     def __init__(self, rate: float) -> None:
         self._rate = rate
         self._origin_ns: int | None = None  # log time of the bag that is due at `_began`
-        self._began = 0.0  # monotonic [s]
+        self._began = self._delay = 0.0  # monotonic time, and wait before it [s]
 
-    def begin(self) -> None:
-        """Begin with the next message."""
-        self._origin_ns = None
+    def begin(self, delay: float = 0.0) -> None:
+        """Begin with the next message, after a delay [s]."""
+        self._origin_ns, self._delay = None, delay
 
     def due(self, log_ns: int) -> float:
         """Return the monotonic time at which a message is due [s]."""
         if self._origin_ns is None:
-            self._origin_ns, self._began = log_ns, time.monotonic()
+            self._origin_ns, self._began = log_ns, time.monotonic() + self._delay
         return self._began + (log_ns - self._origin_ns) * 1e-9 / self._rate if self._rate else self._began
+
+    def jump(self, log_ns: int) -> None:
+        """Continue from a message that is sent before it is due."""
+        self._origin_ns, self._began = log_ns, time.monotonic()
 
     def hold(self, seconds: float) -> None:
         """Postpone all messages by a pause."""
@@ -93,23 +101,45 @@ class _Pace:
         self._rate, self._began = rate, now
 
 
+@dataclass
+class _Steps:
+    """Messages that a client has asked for in a pause: those left, those sent, and the answer."""
+
+    left: int
+    sent: int = 0
+    over: Future = field(default_factory=Future)
+
+
 class Replayer:
     """Publisher of the messages of a bag, in the order of their log times.
 
     Args:
-        node: node with the services ``~/pause``, ``~/resume`` and ``~/toggle_paused``, and the topic /clock.
+        node: node with the topic /clock and the services (see `replay_services`).
         parameters: topics, speed and options of the replay.
         source: the bag.
+        pressed: function that returns the keys pressed since its last call.
+
+    Attributes:
+        paused: whether the replay waits.
+        sent: number of messages sent.
 
     Raises:
         InputError: the bag lacks a topic, or a message type is not installed on this machine.
     """
 
-    def __init__(self, node: StandaloneNode, parameters: ReplayerParameters, source: Source) -> None:
+    def __init__(
+        self,
+        node: StandaloneNode,
+        parameters: ReplayerParameters,
+        source: Source,
+        pressed: Callable[[], list[str]] = list,
+    ) -> None:
         self._node, self._parameters, self._source = node, parameters, source
-        if parameters.as_cell and (parameters.loop or parameters.start or parameters.end or parameters.topics):
+        if parameters.as_cell and any(
+            (parameters.loop, parameters.start, parameters.end, parameters.topics, parameters.remap)
+        ):
             raise InputError(
-                f"{KIND}.as_cell: a cell is replayed whole and once; leave out loop, start, end and topics"
+                f"{KIND}.as_cell: a cell is replayed whole and once; leave out loop, start, end, topics and remap"
             )
         self._topics = set(parameters.topics) or set(self._source.topics) - {_CLOCK}
         if unknown := sorted(self._topics - set(self._source.topics)):
@@ -135,24 +165,34 @@ class Replayer:
             cure = f"{KIND}.end = {_seconds(room)} s leaves them out" if room > _ns(start) else "name other topics"
             raise InputError(f"{parameters.bag}: {topic}: log time {log_ns} ns; {_CLOCK} ends in 2038; {cure}")
         self._classes = {topic: self._class(topic) for topic in sorted(self._topics)}
-        self.paused = False
+        self._names = _remapped(parameters.remap, {*self._topics, _CLOCK})
+        path = parameters.qos_overrides
+        overrides = replayed_qos.overrides(Path(path), self._topics) if path else {}
+        self._qos = {
+            topic: replayed_qos.of(self._source.topics[topic].qos, overrides.get(topic)) for topic in self._topics
+        }
+        self.paused = parameters.start_paused
         self.sent = 0
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._looked = 0.0
         self._pace, self._held_since, self._newest_ns = _Pace(parameters.rate), 0.0, self._start_ns
-        node.tunes("rate", self._change_rate)
-        for name, paused in (
-            ("pause", lambda: True),
-            ("resume", lambda: False),
-            ("toggle_paused", lambda: not self.paused),
-        ):
-            node.create_service(Trigger, f"~/{name}", self._service(paused))
+        self._sought: int | None = None  # log time at which to continue [ns]
+        self._stopped = False
+        self._steps: deque[_Steps] = deque()
+        self._pressed = pressed
+        node.tunes("rate", self._take_rate)
+        try:
+            ReplayServices(node, self)
+        except ImportError:
+            node.get_logger().info("no services: rosbag2_interfaces, their package, is not installed")
         self._members: dict[str, Node] = {}
         self._master, self._window = "", 0  # of a cell: topic whose blocks count, and blocks in flight
         self._blocks = self._recorded = 0
         # Reliable and with a queue, unlike other clocks: readers may need every time.
-        self._publishers: dict[str, Publisher] = {_CLOCK: node.create_publisher(Clock, _CLOCK, QoSProfile(depth=DEPTH))}
+        self._publishers: dict[str, Publisher] = {
+            _CLOCK: node.create_publisher(Clock, self._names.get(_CLOCK, _CLOCK), QoSProfile(depth=DEPTH))
+        }
         self._waiting: dict[str, int] = {_CLOCK: 0}  # messages of a topic that may not have been acknowledged
         self._sent_ns = self._settled_ns = 0  # wall time of the newest message, and when all were acknowledged
 
@@ -165,17 +205,51 @@ class Replayer:
                 f"{topic}: message type {kind} is not installed; install its package, or name other topics"
             ) from None
 
-    def _change_rate(self, rate: float) -> None:
+    # ---- control (implements `replay_services.Controlled`) ------------------------------------------
+
+    @property
+    def rate(self) -> float:
+        """Return the pace against the bag's time; 0: none."""
+        return float(self._node.get_parameter("rate").value)
+
+    def change_rate(self, rate: float) -> bool:
+        """Continue at another rate; return False if it is refused."""
+        (result,) = self._node.set_parameters([Parameter("rate", value=rate)])
+        return bool(result.successful)
+
+    def _take_rate(self, rate: float) -> None:
         """Continue at another rate; the pause of a paused replay goes on."""
         self._pace.change(rate, self._held_since if self.paused else time.monotonic(), self._newest_ns)
 
-    def _service(self, paused: Callable[[], bool]) -> Callable[[Any, Any], Any]:
-        def call(_request: Any, response: Any) -> Any:
-            self.paused = paused()
-            response.success, response.message = True, "paused" if self.paused else "playing"
-            return response
+    def seek(self, log_ns: int) -> bool:
+        """Continue at a time of the bag; return False if it is outside of what is replayed."""
+        if self._parameters.as_cell or not self._source.first_ns <= log_ns < self._stop_ns:
+            return False
+        self._sought = log_ns
+        return True
 
-        return call
+    def step(self, messages: int) -> Future:
+        """Send the next messages of a paused replay at once, 0: all; the result is their number."""
+        self._steps.append(_Steps(messages or 2**64))
+        return self._steps[-1].over
+
+    def _end_steps(self) -> None:
+        """Answer all who wait for messages that do not come any more."""
+        while self._steps:
+            self._steps[0].over.set_result(self._steps.popleft().sent)
+            self._look()
+
+    def stop(self) -> None:
+        """End the replay."""
+        self._stopped = True
+
+    def _press(self, key: str) -> None:
+        if key == "space":
+            self.paused = not self.paused
+        elif key == "right" and self.paused:
+            self.step(1)
+        elif key in ("up", "down"):
+            self.change_rate(self.rate * (1.1 if key == "up" else 1 / 1.1))
 
     # ---- start --------------------------------------------------------------------------------------
 
@@ -193,21 +267,28 @@ class Replayer:
         while lonely := [topic for topic in sorted(self._topics) if self._readers(topic) < self._parameters.wait]:
             self._node.get_logger().info(f"waiting for readers of {', '.join(lonely)}", throttle_duration_sec=5.0)
             self._look(_LOOK)
+        if not self._parameters.as_cell:
+            self._find_readers()
+
+    def _find_readers(self) -> None:
+        """Wait until no further reader is found: readers that are there already receive the first message."""
+        before, since = [-1], time.monotonic()
+        while time.monotonic() - since < _SETTLED:
+            found = [*map(self._readers, sorted(self._topics)), len(self._node.get_node_names())]
+            if found != before:
+                before, since = found, time.monotonic()
+            self._look(_LOOK)
 
     def _readers(self, topic: str) -> int:
         return int(self._publishers[topic].get_subscription_count())
 
     def _publish(self, node: Node, topic: str) -> None:
-        recorded = self._source.topics[topic].qos
-        if replayed_qos.differ(recorded):
-            self._node.get_logger().warning(
-                f"{topic}: its publishers offered different QoS; sent reliable and volatile"
-            )
+        name = self._names.get(topic, topic)
         try:
-            self._publishers[topic] = node.create_publisher(self._classes[topic], topic, replayed_qos.of(recorded))
+            self._publishers[topic] = node.create_publisher(self._classes[topic], name, self._qos[topic])
         except InvalidTopicNameException as error:
             reason = shown(error).removeprefix("Invalid topic name: ").rstrip(":")
-            raise InputError(f"{topic}: no name in ROS ({reason}); name others with --topics") from None
+            raise InputError(f"{name}: no name in ROS ({reason}); name others with --topics or --remap") from None
         self._waiting[topic] = 0
 
     def _join(self) -> None:
@@ -268,6 +349,8 @@ class Replayer:
 
     def _look(self, wait: float = 0.0) -> None:
         """Process pending messages and service requests."""
+        for key in self._pressed():
+            self._press(key)
         self._executor.spin_once(timeout_sec=wait)
         self._looked = time.monotonic()
 
@@ -280,8 +363,9 @@ class Replayer:
         self.open()
         while True:
             self._once()
-            if not self._parameters.loop:
+            if not self._parameters.loop or self._stopped:
                 break
+        self._end_steps()
         for topic in self._publishers:
             self._acknowledged(topic)
         if self._parameters.as_cell:
@@ -293,38 +377,49 @@ class Replayer:
         self._send(_STATE, self._ended)
         self._acknowledged(_STATE)
 
-    def _chosen(self) -> Iterator[Message]:
-        if self._start_ns > self._source.first_ns:
-            yield from self._latched()
-        yield from self._source.messages(self._topics, start_ns=self._start_ns, stop_ns=self._stop_ns)
+    def _chosen(self, start_ns: int) -> Iterator[Message]:
+        if start_ns > self._source.first_ns:
+            yield from self._latched(start_ns)
+        yield from self._source.messages(self._topics, start_ns=start_ns, stop_ns=self._stop_ns)
 
-    def _latched(self) -> Iterator[Message]:
+    def _latched(self, start_ns: int) -> Iterator[Message]:
         """Yield the latched messages from before the start, up to the publishers' depth, as for a late reader."""
         kept: dict[str, deque[Message]] = {}
         for topic in sorted(self._topics):
-            recorded = self._source.topics[topic].qos
-            if replayed_qos.of(recorded).durability == DurabilityPolicy.TRANSIENT_LOCAL:
-                kept[topic] = deque(maxlen=replayed_qos.kept(recorded))
+            if self._qos[topic].durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                kept[topic] = deque(maxlen=replayed_qos.kept(self._source.topics[topic].qos))
         size = 0
-        for message in self._source.messages(set(kept), stop_ns=self._start_ns):
+        for message in self._source.messages(set(kept), stop_ns=start_ns):
             messages = kept[message[0]]
             size += len(message[2]) - (len(messages[0][2]) if len(messages) == messages.maxlen else 0)
             if size > MOST_BEFORE:
                 raise InputError(f"latched messages from before the start take more than {MOST_BEFORE} B; begin at 0")
             messages.append(message)
         for topic, _, data in sorted(chain.from_iterable(kept.values()), key=itemgetter(1)):
-            yield topic, self._start_ns, data
+            yield topic, start_ns, data
 
     def _once(self) -> None:
+        """Publish the messages from the start, or from where a client seeks, to the end."""
+        start_ns = self._start_ns
+        self._pace.begin(self._parameters.delay)
+        while True:
+            if self._sought is not None:
+                start_ns, self._sought = self._sought, None
+                self._pace.begin()
+            self._from(start_ns)
+            if self._sought is None:
+                return
+
+    def _from(self, start_ns: int) -> None:
         told: int | None = None
-        self._pace.begin()
-        for topic, log_ns, data in self._chosen():
-            if (wait := self._pace.due(log_ns) - time.monotonic()) > _LONG:
+        for topic, log_ns, data in self._chosen(start_ns):
+            if (wait := self._pace.due(log_ns) - time.monotonic()) > _LONG + self._parameters.delay:
                 offset = _seconds(log_ns - self._source.first_ns)
                 self._node.get_logger().warning(
                     f"{topic}: the next message comes in {_span(wait)}; start = {offset} begins with it"
                 )
-            self._wait_for(log_ns)
+            if not self._wait_for(log_ns):
+                return
             self._newest_ns = log_ns
             if log_ns != told:
                 told = log_ns
@@ -354,19 +449,26 @@ class Replayer:
         if self._waiting[topic] >= DEPTH // 2:
             self._acknowledged(topic)
 
-    def _wait_for(self, log_ns: int) -> None:
-        """Wait until a message is due, longer while paused; pauses and rates may change meanwhile."""
-        while True:
+    def _wait_for(self, log_ns: int) -> bool:
+        """Wait until a message is due, longer while paused; return False if another is wanted instead, or none."""
+        while self._sought is None and not self._stopped:
             self._held_since = now = time.monotonic()
-            if self.paused:
+            if self._steps and not self._steps[0].left:
+                self._steps[0].over.set_result(self._steps.popleft().sent)
+            elif self._steps and now - self._looked <= _LOOK:
+                self._steps[0].left, self._steps[0].sent = self._steps[0].left - 1, self._steps[0].sent + 1
+                self._pace.jump(log_ns)
+                return True
+            elif self.paused and not self._steps:
                 self._look(_LOOK)
                 self._pace.hold(time.monotonic() - now)
-            elif (wait := self._pace.due(log_ns) - now) > 0.0:
+            elif (wait := self._pace.due(log_ns) - now) > 0.0 and not self._steps:
                 self._look(min(wait, _LOOK))
             elif now - self._looked > _LOOK:
                 self._look()
             else:
-                return
+                return True
+        return False
 
     def _hold(self) -> None:
         """Limit the blocks in flight to the recorder's queue; acknowledged by DDS does not mean read."""
@@ -392,6 +494,19 @@ class Replayer:
         self._waiting[topic] = 0
 
 
+def _remapped(rules: Sequence[str], known: Collection[str]) -> dict[str, str]:
+    """Parse ``FROM:=TO`` rules into names by topic."""
+    names = {}
+    for rule in rules:
+        topic, given, name = rule.partition(":=")
+        if not given or not name:
+            raise InputError(f"{KIND}.remap: {rule!r}; allowed: /topic:=/other")
+        if topic not in known:
+            raise InputError(f"{KIND}.remap: {topic!r} is not replayed; {instead(topic, sorted(known))}")
+        names[topic] = name
+    return names
+
+
 def _ns(seconds: float) -> int:
     """Convert a decimal time to ns exactly; a binary number of 1.7e9 s would be 238 ns coarse."""
     return int(Decimal(repr(seconds)) * 10**9)
@@ -413,8 +528,8 @@ def _span(seconds: float) -> str:
 def _work(node: StandaloneNode, parameters: ReplayerParameters) -> None:
     if not parameters.bag:
         raise InputError(f"{KIND}.bag is empty; name the bag's folder")
-    with Source(Path(parameters.bag)) as source:
-        replayer = Replayer(node, parameters, source)
+    with Source(Path(parameters.bag)) as source, keys.listening() as pressed:
+        replayer = Replayer(node, parameters, source, pressed)
         replayer.run()
         node.get_logger().info(f"{replayer.sent} messages sent")
 

@@ -41,7 +41,7 @@ def files(folder: str) -> set[str]:
     return {name for name in here if "__pycache__" not in name}
 
 
-MESSAGES = {name for name in files("msg_defs") if name.endswith((".msg", ".srv"))}
+MESSAGES = {name for name in files("msg_defs") if name.endswith((".msg", ".srv")) and name.count("/") == 2}
 
 
 def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
