@@ -15,18 +15,18 @@ from lathe_rc import messages, part
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source, name_of
+from lathe_rc.bag.reading.limits import SIMULATED
+from lathe_rc.bag.reading.source import Source, files_of, name_of
 from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 from lathe_rc.commands import options, tables
-from lathe_rc.errors import InputError, LossyRunError, shown
+from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
 from lathe_rc.names import instead
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)
 _LOSSY = LossyRunError.exit_code  # exit code if messages are missing
-_SIMULATED = 10**17  # [ns] upper bound of simulated time: three years; the system clock passed it in 1973
 
 
 @click.group()
@@ -49,10 +49,11 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @options.as_json
 @click.pass_context
 def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
-    """Show topics, rates, time span, scenario and the form error of the part.
+    """Show topics, rates, time span, date, scenario and the form error of the part.
 
-    For a damaged bag, show the readable content and the damage; exit code 3.
+    For a damaged bag, or one that lacks samples, show the readable content and what is wrong; exit code 3.
     """
+    written_ns = max((file.stat().st_mtime_ns for file in files_of(path)), default=0)
     with Source(path, partial=True) as source:
         span = (source.last_ns - source.first_ns) * 1e-9
         types = {topic: entry.type for topic, entry in source.topics.items()}
@@ -69,14 +70,21 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             "start_s": source.first_ns * 1e-9,
             "start": _date(source.first_ns),
             "span_s": span,
+            "written": _date(written_ns),
             "topics": topics,
             "unread": [asdict(each) for each in source.unread],
             "about": dict(source.about),
             "contradictions": source.contradictions,
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
+            "first_sample": 0,
+            "error_um": None,
         }
-    summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
+        try:
+            summary["first_sample"] = stream.first_of(source)
+            summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
+        except LatheError as error:
+            source.damage.append(str(error))
     if as_json:
         click.echo(json.dumps(summary))
         ctx.exit(_LOSSY if source.damage else 0)
@@ -93,6 +101,9 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
     for what in summary["foreign"]:
         console.print(what)
     console.print(f"span: {span:.6g} s from {summary['start'] or format(summary['start_s'], '.6g') + ' s'} on")
+    console.print(f"written: {summary['written']}")
+    if summary["first_sample"]:
+        console.print(f"recorded from sample {summary['first_sample']} of the run on")
     if summary["error_um"]:
         first, last = summary["error_um"]["first"], summary["error_um"]["last"]
         console.print(
@@ -121,7 +132,7 @@ def _print_about(console: Console, about: Mapping[str, str]) -> None:
 
 def _date(log_ns: int) -> str | None:
     """Return the date of a log time in UTC; None for simulated time, which begins near 0."""
-    if log_ns < _SIMULATED:
+    if log_ns < SIMULATED:
         return None
     return datetime.fromtimestamp(log_ns // 10**9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 

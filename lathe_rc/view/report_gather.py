@@ -13,8 +13,8 @@ import numpy as np
 from lathe_rc import event_log, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import Feeder
-from lathe_rc.bag.snapshot import first_sample, span_of
+from lathe_rc.bag.reading.stream import Feeder, first_of
+from lathe_rc.bag.snapshot import span_of
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
@@ -204,7 +204,7 @@ def gather(path: Path) -> Gathered:
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
         gathered = Gathered(source.about, tallies, forms, Curves(types), nodes=nodes, unjudged=unjudged)
-        first = first_sample(source.about)
+        first = first_of(source)
         feeder = Feeder(types, [*forms, gathered.curves], _PIECE, first)
         try:
             _feed(source, feeder, gathered)

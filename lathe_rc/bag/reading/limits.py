@@ -25,6 +25,8 @@ EXPANSION = 1024  #: total message bytes per byte of the files
 MOST_SMALL = 2**28  #: total message bytes allowed for files of any size
 MOST_SMALL_MESSAGES = 2**20  #: messages allowed for files of any size, plus one per byte of the files
 
+SIMULATED = 10**17  #: [ns] upper bound of simulated time: three years; the system clock passed it in 1973
+
 
 class TooMuchError(ValueError):
     """Error for a file that exceeds the limits for its size; unlike damage, it ends reading."""

@@ -4,6 +4,7 @@
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.snapshot import first_sample
+from lathe_rc.bag.snapshot import span_of
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.engine import Sink
 from lathe_rc.cell.stage import Sparse
@@ -113,6 +114,10 @@ class _Dense:
             raise LatheError(f"{self.topic}: {shown(error)}") from None
 
     def _append(self, block: Block) -> None:
+        if self.newest is None and block.first_index < self.end:  # before the first sample that all topics have
+            if block.first_index + block.samples <= self.end:
+                return
+            self.end = block.first_index
         check_next(self.topic, block, self.end, self.newest.step_ns if self.newest else 0)
         self.end += block.samples
         self.newest = block
@@ -209,6 +214,7 @@ class Feeder:
             sparse[topic] = [
                 Sparse(topic, self.types[topic], (stamp - START_NS) // self.step_ns, dict(values))
                 for stamp, values in waiting[:count]
+                if stamp >= START_NS + self.first * self.step_ns  # none before the first sample of a late recording
             ]
             del waiting[:count]
         for sink in self._sinks:
@@ -266,6 +272,19 @@ class SampleReader:
         self._dense.take_into(signals)
 
 
+def first_of(source: Source) -> int:
+    """Return the first sample of all dense topics: not 0 in a snapshot, or if the recorder joined a running cell.
+
+    Raises:
+        InputError: the bag is damaged at the first block of a topic.
+        LatheError: this block cannot be decoded.
+    """
+    if span := span_of(source.about):
+        return span[0]
+    dense = [topic for topic, each in source.topics.items() if each.type in messages.block_types()]
+    return max((block.first_index for topic in dense for block in islice(source.blocks(topic), 1)), default=0)
+
+
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
     """Read a cell's bag and pass its signals to sinks, in chunks.
 
@@ -280,7 +299,7 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
     """
     with Source(path) as source:
         types = {topic: kind.type for topic, kind in source.topics.items()}
-        feeder = Feeder(types, sinks, piece, first_sample(source.about))
+        feeder = Feeder(types, sinks, piece, first_of(source))
         for topic, log_ns, data in source.messages(set(feeder.types)):
             try:
                 feeder.add(topic, log_ns, data)

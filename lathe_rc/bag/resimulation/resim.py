@@ -21,11 +21,11 @@ from lathe_rc import messages
 from lathe_rc.bag import check, provenance
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.reading.stream import feed, first_of
 from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for, wire
 from lathe_rc.bag.resimulation.identify import Identified
-from lathe_rc.bag.snapshot import first_sample
+from lathe_rc.bag.snapshot import span_of
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import models, ros_yaml
@@ -143,10 +143,11 @@ def _refuse_part(source: Source) -> None:
             f"{source.path}: nodes were lost on the way, {topic} is held from sample {sample} on; allowed: a bag of a "
             "run that nothing interrupted"
         )
-    first = first_sample(source.about)
+    first = first_of(source)
     if first:
+        what = "is a snapshot" if span_of(source.about) else "was recorded"
         raise InputError(
-            f"{source.path} is a snapshot from sample {first} on: the start of the run, from which controllers and "
+            f"{source.path} {what} from sample {first} on: the start of the run, from which controllers and "
             "drives have their state, is missing; allowed: a bag from sample 0 on (recorder.mode = both records the "
             "whole run beside the snapshots)"
         )
