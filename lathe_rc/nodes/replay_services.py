@@ -2,6 +2,7 @@
 """Services of a replay, with the names and types of rosbag2's player."""
 
 from collections.abc import Awaitable
+from importlib import import_module
 from typing import Any, Protocol
 
 from rclpy.node import Node
@@ -46,7 +47,7 @@ class ReplayServices:
     """
 
     def __init__(self, node: Node, replay: Controlled) -> None:
-        from rosbag2_interfaces import srv  # of ROS 2, or of ./lathe setup; absent beside pip's lathe_rc_msgs
+        srv: Any = import_module("rosbag2_interfaces.srv")
 
         self._replay = replay
         for kind, name, callback in (
