@@ -332,6 +332,7 @@ def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_p
 
 def test_the_replayer(observer, tmp_path):
     """The replayer uses what its policy allows, and nothing else."""
+    pytest.importorskip("rosbag2_interfaces.srv")
     piston = scenarios.load(CONFIG / "piston.yaml", ["spindle_encoder.revolutions=1.0"])
     harness.run(piston, mode="composed", bag=tmp_path / "bag")
     root = parsed(made("piston", "--with", REPLAYER))
