@@ -54,6 +54,7 @@ def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):
         assert list(old.messages(signals)) == list(new.messages(signals))
         assert old.about["lathe_rc.file.tool.profile_file"] == new.about["lathe_rc.file.tool.profile_file"]
     assert check(first).digests == check(again).digests
+    assert check(again).compared == 9, "a recorder that is started by hand stores digests"
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import rclpy
 from bags import JAZZY
-from cells import refusals, scenario, started
+from cells import block, refusals, scenario, started
+from lathe_rc_msgs.msg import ToolBlock
 from rclpy.duration import Infinite
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rosbags.highlevel import AnyReader
@@ -160,6 +161,19 @@ def test_what_was_missed_is_told(ghost, tmp_path):
     assert recording.returncode == 3
     assert f"lathe: {tmp_path / 'bag'}: 3 messages of /talk are missing" in said
     assert len(messages(tmp_path / "bag")) == 1
+
+
+def test_missing_samples_of_a_cell_are_told(ghost, tmp_path):
+    """Nodes in one process neither send nor number blocks that no other process reads."""
+    with started("record", tmp_path / "bag", "--once", first=LOOKS.format(4)) as recording:
+        talker = ghost.create_publisher(ToolBlock, "/tool", QoSProfile(depth=10))
+        matched(ghost, talker)
+        talker.publish(block("lathe_rc_msgs/msg/ToolBlock", 128, "/tool", "test"))
+        assert talker.wait_for_all_acked()
+        ghost.destroy_node()
+        said = recording.communicate()[0]
+    assert recording.returncode == 3
+    assert "samples 0 to 127 of /tool are missing; /tool ends at sample 191 without its last block" in said
 
 
 def test_what_was_before_it_is_told_and_no_loss(ghost, tmp_path):

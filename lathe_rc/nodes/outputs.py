@@ -14,7 +14,7 @@ from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import message_class, signal_qos
 
-_OUTSIDE_PERIOD = 0.1  # [s] between checks for readers in other processes
+_OUTSIDE_PERIOD = 0.02  # [s] between checks for readers in other processes
 
 Memory = tuple[Signals, Samples | None]  #: arrays of one output, and the record array that they are views of
 

@@ -225,6 +225,20 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
                 reporter("refused", node.get_name(), senders=node.refused_messages.senders)
         # The nodes are not destroyed: Fast DDS may deadlock while other participants are leaving, too.
         rclpy.try_shutdown()
+        if not reporter.attached:  # a harness stores them itself
+            _store_digests(nodes)
+
+
+def _store_digests(nodes: Sequence[CellNode]) -> None:
+    """Store the digests of the bags of complete runs, after the cell has ended and nobody waits."""
+    from lathe_rc.bag.check import check, write_digests
+
+    for bag in (node.role.whole for node in nodes if isinstance(node.role, RecorderRole)):
+        try:
+            if bag is not None and (found := check(bag)).digests:
+                write_digests(bag, found.digests)
+        except LatheError as error:
+            print(f"lathe: {bag}: no digests: {error}", file=sys.stderr)
 
 
 def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:

@@ -2,6 +2,7 @@
 """Publishers of arbitrary topics: installed message types and offered quality of service (QoS)."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rosbags.typesys.store import Typestore
 from lathe_rc.errors import InputError
 
 
+@cache
 def installed(msgtype: str) -> Typestore:
     """Return a message type and its nested types, as defined by the installed packages.
 

@@ -57,10 +57,14 @@ class RecorderRole(Role):
 
     Args:
         node: node that has this role.
+
+    Attributes:
+        whole: bag of a complete run that is closed; None before.
     """
 
     def __init__(self, node: CellNode) -> None:
         self.node = node
+        self.whole: Path | None = None
         self.table = cast("RecorderParameters", node.table)
         name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
         self._path = Path(name)
@@ -429,6 +433,7 @@ class RecorderRole(Role):
         finally:
             self._writer = None
         complete = complete and not self.node.protocol.failure
+        self.whole = self._path if complete and not self._lost and self.table.mode != "snapshot" else None
         whole = "complete" if complete else "interrupted"
         if complete and self.node.protocol.safe:
             whole = "to the end of the safe state; what lost members published is held"

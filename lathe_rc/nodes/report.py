@@ -22,6 +22,11 @@ class Reporter:
         number = os.environ.get(VARIABLE)
         self._socket = socket.socket(fileno=int(number)) if number else None
 
+    @property
+    def attached(self) -> bool:
+        """Return True if a harness has started the process."""
+        return self._socket is not None
+
     def __call__(self, event: str, node: str, **values: object) -> None:
         """Report an event with the monotonic time, which all processes of the machine share."""
         if self._socket is None:

@@ -4,7 +4,7 @@
 import signal
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -21,7 +21,8 @@ from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
 from lathe_rc.cell.beside import TOPIC_RECORDER as KIND
 from lathe_rc.cell.beside import TopicRecorderParameters
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.errors import InputError, LossyRunError
+from lathe_rc.cell.wire import Decoder
+from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
@@ -60,7 +61,9 @@ class TopicRecorder:
             hold_ns=round(parameters.hold * 1e9), sim_time=parameters.sim_time, began_ns=time.time_ns()
         )
         self._inlets: dict[str, Subscription] = {}
+        self._blocks = {message_class(kind): kind for kind in messages.block_types()}
         self._continuity: dict[str, Continuity] = {}
+        self._ends: dict[str, tuple[bytes, bytes]] = {}  # first and newest message of the topics of blocks
         self._refused: dict[str, str] = {}  # topic -> reason why it is not recorded
         self._present: set[str] = set()  # topics that may have begun before the recording
         self._looks = 0
@@ -158,6 +161,8 @@ class TopicRecorder:
                 raise InputError(f"{topic}: {error}") from None
             self._order.add_clock(source_ns, sequence, clock.sec * 10**9 + clock.nanosec)
         else:
+            if self._inlets[topic].msg_type in self._blocks:
+                self._ends[topic] = self._ends.get(topic, (data, data))[0], data
             # DDS pads messages sent in one fragment to a multiple of 4 bytes; large messages arrive unpadded.
             self._order.add(topic, source_ns, sequence, data + bytes(-len(data) % 4))
 
@@ -240,9 +245,23 @@ class TopicRecorder:
         wrong = [f"{c.missing} messages of {topic} are missing" for topic, c in self._continuity.items() if c.missing]
         if self._order.late:
             wrong.append(f"{self._order.late} messages came too late for their place, hold = {self._parameters.hold} s")
+        wrong += [what for topic in sorted(self._ends) for what in self._lacking(topic)]
         wrong += self._refused.values()
         if wrong:
             raise LossyRunError(f"{self._parameters.bag}: {'; '.join(wrong)}")
+
+    def _lacking(self, topic: str) -> Iterator[str]:
+        """Yield what a topic of blocks lacks: nodes in one process do not number blocks that nobody else reads."""
+        decoder = Decoder(self._blocks[self._inlets[topic].msg_type])
+        try:
+            first, newest = map(decoder.decode, self._ends[topic])
+        except ValueError as error:
+            yield f"{topic}: {shown(error)}"
+            return
+        if first.first_index:
+            yield f"samples 0 to {first.first_index - 1} of {topic} are missing"
+        if not newest.last and self._parameters.once and not self.stopped.is_set():
+            yield f"{topic} ends at sample {newest.first_index + newest.samples - 1} without its last block"
 
 
 def _work(node: Node, parameters: TopicRecorderParameters) -> None:
