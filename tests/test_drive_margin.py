@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from cells import config, scenario
+from cells import assert_resimulated, config, scenario
 
 from lathe_rc import Plant, PlantParameters, allowed_code, harness, kernel, parameter
 from lathe_rc.analysis.frequency_response import FrequencyResponse, write_points
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise, second_order
+from lathe_rc.view.report import write_report
 
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3
 COMPOUND = {
@@ -195,3 +196,14 @@ def test_measured_drive_with_which_the_loop_diverges_is_refused_with_a_cure(tmp_
     measured(tmp_path / "points.csv", -40.0)
     with pytest.raises(InputError, match=r"as measured is unstable at .*: a stable one \(smaller gains of its PID"):
         Cell(cell_of(*compound).nodes).check()
+
+
+def test_bag_holds_the_measured_points_for_a_resimulation(tmp_path):
+    """Whatever the name of the file, whose content alone is in the bag; its loop is that of the report's figure."""
+    measured(tmp_path / "points.txt", 2.0)
+    given = config("piston", f"{FILE}={tmp_path / 'points.txt'}", "spindle_encoder.revolutions=2")
+    result = harness.run(given, bag=tmp_path / "bag")
+    (tmp_path / "points.txt").unlink()
+    assert_resimulated(tmp_path / "bag")
+    write_report(tmp_path / "bag", tmp_path / "page.html")
+    assert f"margin {result.drive_margins['learning_controller']}" in (tmp_path / "page.html").read_text()

@@ -24,6 +24,7 @@ from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell.budget import changing
 from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
 from lathe_rc.view import charts
@@ -87,7 +88,7 @@ class TestPage:
     def test_figures_to_enlarge_have_the_numbers_of_the_pictures(self, turned):
         """Each follows the schema of its language; the curve of the form error is that of the recording."""
         specs = {name: spec for name, choices in turned.shown.specs.items() for spec in choices.values()}
-        assert len(specs) == 8  # the polar figure and that of the surface have two
+        assert len(specs) == 10  # the polar figure and those of the surface and of the loop have two
         for spec in specs.values():
             alt.Chart.from_dict(of_two_rows(spec))
             assert spec["usermeta"]["box"]
@@ -101,7 +102,7 @@ class TestPage:
 
     def test_pictures_are_whole_svg_without_links(self, turned):
         images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned.page)
-        assert len(images) == 6  # two polar ones, spectrum, convergence, speed, surface; maps are JPEG
+        assert len(images) == 8  # two polar ones, spectrum, convergence, surface, two of the loop, speed; maps are JPEG
         for image in images:
             root = ET.fromstring(base64.b64decode(image))  # noqa: S314 - made here
             assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -134,6 +135,24 @@ class TestPage:
         assert_allclose(last.surface, surface.surface, rtol=0, atol=1e-15)
         assert_allclose(last.height, surface.height, rtol=0, atol=1e-15)
         assert "Along the part, last 8 revolutions at 100 µm/rev: Ra " in turned.shown.text
+
+    def test_marks_the_drive_margin_of_the_run_in_both_figures_of_the_loop(self, turned):
+        """The least error over the waves is the margin that the run printed; the locus is that of the formula."""
+        specs = [spec for choices in turned.shown.specs.values() for spec in choices.values()]
+        margin = turned.result.drive_margins["learning_controller"]
+        drawn = [spec for spec in specs if f"margin {margin}" in str(spec)]
+        assert len(drawn) == 2
+        locus, over_waves = ([row for layer in spec["layer"] for row in layer["data"]["values"]] for spec in drawn)
+        error = {row["n"]: row["v"] for row in over_waves if row.get("l") == "error that diverges"}
+        assert min(error.values()) == pytest.approx(margin.error, rel=1e-4)
+        assert min(error, key=error.get) == pytest.approx(margin.waves, rel=1e-4)
+        cell = Cell(turned.result.scenario.nodes)
+        cell.check()
+        (loop,) = cell.loops["learning_controller"]
+        whole = next(row for row in locus if row.get("n") == 3.0)
+        (drive,) = loop.responses
+        factor = loop.stage.factors(drive, np.array([3.0]), margin.speed)[0, 0]
+        assert whole["u"] + 1j * whole["v"] == pytest.approx(factor, rel=1e-3)
 
     def test_is_the_same_every_time(self, turned, tmp_path):
         again = tmp_path / "page.html"

@@ -26,6 +26,12 @@ _FINE = 65
 _TURN, _ROUNDS = 0.5, 12  # [rad] largest turn of D + F between two frequencies, and rounds of halving to get there
 
 
+def smallest_errors(own: Complex, fed: Complex) -> Array:
+    """Return the smallest relative errors of the drive that bring D + F to 0, shape (n,); inf where F is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(fed == 0.0, np.inf, np.abs(own + fed) / np.abs(fed)))
+
+
 def feedback_margin(characteristic: Characteristic, speed: float, step: float, points: Array) -> DriveMargin:
     """Compute the smallest relative error of the drive with which a feedback loop is unstable; 0 if it is already.
 
@@ -35,11 +41,6 @@ def feedback_margin(characteristic: Characteristic, speed: float, step: float, p
         step: sampling step [s].
         points: further frequencies to be evaluated, up to the Nyquist frequency [rad/s], shape (k,).
     """
-
-    def distance(own: Complex, fed: Complex) -> Array:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(fed == 0.0, np.inf, np.abs(own + fed) / np.abs(fed)))
-
     frequency = np.union1d(_grid(speed, step), points)
     own, fed = characteristic(frequency)
     for _ in range(_ROUNDS):
@@ -51,12 +52,12 @@ def feedback_margin(characteristic: Characteristic, speed: float, step: float, p
         halves = 0.5 * (frequency[coarse] + frequency[coarse + 1])
         frequency = np.insert(frequency, coarse + 1, halves)
         own, fed = (np.insert(a, coarse + 1, b) for a, b in zip((own, fed), characteristic(halves), strict=True))
-    found = distance(own, fed)
+    found = smallest_errors(own, fed)
     k = int(np.argmin(found))
     if not abs(turns.sum()) < 0.5 * np.pi:
         return DriveMargin(0.0, float(frequency[k] / speed), speed)
     near = np.linspace(frequency[max(k - 1, 0)], frequency[min(k + 1, frequency.size - 1)], _FINE)
-    fine = distance(*characteristic(near))
+    fine = smallest_errors(*characteristic(near))
     j = int(np.argmin(fine))
     return DriveMargin(float(min(fine[j], found[k])), float(near[j] / speed), speed)
 

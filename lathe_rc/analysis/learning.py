@@ -8,7 +8,7 @@ up to the grid's Nyquist limit. Q, Z and the interpolators are modelled as imple
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +62,23 @@ class DriveMargin(NamedTuple):
         return f"{self.error:.4g} at {self.waves:.3g} waves ({self.waves * self.speed / (2.0 * np.pi):.3g} Hz)"
 
 
+def smallest_errors(factors: Callable[[Array, Sequence[float]], Sequence[Complex]], waves: Array) -> Array:
+    """Compute the smallest relative errors of the drive at ``waves`` with which learning diverges, shape (n,).
+
+    See `drive_margin` for the formula and the ``factors``.
+    """
+    given, more, less = factors(waves, (1.0, 1.0 + _SCALE, 1.0 - _SCALE))
+    with np.errstate(all="ignore"):
+        depends = np.abs(more - less) > _ROUNDING
+        delta = np.where(depends, (2.0 * given - more - less) / (_SCALE * (more - less)), 0.0)
+        beta = np.where(depends, (more * (1.0 + _SCALE * delta) - given) / _SCALE, 0.0)
+        square = np.abs(beta) ** 2 - np.abs(delta) ** 2
+        half, rest = np.abs(np.conj(given) * beta - delta), 1.0 - np.abs(given) ** 2
+        # The quotient without cancellation; for a negative square it is the smaller of two positive roots.
+        root = rest / (half + np.sqrt(half**2 + square * rest))
+    return np.asarray(np.where(root >= 0.0, root, np.where(rest > 0.0, np.inf, 0.0)).min(axis=0))
+
+
 def drive_margin(
     factors: Callable[[Array, Sequence[float]], Sequence[Complex]],
     highest: float,
@@ -83,19 +100,7 @@ def drive_margin(
         speed: speed of the spindle [rad/s].
         points: waves per revolution that are evaluated, those of a measurement, shape (n,), n above 0; None: all.
     """
-
-    def smallest(waves: Array) -> Array:
-        given, more, less = factors(waves, (1.0, 1.0 + _SCALE, 1.0 - _SCALE))
-        with np.errstate(all="ignore"):
-            depends = np.abs(more - less) > _ROUNDING
-            delta = np.where(depends, (2.0 * given - more - less) / (_SCALE * (more - less)), 0.0)
-            beta = np.where(depends, (more * (1.0 + _SCALE * delta) - given) / _SCALE, 0.0)
-            square = np.abs(beta) ** 2 - np.abs(delta) ** 2
-            half, rest = np.abs(np.conj(given) * beta - delta), 1.0 - np.abs(given) ** 2
-            # The quotient without cancellation; for a negative square it is the smaller of two positive roots.
-            root = rest / (half + np.sqrt(half**2 + square * rest))
-        return np.asarray(np.where(root >= 0.0, root, np.where(rest > 0.0, np.inf, 0.0)).min(axis=0))
-
+    smallest = partial(smallest_errors, factors)
     if points is None:
         waves = _waves_up_to(highest)
         near = _near_peaks(waves, -smallest(waves))

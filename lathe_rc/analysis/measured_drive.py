@@ -47,7 +47,7 @@ class MeasuredDrive:
 
 
 def read_points(path: Path) -> tuple[Array, Complex]:
-    """Read the frequencies [rad/s] and values of a frequency response, in the formats of ``lathe fit drive``.
+    """Read frequencies [rad/s] and values of a frequency response, CSV as of ``lathe fit drive``, whatever its name.
 
     Raises:
         InputError: the file cannot be read, or is no frequency response.
@@ -61,5 +61,5 @@ def _read(path: Path, _: tuple[int, int] | None) -> tuple[Array, Complex]:
     from lathe_rc.analysis import frequency_response  # with SciPy, which a cell without measurements need not import
     from lathe_rc.signals import measurement_file
 
-    found = frequency_response.of_measurement(measurement_file.read(path, {}))
+    found = frequency_response.of_measurement(measurement_file.read(path, {}, ".csv"))
     return found.frequency, found.value

@@ -505,8 +505,8 @@ _FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
 }
 
 
-def open_file(path: Path) -> Source:
-    """Open a measurement file; the ending of its name gives the format.
+def open_file(path: Path, ending: str = "") -> Source:
+    """Open a measurement file; ``ending``, or else that of its name, gives the format.
 
     Raises:
         InputError: the ending is unknown, or the file is missing or damaged.
@@ -514,18 +514,19 @@ def open_file(path: Path) -> Source:
     """
     if not path.is_file():
         raise InputError(f"{path}: cannot be read ({'a folder' if path.is_dir() else 'no such file'}); check the path")
-    if path.suffix.lower() not in _FORMATS:
+    ending = ending or path.suffix.lower()
+    if ending not in _FORMATS:
         raise InputError(f"{path}: no format of measurements; allowed: {', '.join(_FORMATS)}, or a bag")
-    name, opened = _FORMATS[path.suffix.lower()]
+    name, opened = _FORMATS[ending]
     with _readable(f"{path}: no readable {name} file"):
         return opened(path)
 
 
-def read(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
-    """Open a measurement file with a mapping of its columns.
+def read(path: Path, mapping: Mapping[str, Mapped], ending: str = "") -> Measurement:
+    """Open a measurement file with a mapping of its columns; ``ending`` as for `open_file`.
 
     Raises:
         InputError: see `open_file` and `Measurement`.
         LatheError: see `open_file`.
     """
-    return Measurement(str(path), open_file(path), mapping)
+    return Measurement(str(path), open_file(path, ending), mapping)

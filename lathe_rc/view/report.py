@@ -23,10 +23,13 @@ from lathe_rc.analysis.metrology import Lay
 from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.budget import budget
+from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place, replacing
 from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
+from lathe_rc.view import report_loop
 from lathe_rc.view.charts import Charts, page_template
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
@@ -230,6 +233,19 @@ def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
         yield "run", printable(data.run_id, 16), ""
 
 
+def _loops(data: Gathered) -> tuple[list[LoopCurve], str]:
+    """Return the loops of the bag's scenario, or the reason why they cannot be computed."""
+    if SCENARIO not in data.about:
+        return [], ""
+    with tempfile.TemporaryDirectory(prefix="lathe-report-") as folder:
+        try:
+            cell = Cell(scenario_of(data.about, Path(folder)).nodes)
+            cell.check(cures=False)
+            return loop_curves(cell), ""
+        except LatheError as error:
+            return [], str(error)
+
+
 def render(data: Gathered, name: str, command: str, made_of: Budget | None = None) -> str:
     """Return the report as an HTML page.
 
@@ -245,6 +261,8 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
         cycles = {f"{topic}: {field}": found for (topic, field), found in data.curves.cycles.items() if found.size}
         forms = [_form(form, cycles, len(data.forms), charts) for form in data.forms]
         signals = list(_signals(data, charts))
+        curves, unknown_loop = _loops(data)
+        loops = [charts.place(report_loop.loop(curve)) for curve in curves]
         alone = cycles and not any(form["metrics"] for form in forms)
         text: str = template.render(
             title=f"Report of {printable(name, 80)}",
@@ -261,6 +279,8 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
             cutoff=f"{CUTOFF:.0f}",
             forms=forms,
             signals=signals,
+            loops=loops,
+            unknown_loop=unknown_loop,
             cycles=charts.place([figures.convergence(None, cycles)]) if alone else None,
             timing=charts.place(figures.timing(data.host, data.step_ns * 1e-9)) if len(data.host.pace) else None,
             host=data.host,

@@ -21,7 +21,8 @@ _SQUARE = 460  # [px] size of the largest polar figure
 _INSIDE = 1.2  # radius of the desired form in a polar figure, relative to the largest deviation
 _POINTS = 720  # points of a polar figure
 _OTHERS = 4  # largest number of controllers with plotted cycles
-_LAST, _FIRST, _BEST, _GREY, _COLOURS = 0, 1, 2, 5, 6  # indices of the page's colours, and their number
+LAST, FIRST = 0, 1  #: indices of the page's colours
+_BEST, _GREY, _COLOURS = 2, 5, 6  # further ones, and their number
 _LONGEST_LABEL = 60  # characters
 _LONGEST_LENGTH = 1e3  # largest drawn length [m]
 _MOST_VALUE = 1e12  # largest value of other signals
@@ -29,7 +30,7 @@ _FLOOR = 1e-3  # smallest form error that a figure resolves [µm]
 _ALMOST = 1e-9  # relative difference above which two numbers count as different
 
 #: Dragging selects the range to enlarge.
-_BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
+BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
 _LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolOpacity": 1, "symbolStrokeWidth": 3}
 _LEGEND["columnPadding"] = 24  # a reader's font may be wider than the font used for the layout
 _GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 260, "columns": 0, "titleLimit": 300}
@@ -52,7 +53,8 @@ def _clipped(values: Samples) -> Samples:
     return cut
 
 
-def _figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: Any) -> Spec:
+def figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: Any) -> Spec:
+    """Return a specification whose figure can be enlarged; ``height`` in px."""
     return chart(height, usermeta={"box": True, **(usermeta or {})}, **parts)
 
 
@@ -62,10 +64,10 @@ def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: 
     if colour["type"] == "quantitative":  # no gaps between the fields of a map
         encoding["stroke"] = {key: value for key, value in colour.items() if key != "legend"}
     mark = {"type": "rect", "clip": True, "strokeWidth": 1.2}
-    return _figure(height, params=[_BOX], mark=mark, encoding=encoding, **parts)
+    return figure(height, params=[BOX], mark=mark, encoding=encoding, **parts)
 
 
-def _colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
+def colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
     """Return a colour encoding by label, with the page's colours at the given indices."""
     domain = [f"_{place}" for place in range(_COLOURS)]
     for label, place in places.items():
@@ -150,10 +152,10 @@ def along(surface: Lay) -> list[Spec]:
     up = {"title": "height [mm]", "start": low - step / 2, "step": step * group, "end": high + step / 2}
     up["scale"] = axis_scale(ends=sorted((low - step / 2, high + step / 2)))
     colour = quantity("data", "radius deviation [µm]", scale={"scheme": "viridis"}, legend=_GRADIENT)
-    line = _figure(
+    line = figure(
         240,
         data={"values": rows(u=place, v=deviation[0])},
-        params=[_BOX],
+        params=[BOX],
         mark={"type": "line", "clip": True, "strokeWidth": 1.4},
         encoding={
             "x": quantity("u", "height [mm]", scale=axis_scale()),
@@ -169,7 +171,7 @@ def along(surface: Lay) -> list[Spec]:
 
 def polar(form: Form) -> list[Spec]:
     """Return polar plots of the radius deviation of the first and the last revolution, each with its own scale."""
-    return [_polar(each, colour) for each, colour in ((form.first, _FIRST), (form.last, _LAST)) if each]
+    return [_polar(each, colour) for each, colour in ((form.first, FIRST), (form.last, LAST)) if each]
 
 
 def _polar(revolution: Revolution, colour: int) -> Spec:
@@ -197,13 +199,13 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     where = {"scale": axis_scale(ends=(-2.55, 2.55)), "axis": None}
     dash = {"domain": list(rings), "range": [[1, 3], [4, 3], [1, 3]]}
     line = {"type": "line", "clip": True}
-    return _figure(
+    return figure(
         _SQUARE,
         title=f"revolution {numbers['revolution']}: {numbers['rms']:.3g} µm RMS",
         encoding={"x": quantity("u", "", **where), "y": quantity("v", "", **where)},
         layer=[
             {
-                "params": [_BOX],
+                "params": [BOX],
                 "data": {"values": circles},
                 "mark": {**line, "color": "#888", "strokeWidth": 1},
                 "encoding": {
@@ -217,7 +219,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
                 "mark": {**line, "strokeWidth": 1.6},
                 "encoding": {
                     "order": {"field": "k"},
-                    "color": _colours({"form": colour}, legend=False),
+                    "color": colours({"form": colour}, legend=False),
                     "tooltip": tip(a="angle [°]", d="deviation [µm]"),
                 },
             },
@@ -250,7 +252,7 @@ def spectrum_range(form: Form) -> tuple[float, float]:
 
 def spectrum(form: Form) -> Spec:
     """Return a bar chart of the amplitude by undulations per revolution."""
-    places = {"first": _FIRST, "best": _BEST, "last": _LAST}
+    places = {"first": FIRST, "best": _BEST, "last": LAST}
     shown = {f"{name} revolution ({each.numbers['revolution']})": each for name, each in shown_revolutions(form)}
     low, high = spectrum_range(form)
     bars: Rows = []
@@ -260,14 +262,14 @@ def spectrum(form: Form) -> Spec:
         order = np.arange(1, value.size + 1)
         left = order - 0.4 + k * width
         bars += rows(n=order, u=left, u2=left + width, v=value, l=label)
-    colours = {label: places[label.partition(" revolution")[0].split(", ")[-1]] for label in shown}
+    indices = {label: places[label.partition(" revolution")[0].split(", ")[-1]] for label in shown}
     ends = (low, high) if high else ()
     return _rectangles(
         260,
         quantity("u", "undulations per revolution", scale=axis_scale(ends=(0.4, 50.6)), axis={"grid": False}),
         quantity("v", "amplitude [µm]", scale=axis_scale(log=bool(high), ends=ends)),
         {"datum": number(low)},
-        _colours(colours, "square", legend=True),
+        colours(indices, "square", legend=True),
         tip(n="undulations per revolution", v="amplitude [µm]"),
         data={"values": bars},
     )
@@ -313,7 +315,7 @@ def _lines(
     line = {"type": "line", "clip": True, "strokeWidth": 1.4, "point": {"size": 12} if len(data) <= 400 else False}
     layer: Rows = [
         {
-            "params": [_BOX],
+            "params": [BOX],
             "transform": [{"filter": "!datum.dot"}],
             "mark": {"type": "area", "opacity": 0.35, "clip": True},
             "encoding": {"y": quantity("a", up), "y2": {"field": "b"}},
@@ -335,14 +337,14 @@ def _lines(
         ]
     axis = {"format": ".4~g", "tickCount": 5}
     places = {label: colour for label, (_, colour, _) in curves.items()}
-    return _figure(
+    return figure(
         height,
         data={"values": data},
         transform=[{"calculate": "sqrt(datum.a * datum.b)" if log else "(datum.a + datum.b) / 2", "as": "m"}],
         encoding={
             "x": quantity("u", across, scale=axis_scale(), axis={"grid": False, "format": "~r", "tickCount": 12}),
             "y": {"type": "quantitative", "title": up, "scale": axis_scale(log=log), "axis": axis},
-            "color": _colours(places, legend=len(places) > 1),
+            "color": colours(places, legend=len(places) > 1),
         },
         layer=layer,
     )
@@ -350,7 +352,7 @@ def _lines(
 
 def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     """Return a plot of the form error by revolution, and of the controllers' named cycle reports [m]."""
-    own = {"form error, RMS": (form.rms, _LAST), "form error, largest": (form.largest, _GREY)} if form else {}
+    own = {"form error, RMS": (form.rms, LAST), "form error, largest": (form.largest, _GREY)} if form else {}
     drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}
     for colour, (name, series) in enumerate(list(cycles.items())[:_OTHERS], start=1):
         drawn[_plain(name)] = series, colour, True
@@ -385,7 +387,7 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
         quantity("u", across, scale=scale, axis={"grid": False, "format": "~r"}),
         quantity("v", up, scale={"zero": True}),
         {"value": "height"},
-        _colours({name: colour}, legend=False),
+        colours({name: colour}, legend=False),
         tip(u="from", u2="to", v=up),
         title=name,
         data={"values": rows(u=edges[:-1], u2=edges[1:], v=counts.astype(int), l=name)},
@@ -403,7 +405,7 @@ def timing(host: Host, step: float) -> list[Spec]:
     found = [_histogram("pace", counts, edges, ("simulated by wall time [s/s]", "reports"), _GREY, log=False)]
     for name, across, durations, colour in (
         ("lateness", "let go after it was due [ms]", host.lateness, _BEST),
-        ("latency", "until completed by all [ms]", host.latency, _LAST),
+        ("latency", "until completed by all [ms]", host.latency, LAST),
     ):
         counts = np.sum([each.counts for each in durations.values()], axis=0)
         if counts.any():

@@ -43,8 +43,8 @@ class ElectrodynamicActuatorParameters(PlantParameters):
 
     response_file: str = parameter(
         "",
-        "measured frequency response of the drive, in the formats of lathe fit drive: the checks and the drive margin "
-        "then hold for its points as well",
+        "measured frequency response of the drive, CSV as of lathe fit drive: checks and drive margin then hold for "
+        "its points as well",
         path=True,
     )
 

@@ -4,14 +4,15 @@
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.analysis.feedback import feedback_margin
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response, drive_margin, supremum
+from lathe_rc.analysis import feedback
+from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response, drive_margin, smallest_errors, supremum
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.cell.parameters import (
     NonNegative,
@@ -116,11 +117,19 @@ class Learner(Obedient):
         measured = drive if isinstance(drive, MeasuredDrive) else None
         if (highest := self._highest(drive, speed)) is None:
             return self._feedback_margin(drive, speed, measured)
+        points = measured.waves(highest, speed) if measured else None
+        return drive_margin(partial(self.scaled_factors, drive, speed), highest, speed, points)
 
-        def factors(waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
-            return self.scaled_factors(drive, waves, speed, scales)
+    def smallest_errors(self, drive: Response, waves: Array, speed: float) -> Array:
+        """Return the smallest errors of the drive at some waves per revolution above 0, shape (n,).
 
-        return drive_margin(factors, highest, speed, measured.waves(highest, speed) if measured else None)
+        The least over all waves is the `drive_margin`, which must be known.
+        """
+        if self._highest(drive, speed) is not None:
+            return smallest_errors(partial(self.scaled_factors, drive, speed), waves)
+        parts = self.characteristic(drive, waves * speed, speed)
+        assert parts is not None, "the margin is known"
+        return feedback.smallest_errors(*parts)
 
     def _feedback_margin(self, drive: Response, speed: float, measured: MeasuredDrive | None) -> DriveMargin | None:
         step, points = self.shared.step, np.zeros(0)
@@ -135,9 +144,9 @@ class Learner(Obedient):
                 return None
             if measured:
                 points = measured.waves(np.pi / (step * speed), speed) * speed
-            return feedback_margin(characteristic, speed, step, points)
+            return feedback.feedback_margin(characteristic, speed, step, points)
 
-    def scaled_factors(self, drive: Response, waves: Array, speed: float, scales: Sequence[float]) -> Sequence[Complex]:
+    def scaled_factors(self, drive: Response, speed: float, waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
         """Return the `factors` for the drive scaled by each of some numbers."""
         return [
             self._known(lambda frequency, scale=scale: np.asarray(scale * drive(frequency)), waves, speed)  # type: ignore[misc]
@@ -353,8 +362,13 @@ class Loop(NamedTuple):
 
     def drive_margin(self) -> DriveMargin | None:
         """Return the smallest error of a drive with which learning diverges, over all drives and speeds."""
-        each = [self.stage.drive_margin(response, speed) for response in self.responses for speed in self.speeds]
-        return min(filter(None, each), default=None)
+        found = self.worst()
+        return found and found[0]
+
+    def worst(self) -> tuple[DriveMargin, Response] | None:
+        """Return the drive margin and the response of the drive with which it is the least."""
+        each = [(self.stage.drive_margin(drive, speed), drive) for drive in self.responses for speed in self.speeds]
+        return min(((margin, drive) for margin, drive in each if margin), key=lambda pair: pair[0], default=None)
 
     def first(self, candidates: Iterable[Mapping[str, Value]], allowed: float = _SAFE) -> Mapping[str, Value] | None:
         """Return the first parameters with all factors within the allowed value; None if there are none."""

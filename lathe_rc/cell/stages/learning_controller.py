@@ -138,7 +138,7 @@ class LearningController(Learner):
         """Return Q - γZ, shape (1, n)."""
         return self.loop(drive).operator(waves, speed)[None]
 
-    def scaled_factors(self, drive: Response, waves: Array, speed: float, scales: Sequence[float]) -> Sequence[Complex]:
+    def scaled_factors(self, drive: Response, speed: float, waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
         """Return Q - γZ for the drive scaled by each of some numbers; Q and Z are computed once."""
         return [operator[None] for operator in self.loop(drive).operators(waves, speed, scales)]
 

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of a controller's loop: its factor of a cycle in the unit circle, and the errors that the drive may have."""
+
+from typing import Any
+
+import numpy as np
+
+from lathe_rc.cell.loop_curves import LEAST, LoopCurve
+from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
+from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
+
+_SQUARE = 460  # [px] size of the locus
+_LABELLED = (1, 2, 5, 10, 20, 50, 100)  # harmonics with a label in the locus
+_APART = 0.12  # least distance of two labels
+_TOP, _EDGE = 2.0, 1.25  # ends of the axes
+_RPM = 60.0 / (2.0 * np.pi)
+_ERROR = "error that diverges"
+
+
+def loop(curve: LoopCurve) -> list[Spec]:
+    """Return the locus of the factor of a cycle, if there is one, and its magnitude over the waves per revolution."""
+    return [*([_locus(curve)] if curve.factor is not None else []), _over_waves(curve)]
+
+
+def _texts(data: Rows, **mark: Any) -> Rows:
+    """Return layers of labels that a curve below does not make illegible."""
+    text = {"type": "text", "clip": True, "fontSize": 11, **mark}
+    encoding = {"text": {"field": "t"}}
+    layer = {"data": {"values": data}, "encoding": encoding}
+    return [{**layer, "mark": {**text, "style": "halo"}}, {**layer, "mark": text}]
+
+
+def _locus(curve: LoopCurve) -> Spec:
+    factor, waves = curve.factor, curve.waves
+    assert factor is not None, "asked by the caller"
+    size = max(_EDGE, 1.08 * float(np.abs(factor).max()))
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = rows(u=np.cos(turn), v=np.sin(turn), k=np.arange(turn.size))
+    line = rows(u=factor.real, v=factor.imag, k=np.arange(waves.size), n=waves, f=np.abs(factor), l="factor")
+    harmonics, labelled = np.isin(waves, np.arange(1.0, 101.0)), np.flatnonzero(np.isin(waves, _LABELLED))
+    kept: list[int] = []
+    for k in labelled:
+        if all(abs(factor[k] - factor[j]) > _APART * size for j in kept):
+            kept.append(int(k))
+    dots = [row for row, whole in zip(line, harmonics, strict=True) if whole]
+    names = rows(u=factor.real[kept], v=factor.imag[kept], t=[f"{waves[k]:.0f}" for k in kept])
+    where = {"scale": axis_scale(ends=(-size, size)), "axis": {"tickCount": 5}}
+    place = {"x": quantity("u", "real part", **where), "y": quantity("v", "imaginary part", **where)}
+    own = {"order": {"field": "k"}, "color": colours({"factor": LAST}, legend=False)}
+    shown = tip(n="waves per revolution", f="magnitude")
+    return figure(
+        _SQUARE,
+        title=f"{curve.node} at {curve.margin.speed * _RPM:.5g}/min: factor of a cycle",
+        encoding=place,
+        layer=[
+            {
+                "params": [BOX],
+                "data": {"values": circle},
+                "mark": {"type": "line", "clip": True, "color": "#888", "strokeDash": [6, 4]},
+                "encoding": {"order": {"field": "k"}},
+            },
+            {"data": {"values": line}, "mark": {"type": "line", "clip": True}, "encoding": own},
+            {
+                "data": {"values": dots},
+                "mark": {"type": "point", "filled": True, "size": 22, "clip": True},
+                "encoding": {"color": own["color"], "tooltip": shown},
+            },
+            *_texts(names, align="left", dx=6, dy=-6),
+            *_worst(curve, rows(u=factor[_at(curve)].real, v=np.array([factor[_at(curve)].imag]))),
+        ],
+        usermeta={"square": _SQUARE},
+    )
+
+
+def _at(curve: LoopCurve) -> int:
+    return int(np.argmin(np.abs(curve.waves - max(curve.margin.waves, LEAST))))
+
+
+def _worst(curve: LoopCurve, place: Rows) -> Rows:
+    """Return the mark of the least margin with its label."""
+    data = [{**row, "t": f"margin {curve.margin}", "l": "worst"} for row in place]
+    mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
+    colour = colours({"worst": FIRST}, legend=False)
+    return [{"data": {"values": data}, "mark": mark, "encoding": {"color": colour}}, *_texts(data, dy=16)]
+
+
+def _over_waves(curve: LoopCurve) -> Spec:
+    waves = curve.waves
+    drawn = {_ERROR: np.minimum(curve.error, 2.0 * _TOP)}
+    if curve.factor is not None:
+        drawn = {"magnitude of the factor": np.abs(curve.factor), **drawn}
+    data = [row for label, values in drawn.items() for row in rows(n=waves, v=values, l=label)]
+    across = f"waves per revolution (1: {curve.margin.speed / (2.0 * np.pi):.4g} Hz)"
+    dash = {"domain": list(drawn), "range": [[1, 0], [7, 3]][-len(drawn) :]}
+    shade = colours(dict(zip(drawn, (LAST, FIRST)[-len(drawn) :], strict=True)), legend=True)
+    limit = rows(v=np.ones(1))
+    worst = rows(n=float(curve.waves[_at(curve)]), v=np.array([min(curve.margin.error, _TOP)]))
+    return figure(
+        280,
+        title=f"{curve.node} at {curve.margin.speed * _RPM:.5g}/min",
+        encoding={
+            "x": quantity("n", across, scale=axis_scale(log=True), axis={"grid": False, "format": "~g"}),
+            "y": quantity("v", "relative to 1", scale=axis_scale(ends=(0.0, _TOP)), axis={"tickCount": 5}),
+        },
+        layer=[
+            {
+                "params": [BOX],
+                "data": {"values": data},
+                "mark": {"type": "line", "clip": True},
+                "encoding": {
+                    "color": shade,
+                    "strokeDash": {"field": "l", "type": "nominal", "legend": shade["legend"], "scale": dash},
+                    "tooltip": tip(n="waves per revolution", v="value"),
+                },
+            },
+            {
+                "data": {"values": limit},
+                "mark": {"type": "rule", "strokeDash": [2, 3], "clip": True},
+                "encoding": {
+                    "x": {"value": 0},
+                    "x2": {"value": "width"},
+                    "y": {"field": "v"},
+                    "color": {"value": "#888"},
+                },
+            },
+            *_worst(curve, worst),
+        ],
+    )
