@@ -143,7 +143,7 @@ class TestPage:
         drawn = [spec for spec in specs if f"margin {margin}" in str(spec)]
         assert len(drawn) == 2
         locus, over_waves = ([row for layer in spec["layer"] for row in layer["data"]["values"]] for spec in drawn)
-        error = {row["n"]: row["v"] for row in over_waves if row.get("l") == "error that diverges"}
+        error = {row["n"]: row["v"] for row in over_waves if row.get("l") == "error that diverges (dashed)"}
         assert min(error.values()) == pytest.approx(margin.error, rel=1e-4)
         assert min(error, key=error.get) == pytest.approx(margin.waves, rel=1e-4)
         cell = Cell(turned.result.scenario.nodes)

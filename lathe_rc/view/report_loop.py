@@ -14,7 +14,7 @@ _LABELLED = (1, 2, 5, 10, 20, 50, 100)  # harmonics with a label in the locus
 _APART = 0.12  # least distance of two labels
 _TOP, _EDGE = 2.0, 1.25  # ends of the axes
 _RPM = 60.0 / (2.0 * np.pi)
-_ERROR = "error that diverges"
+_ERROR = "error that diverges (dashed)"
 
 
 def loop(curve: LoopCurve) -> list[Spec]:
@@ -109,7 +109,7 @@ def _over_waves(curve: LoopCurve) -> Spec:
                 "mark": {"type": "line", "clip": True},
                 "encoding": {
                     "color": shade,
-                    "strokeDash": {"field": "l", "type": "nominal", "legend": shade["legend"], "scale": dash},
+                    "strokeDash": {"field": "l", "type": "nominal", "legend": None, "scale": dash},
                     "tooltip": tip(n="waves per revolution", v="value"),
                 },
             },
