@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drive margin of laws without a cycle, and of measured drives: what it promises happens in runs."""
 
+import json
 from typing import NamedTuple
 
 import numpy as np
@@ -207,3 +208,10 @@ def test_bag_holds_the_measured_points_for_a_resimulation(tmp_path):
     assert_resimulated(tmp_path / "bag")
     write_report(tmp_path / "bag", tmp_path / "page.html")
     assert f"margin {result.drive_margins['learning_controller']}" in (tmp_path / "page.html").read_text()
+
+
+def test_a_loop_without_feedback_has_no_limit_in_json():
+    off = {"proportional": 0.0, "integral": 0.0, "derivative": 0.0}
+    result = harness.run(cell_of({**COMPOUND, **off, "feedback_delay": 16}))
+    assert result.drive_margins["learning_controller"].error == np.inf
+    assert json.loads(json.dumps(result.summary()))["drive_margin"]["learning_controller"]["error"] is None

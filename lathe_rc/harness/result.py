@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Result of a run."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -194,7 +195,10 @@ class Result:
             "unchecked": list(self.unchecked),
             "warnings": list(self.warnings),
             "stability_margin": dict(self.margins),
-            "drive_margin": {name: margin._asdict() for name, margin in self.drive_margins.items()},
+            "drive_margin": {
+                name: {**margin._asdict(), "error": margin.error if math.isfinite(margin.error) else None}
+                for name, margin in self.drive_margins.items()
+            },
             "error_um": {
                 "first": of(0),
                 "last": of(-1),
