@@ -362,7 +362,7 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
         (
             HEADER + EVEN,
             ["--column", "command=u:furlong"],
-            "no unit 'furlong' of command; allowed: m, mm, um, nm, 1, or a",
+            "no unit 'furlong' of command; allowed: m, mm, um, nm, in, 1, or a",
         ),
         (HEADER.replace("_um", " [V]", 1) + EVEN, [], "has the unit 'V'; allowed for command"),
         (HEADER + EVEN + "30.3,1,1\n", [], "not in even steps.*resample the record, or give --rate"),
