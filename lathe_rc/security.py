@@ -7,7 +7,7 @@ its nodes' profiles. No name is denied explicitly, since everything outside the 
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lathe_rc import harness
@@ -44,6 +44,7 @@ _LIFECYCLE = (
 _PLAYER = "burst get_rate is_paused pause play_next resume seek set_rate stop toggle_paused"
 _SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split())}  # services of some kinds of nodes
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
+_OF_A_SIMULATOR = ("get_simulation_state", "get_simulator_features", "set_simulation_state", "step_simulation")
 _OF_THE_MACHINE = {"joint_states", "wrench"}  # topics of the node machine_state
 _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create
 
@@ -105,6 +106,8 @@ class _Maker:
             subscribe=reads - inside | heard,
             services=services,
         )
+        if getattr(self._scenario.nodes[name], "simulation_services", ""):
+            profile = replace(profile, reply=profile.reply.union(_OF_A_SIMULATOR))
         self.members.append(profile)
         return profile
 

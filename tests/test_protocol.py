@@ -312,6 +312,38 @@ def test_the_window_bounds_the_blocks_in_flight_and_the_slowest_member_gives_cre
     assert protocol.credit == 1
 
 
+@pytest.mark.parametrize("stalls", ["wait", "safe"])
+def test_a_run_that_is_held_goes_on_with_the_same_values_and_nobody_was_silent(stalls):
+    """Held for longer than any patience, twice in a row; the stand-still is the time master's own will."""
+
+    def hold(cell):
+        spindle = cell.process_of("/spindle")
+
+        def to(blocks):
+            spindle.protocol.hold(blocks, cell.now)
+            spindle.wake()
+
+        to(8)
+        cell.at(cell.now + 20.0, lambda: to(12))
+        cell.at(cell.now + 40.0, lambda: to(None))
+
+    cell = piston(hold, stalls=stalls)
+    assert cell.now > 40.0
+    assert not told(cell, "stall")
+    assert not told(cell, "safe")
+
+
+def test_the_safe_state_ends_a_hold():
+    protocol = leads()
+    release(protocol, 2)
+    protocol.hold(2, 0.0)
+    assert protocol.credit == 0
+    protocol.declare_safe("the encoder is lost", 1.0)
+    assert (protocol.held_at, protocol.credit) == (None, 2)
+    protocol.hold(2, 2.0)
+    assert protocol.held_at is None, "the members shall reach their safe state"
+
+
 @pytest.mark.parametrize("session", [0, 5])
 def test_progress_of_another_start_of_the_scenario_is_a_stranger(session):
     """Equal scenarios have equal run ids: "/c claims 7472 blocks; 0 were sent" ended a cell beside one that ended."""

@@ -20,6 +20,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.nodes.cell_node import CellNode, from_ros
 from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.simulation_services import SimulationServices
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMasterProtocol, actions
 
@@ -50,6 +51,7 @@ class SpindleRole(StageRole):
         self.pace = Pace(_per_block(table), table.window, round(_JUDGED / block))
         self._reported: deque[Progress] = deque()  # of members in this process
         self._cell: Cell | None = None
+        self._simulation: SimulationServices | None = None
 
     def _check_pace(self, table: TimeMasterParameters) -> None:
         if table.members and not table.window and not table.speed_factor:
@@ -93,6 +95,8 @@ class SpindleRole(StageRole):
         )
         protocol = TimeMasterProtocol(own, table.window, reactions, masters=MASTERS)
         protocol.know_end(self.stage.samples)
+        if table.simulation_services == "paused":
+            protocol.held_at = 0
         return protocol
 
     def member_names(self) -> list[str]:
@@ -109,6 +113,8 @@ class SpindleRole(StageRole):
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
         node.create_subscription(ProgressMessage, "progress", node.guarded(self._on_progress), latched_qos())
         node.exchange.master = node.guarded(self._reported.append)
+        if self.table.simulation_services:
+            self._simulation = SimulationServices(node, self.leads, self.pace)
 
     def _on_progress(self, message: ProgressMessage) -> None:
         self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
@@ -144,6 +150,14 @@ class SpindleRole(StageRole):
             case actions.TellPace():
                 if figures := self.pace.figures():
                     self.node.reporter("pace", self.node.get_name(), **figures)
+        if self._simulation is not None:
+            self._simulation.look()
+
+    def failed(self) -> None:
+        """Dissolve the chain, and answer a client that waits for a step (extends `StageRole`)."""
+        super().failed()
+        if self._simulation is not None:
+            self._simulation.look()
 
     def _check_cell(self) -> None:
         """Check the cell as before an offline run, with the actual parameters of the members, and start the run."""
@@ -254,4 +268,6 @@ class SpindleRole(StageRole):
         super().tick(now)
         if self.leads.running:
             self.node.attempt(self.release)
+        if self._simulation is not None:
+            self._simulation.tick(now)
         return min(now + _LOOK, self.node.next_tick)

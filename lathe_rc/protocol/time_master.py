@@ -40,6 +40,7 @@ class TimeMasterProtocol(MemberProtocol):
         running: True from block 0 to the end of the run.
         unsafe: members that have not confirmed the safe state; no block is released until all have.
         completed: number of blocks that each member has completed.
+        held_at: total number of blocks after which the run is held; None: it is not held.
         latency: histogram of the time from the release of a block to its completion by every member.
     """
 
@@ -52,6 +53,7 @@ class TimeMasterProtocol(MemberProtocol):
         self.running = False
         self.unsafe: frozenset[str] = frozenset()
         self.completed = {name: 0 for name in own.members if name != own.name}
+        self.held_at: int | None = None
         self.latency = Durations()
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were released
         self._checking = self._declared = False
@@ -78,6 +80,11 @@ class TimeMasterProtocol(MemberProtocol):
 
     @property
     def credit(self) -> int:
+        """Return the number of blocks that the window allows, and the hold if there is one."""
+        return self._room if self.held_at is None else min(self._room, self.held_at - self.blocks)
+
+    @property
+    def _room(self) -> int:
         """Return the number of blocks that the window allows."""
         if not self.completed or not self.window:
             return 1
@@ -203,6 +210,15 @@ class TimeMasterProtocol(MemberProtocol):
         else:
             self.actions.append(do.Release())
 
+    def hold(self, blocks: int | None, now: float) -> None:
+        """Hold the run after a total number of blocks, or let it go on: None; a held run changes no sample.
+
+        A safe state ends the hold.
+        """
+        self.held_at = None if self._declared else blocks
+        self._heard = now  # nobody was silent meanwhile
+        self.actions.append(do.Release())
+
     # ---- end ----------------------------------------------------------------------------------------
 
     def complete_part(self) -> None:
@@ -263,7 +279,7 @@ class TimeMasterProtocol(MemberProtocol):
     def _look_at_the_silent(self, now: float) -> None:
         silent = self.silent.keys() & self.completed.keys()
         stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
-        stands = (self.unsafe or self.credit <= 0) and now - self._heard > SILENCE
+        stands = (self.unsafe or self._room <= 0) and now - self._heard > SILENCE
         if stands:
             # Waiting members lag as much as the stalled one: members without DDS liveliness are named first.
             self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
@@ -338,7 +354,7 @@ class TimeMasterProtocol(MemberProtocol):
     def declare_safe(self, why: str, now: float) -> None:
         """Declare the safe state from the next sample on; blocks are released again once all members know."""
         self._why = f"{self._why}; {why}" if self._why else f"{why}: safe state from sample {self.samples} on"
-        again, self._declared = self._declared, True
+        again, self._declared, self.held_at = self._declared, True, None
         if not again:
             if self.end != self.samples:
                 self._set_end(self.samples + self._reactions.safe_samples)

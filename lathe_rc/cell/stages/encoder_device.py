@@ -106,6 +106,11 @@ class EncoderDevice(TimeMaster):
         needed = {"topic": "topic", "line": "device", "file": "counts_file"}[source]
         if not getattr(parameters, needed):
             raise InputError(f"{self.name}.{needed} is empty with source = {source}; allowed: a name")
+        if self.live and parameters.simulation_services:
+            raise InputError(
+                f"{self.name}.simulation_services = {parameters.simulation_services!r} with source = "
+                f"{parameters.source}; allowed: none, since nobody can hold the spindle"
+            )
         if self.live and parameters.speed_factor != 1.0:
             raise InputError(
                 f"{self.name}.speed_factor = {parameters.speed_factor:g} with source = {source}; allowed: 1, since the "

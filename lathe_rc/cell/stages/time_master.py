@@ -48,6 +48,9 @@ class TimeMasterParameters(NodeParameters):
     restart_time: Annotated[float, Ge(0), Le(3600)] = parameter(
         30.0, "wall time in which a member that can be restarted has to be back", "s"
     )
+    simulation_services: Literal["", "playing", "paused"] = parameter(
+        "", "offer services of simulation_interfaces, with a run that begins playing or paused; empty: none"
+    )
     members: list[str] = parameter([], "nodes that must be ready before block 0; empty: start alone")
     processes: list[str] = parameter(
         [], "nodes that share a process, as 'coarse+tool', for harness and launch; those not named have one each"
