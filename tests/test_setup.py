@@ -29,7 +29,17 @@ from lathe_rc.nodes import dds
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 # files from which ./lathe computes the keys of its steps
-INPUTS = ["lathe", "tools", "requirements", "msg_defs", "setup.py", "setup.cfg", "package.xml", "lathe_rc/nodes/dds.py"]
+INPUTS = [
+    "lathe",
+    "tools",
+    "requirements",
+    "msg_defs",
+    "third_party",
+    "setup.py",
+    "setup.cfg",
+    "package.xml",
+    "lathe_rc/nodes/dds.py",
+]
 LINES_SHOWN = 15
 
 
@@ -181,6 +191,7 @@ def keys(monkeypatch, copy: Path, chosen: ros.SourcedRos | None = None) -> tuple
         ("requirements/ros.lock", 0),
         ("requirements/python.lock", 0),
         ("msg_defs/msg/BlockInfo.msg", 1),
+        ("third_party/simulation_interfaces/msg/Result.msg", 1),
         ("setup.py", 2),
         ("config/new.yaml", 2),
         ("lathe_rc/new_module.py", 3),

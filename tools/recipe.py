@@ -24,7 +24,7 @@ from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PYTHON, REQUIREMEN
 CONSTRAINTS = VENV / "constraints.txt"
 PACKAGES_STAMP = VENV / "packages.stamp"
 MESSAGES_STAMP = INSTALL / "messages.stamp"
-SIMULATION = ROOT / "third_party" / "simulation_interfaces"
+SIMULATION = Path("third_party", "simulation_interfaces")  # in ROOT
 ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
 
 CHECK_NETWORK = "check the network and the free disk space, then call again"
@@ -80,7 +80,7 @@ class Recipe:
                 *(tools / name for name in ("recipe.py", "ros.py")),
             ],
         )
-        self._messages_key = digest([self._packages_key], [*sources(ROOT / "msg_defs"), *sources(SIMULATION)])
+        self._messages_key = digest([self._packages_key], [*sources(ROOT / "msg_defs"), *sources(ROOT / SIMULATION)])
         # lathe_rc is installed as links: only a new file that is not a module needs a new installation.
         linked = [path for folder in ("config", "launch", "urdf") for path in sources(ROOT / folder)]
         self._package_key = digest(
@@ -169,7 +169,7 @@ class Recipe:
         there = self._ros and any(Path(prefix, "share", SIMULATION.name).exists() for prefix in self._ros.prefixes)
         with Step("messages", "40 s", advice, lock) as step:
             step.run(
-                *colcon("--paths", ROOT / "msg_defs", *([] if there else [SIMULATION])),
+                *colcon("--paths", ROOT / "msg_defs", *([] if there else [ROOT / SIMULATION])),
                 *("--cmake-args", *cmake_options(PYTHON), *(() if self._ros else (PYTHON_ALONE,))),
                 environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )
