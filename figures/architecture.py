@@ -24,7 +24,11 @@ LAYERS = (
     Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
     Layer(
         "beside the cell",
-        {"bag": "MCAP: record, read, check, recover, simulate again", "protocol": "joining, progress, deaths, the end"},
+        {
+            "bag": "MCAP: record, read, repair",
+            "protocol": "joining, progress, the end",
+            "c_library": "stages without Python",
+        },
     ),
     Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
     Layer(

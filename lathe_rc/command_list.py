@@ -16,7 +16,7 @@ COMMANDS = {
     "correct": "Correct the programmed form of the next part.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "design": "Find the learning law of a scenario for a measured drive.",
-    "export": "Export a recording as CSV, Parquet or NPZ.",
+    "export": "Export a recording as tables, or stages as a C library.",
     "fit": "Fit models to measurements.",
     "measure": "Measure the part turned in a recorded run.",
     "new": "Create a law, drive, stage or study of your own.",

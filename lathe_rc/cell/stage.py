@@ -35,7 +35,7 @@ from lathe_rc.names import instead
 from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
-from lathe_rc.signals.noise import Sensor
+from lathe_rc.signals.noise import NormalStream, Sensor
 
 
 @dataclass(frozen=True)
@@ -173,6 +173,7 @@ class Stage(ABC):
     outputs: tuple[Output, ...] = ()
     step: ClassVar[Step | None] = None
     learns: ClassVar[bool] = False  #: whether a run tells its stability margin
+    goes_on: ClassVar[Mapping[int, str]] = {}  #: stop reasons, in words, after which the step needs no answer
     rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
     _sensors: Sequence[Sensor] = ()  # sensors whose noise the step needs
 
@@ -612,7 +613,7 @@ class Stage(ABC):
     def room(self) -> Samples:
         """Scratch memory of the step, shape (rooms, MAX_BLOCK), allocated once because allocation is slow."""
         if self._room is None:
-            self._room = np.empty((self.rooms, messages.MAX_BLOCK))
+            self._room = np.zeros((self.rooms, messages.MAX_BLOCK))
         return self._room
 
     def take_room(self, other: "Stage") -> None:
@@ -634,10 +635,25 @@ class Stage(ABC):
             if "parameters" in state:  # not of every third-party stage
                 self.__dict__["parameters"] = self.parameters_now
 
+    @property
+    def streams(self) -> list[NormalStream]:
+        """Return the random streams whose numbers the step uses."""
+        return [sensor.stream for sensor in self._sensors]
+
+    @property
+    def needs_python(self) -> str:
+        """Return why the compiled step cannot run without Python, with what is allowed instead; empty if it can."""
+        return "" if self.is_compiled else f"{self.kind} has no compiled step; allowed: a step or sample with @kernel"
+
+    @property
+    def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
+        """Return the numbers in the memory that a host without Python may change, by name: array and flat index."""
+        return {}
+
     def prepare(self, first: int, samples: int) -> None:
-        """Prepare the noise of the samples from ``first`` in the memory, as the step cannot generate it."""
-        for sensor in self._sensors:
-            sensor.draw(samples)
+        """Draw the random numbers of the samples from ``first`` in advance, as the step cannot draw them."""
+        for stream in self.streams:
+            stream.draw(samples)
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]

@@ -1,15 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command ``lathe export``: signals of a bag as CSV, Parquet or NumPy files."""
+"""Command group ``lathe export``: signals of a bag as CSV, Parquet or NumPy files, and stages as a C library."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from lathe_rc.commands import options
+from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
 
+_TARGETS = ("x86-64", "aarch64")  # those of lathe_rc.c_library.object_code, whose import takes a second
 
-@click.command()
+
+class _BagUnlessNamed(click.Group):
+    """Group whose command ``bag`` need not be named."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, with ``bag`` before them if they name no command."""
+        named = not args or args[0] in (*self.commands, *ctx.help_option_names)
+        return super().parse_args(ctx, args if named else ["bag", *args])
+
+
+@click.group(cls=_BagUnlessNamed)
+def export() -> None:
+    """Export a recording as tables, or stages of a scenario as a C library; without a command: a recording."""
+
+
+@export.command()
 @options.bag
 @click.option("--csv", "kinds", flag_value="csv", multiple=True, help="a CSV file for each topic")
 @click.option("--parquet", "kinds", flag_value="parquet", multiple=True, help="a Parquet file for each topic")
@@ -21,7 +38,7 @@ from lathe_rc.errors import InputError
     help="folder, for --npz file, to make; must not exist; default: BAG-csv, BAG-parquet or BAG.npz, here",
 )
 @click.option("--topics", multiple=True, metavar="LIST", help="like /tool,/encoder; repeatable; default: all signals")
-def export(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[str, ...]) -> None:
+def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[str, ...]) -> None:
     """Export the signal topics of a recording, with units."""
     if len(kinds) != 1:
         raise InputError(f"{len(kinds)} formats; allowed: one of --csv, --parquet and --npz")
@@ -34,3 +51,35 @@ def export(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple
     wanted = [topic.strip() for text in topics for topic in text.split(",") if topic.strip()]
     done = exporting.export_bag(bag, place, kind, wanted)
     click.echo(f"{len(done.rows)} topics, {sum(done.rows.values())} rows: {done.place}")
+
+
+@export.command("c")
+@click.argument("nodes", nargs=-1, metavar="[NODE]...", shell_complete=completers.nodes)
+@click.option("--scenario", required=True, shell_complete=completers.scenarios, help="whose tables the nodes have")
+@options.overrides
+@click.option("--name", help="of the library, a C identifier; default: that of the node or, if several, the scenario")
+@click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-c, here")
+@click.option("--target", type=click.Choice(_TARGETS), default="x86-64", show_default=True, help="processor")
+@click.option("--block", type=int, help="most samples in a call, and the delay of fed-back inputs; default: block_size")
+@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@click.option(
+    "--samples",
+    type=click.IntRange(1),
+    default=65536,
+    show_default=True,
+    help="of the engine's run with which the example compares the library",
+)
+@options.allow_code
+def c_library(
+    nodes: tuple[str, ...], scenario: str, overrides: tuple[str, ...], output: Path | None, **how: Any
+) -> None:
+    """Export NODEs of a scenario, wired together, as a C library that needs no Python; none: all of them."""
+    from lathe_rc.c_library.sources import export_nodes
+    from lathe_rc.commands import scenario as scenarios
+
+    done = export_nodes(scenarios.load(scenario, overrides), nodes, output, **how)
+    for line in done.library.left_out:
+        click.echo(f"warning: not in the library, the program has to cause it: {line}", err=True)
+    exported = ", ".join(part.stage.name for part in done.library.parts)
+    click.echo(f"{done.place}: {exported}; state of {done.library.size} bytes")
+    click.echo(f"next: cd {done.place} && cmake -B build && cmake --build build && build/{done.library.name}_main")

@@ -131,6 +131,19 @@ class CompiledStep:
         """
         return self._entry.address
 
+    @property
+    def table(self) -> AddressTable:
+        """Layout of the address table."""
+        return self._entry.table
+
+    def intermediate_code(self) -> tuple[str, str]:
+        """Return the name of the function in Numba's optimised LLVM code, and this code.
+
+        Raises:
+            InputError: the function cannot be compiled.
+        """
+        return self._entry.intermediate_code()
+
     def __call__(self, first: int, start: int, fields: Sequence[npt.NDArray[Any]], samples: int) -> tuple[int, int]:
         """Call the step with the arrays of all fields, each of shape (samples,)."""
         for place, array in zip(self._places, fields, strict=True):
@@ -177,10 +190,20 @@ class Entry:
     @cached_property
     def address(self) -> int:
         """Address of the function, which is compiled on first use."""
+        return int(self._enter.address)
+
+    @property
+    def _enter(self) -> Any:
         try:
-            return int(_module(self.name, self._text, self._memory).enter.address)
+            return _module(self.name, self._text, self._memory).enter
         except NumbaError as error:
             raise InputError(_cause(str(error))) from error
+
+    def intermediate_code(self) -> tuple[str, str]:
+        """Return the name of the function in Numba's optimised LLVM code, and this code."""
+        enter = self._enter
+        # The code for linking is the whole code, also where the function comes from the cache.
+        return enter.native_name.removeprefix("cfunc."), str(enter._library._get_module_for_linking())  # noqa: SLF001
 
 
 _entry = cache(Entry)  # one entry for all calls with equal arguments

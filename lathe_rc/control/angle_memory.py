@@ -320,6 +320,7 @@ def _step(m: AngleMemory, first: int, start: int, angle: Array, told: Array) -> 
 def _end_cycle(m: AngleMemory, sample: int) -> None:
     """Log a completed cycle, and let the channel join if the error is small enough."""
     whole, real = m.whole, m.real
+    whole[LOGGED] %= LOG  # full where the host does not read it
     row = m.log[whole[LOGGED]]
     row[0], row[1], row[2] = sample, real[CYCLE_SQUARES], real[CYCLE_LARGEST]
     row[3] = whole[LEARNS] * whole[JOINED]

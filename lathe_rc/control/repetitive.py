@@ -94,7 +94,7 @@ class RepetitiveController:
     ) -> None:
         self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
         self.preview = preview
-        room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
+        room: dict[str, Any] = {name: np.zeros(shape) for name, shape in _ROOM.items()}
         whole, real = np.zeros(angle_memory.INTEGERS, dtype=np.int64), np.zeros(angle_memory.REALS)
         whole[angle_memory.LEARNS], whole[angle_memory.JOINED] = 1, np.isinf(join_below)
         real[angle_memory.PLACE] = np.nan
@@ -111,11 +111,11 @@ class RepetitiveController:
             memory=self._room_for(q),
             **self._smoother(q),
             **room,
-            sample=np.empty(angle_memory.PIECE, dtype=np.int64),
-            work=np.empty((7, angle_memory.PIECE + 1)),
+            sample=np.zeros(angle_memory.PIECE, dtype=np.int64),
+            work=np.zeros((7, angle_memory.PIECE + 1)),
             whole=whole,
             real=real,
-            log=np.empty((angle_memory.LOG, 5)),
+            log=np.zeros((angle_memory.LOG, 5)),
         )
         self._cycles = 0
         self._rms_before = np.nan
@@ -133,7 +133,7 @@ class RepetitiveController:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a pickled state, with new scratch arrays."""
         self.__dict__.update(state)
-        room: dict[str, Any] = {name: np.empty(shape) for name, shape in _ROOM.items()}
+        room: dict[str, Any] = {name: np.zeros(shape) for name, shape in _ROOM.items()}
         self.table = self.table._replace(**room)
 
     @property
@@ -207,8 +207,8 @@ class RepetitiveController:
         return {
             "ratio": q.ratio,
             "reach": q.reach,
-            "chunk": np.empty(q.chunk),
-            "scratch": np.empty((2, q.chunk + 2 * q.reach)),
+            "chunk": np.zeros(q.chunk),
+            "scratch": np.zeros((2, q.chunk + 2 * q.reach)),
         }
 
     def clear(self) -> None:

@@ -117,6 +117,7 @@ class Allowance:
         name: name of the node; selects an independent random stream.
 
     Attributes:
+        stream: stream of the random walk.
         table: constants and state for `allow`.
 
     Raises:
@@ -130,14 +131,10 @@ class Allowance:
         wrong = order[(order < 1.0) | (order != np.rint(order))]
         if wrong.size:
             raise InputError(f"run-out: order {wrong[0]:g}; allowed: whole numbers from 1")
-        self._stream = NormalStream(seed, name)
-        self.table = AllowanceTable(walk, run_out, self._stream.drawn, np.zeros(2))
-
-    def draw(self, samples: int) -> None:
-        """Draw the random numbers for the next ``samples`` samples, up to 8192."""
-        self._stream.draw(samples)
+        self.stream = NormalStream(seed, name)
+        self.table = AllowanceTable(walk, run_out, self.stream.drawn, np.zeros(2))
 
     def block(self, angle: Array, allowance: Array) -> None:
         """Fill ``allowance`` [m] at the true spindle ``angle`` [rad]; both of shape (n,)."""
-        for piece in self._stream.draw_along(angle.size):
+        for piece in self.stream.draw_along(angle.size):
             allow(self.table, angle[piece], allowance[piece])

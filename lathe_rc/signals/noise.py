@@ -45,14 +45,15 @@ class NormalStream:
         on: whether any numbers are drawn.
 
     Attributes:
+        generator: NumPy's generator of the numbers; only if any are drawn.
         drawn: numbers drawn in advance, for kernels.
     """
 
     def __init__(self, seed: int, name: str, *, on: bool = True) -> None:
         if on:
-            self._random = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
+            self.generator = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
         size = DRAWN if on else 0
-        self.drawn = Drawn(np.empty(size), np.array([size], np.int64))
+        self.drawn = Drawn(np.zeros(size), np.array([size], np.int64))
 
     def draw(self, numbers: int) -> None:
         """Ensure that ``numbers`` random numbers are drawn in advance, up to 8192."""
@@ -61,7 +62,7 @@ class NormalStream:
             # Unused numbers move to the front, so that numbers are used in the order drawn for any block length.
             left = values.size - used[0]
             values[:left] = values[used[0] :].copy()
-            self._random.standard_normal(out=values[left:])
+            self.generator.standard_normal(out=values[left:])
             used[0] = 0
 
     def draw_along(self, samples: int) -> Iterator[slice]:
@@ -123,18 +124,15 @@ class Sensor:
         name: name of the sensor; selects an independent noise stream.
 
     Attributes:
+        stream: stream of the noise.
         table: constants and random numbers for `measure`.
     """
 
     def __init__(self, noise_rms: float, resolution: float, seed: int, name: str) -> None:
-        self._stream = NormalStream(seed, name, on=noise_rms > 0.0)
-        self.table = SensorTable(self._stream.drawn, noise_rms, resolution)
-
-    def draw(self, samples: int) -> None:
-        """Draw the noise for the next ``samples`` samples, up to 8192."""
-        self._stream.draw(samples)
+        self.stream = NormalStream(seed, name, on=noise_rms > 0.0)
+        self.table = SensorTable(self.stream.drawn, noise_rms, resolution)
 
     def measure(self, true: Array, measured: Array) -> None:
         """Fill ``measured`` from ``true`` with noise and rounding, both of shape (n,)."""
-        for piece in self._stream.draw_along(true.size):
+        for piece in self.stream.draw_along(true.size):
             measure(self.table, true[piece], measured[piece])

@@ -22,7 +22,7 @@ from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, Elasticity, F
 from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.safety.faults import Fault
 from lathe_rc.signals.allowance import Allowance, AllowanceTable, allow, mean_reverting, unbounded
-from lathe_rc.signals.noise import Sensor, SensorTable, measure
+from lathe_rc.signals.noise import NormalStream, Sensor, SensorTable, measure
 
 _ELASTICITIES = {"rigid": RIGID, "paper": PAPER, "realistic": REALISTIC}
 READ = {
@@ -265,11 +265,10 @@ class CutStage(Stage):
         ]
         self.cut.damage(shorter=shorter, spots=spots)
 
-    def prepare(self, first: int, samples: int) -> None:
-        """Generate allowance and sensor noise for the samples ahead."""
-        super().prepare(first, samples)
-        self._allowance.draw(samples)
-        self._force_sensor.draw(samples)
+    @property
+    def streams(self) -> list[NormalStream]:
+        """Return the random streams of the drives' sensors, the allowance and the force sensor."""
+        return [*super().streams, self._allowance.stream, self._force_sensor.stream]
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]

@@ -2,7 +2,7 @@
 """Control laws as plug-ins: a class with a formula per sample, independent of ports, blocks and events."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -251,6 +251,11 @@ class Law(Sampled, Learner):
         """Current memory of the step of the control law."""
         delay, period = self.parameters.feedback_delay, self.parameters.step
         return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
+
+    @property
+    def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
+        """Return whether events permit learning."""
+        return {"learning": (self._learns, 0)}
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -54,6 +54,7 @@ class LearningController(Learner):
     factor = "sup|Q - Z|"
     remedy = "another lead, correction or Q"
     step = staticmethod(step)
+    goes_on: ClassVar[Mapping[int, str]] = {angle_memory.CYCLE_ENDED: "a cycle has ended"}
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
@@ -280,6 +281,20 @@ class LearningController(Learner):
             state=self._state,
         )
 
+    @property
+    def needs_python(self) -> str:
+        """Return why the step needs Python: filters other than the exponential one are no kernels."""
+        filtered = f"q_filter = {self.parameters.q_filter} is computed in Python; allowed: exponential"
+        return filtered if self._q.ratio < 0.0 else super().needs_python
+
+    @property
+    def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
+        """Return whether it learns, and what the end of a cycle may change: the margin, and a1 and a2 of 1/W0."""
+        table, obedience = self._controller.table, self._obedience
+        learning = obedience.wanted if obedience else (table.whole, angle_memory.LEARNS)
+        inverse = {"inverse_a1": (table.settings, 0), "inverse_a2": (table.settings, 1)}
+        return {"learning": learning, "stability_margin": (self._margin, 0), **inverse}
+
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
     ) -> list[Sparse]:
@@ -294,17 +309,14 @@ class LearningController(Learner):
             self._controller.smooth()
             return []
         if reason == angle_memory.CYCLE_ENDED:
-            return self._newest_cycle(reached, outputs) if self._asks else []
+            return self._newest_cycle() if self._asks else []
         angle, speed, past_angle = inputs[0]["angle"], inputs[0]["speed"], inputs[1]["angle"]
         raise self._controller.lost(reason, first, reached, angle, speed, past_angle)
 
-    def _newest_cycle(self, reached: int, outputs: Sequence[Signals]) -> list[Sparse]:
+    def _newest_cycle(self) -> list[Sparse]:
         """Complete the cycle that ended with the previous sample; its results apply from that sample on."""
         sparse = [message for cycle in self._controller.ended() for message in self._end_cycle(cycle)]
         self._margin[0] = sparse[0].values["stability_margin"]
-        for published in outputs[1:]:
-            # That sample has been written already, with the margin of the previous cycle.
-            published["stability_margin"][reached - 1] = self._margin[0]
         return sparse
 
     def tell(self, first: int, end: int) -> list[Sparse]:

@@ -94,11 +94,21 @@ def _lose(memory: Memory, start: int, stop: int, command: Samples) -> None:
     command[start:stop] = command[start - 1] if start > memory.state[_BEGIN] else memory.who.obedience.takeover.given[1]
 
 
+@inlined
+def _publish(memory: Memory, start: int, stop: int, outputs: Fields) -> None:
+    """Fill the stability margin of some samples, if it is published."""
+    for published in range(1, len(outputs)):
+        outputs[published][start:stop] = memory.margin[0]
+
+
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """Compute the command of one block from the repetitive memory over the angle."""
     control, state, who, command = memory.control, memory.state, memory.who, outputs[0]
     n = command.size
+    if state[_INSIDE] and start > 0:
+        # A cycle has ended with the previous sample, to which its margin applies.
+        _publish(memory, start - 1, start, outputs)
     # If it stopped within a segment, the step function resumes with this segment still open, possibly at its end.
     while start < n or state[_INSIDE]:
         if not state[_INSIDE]:
@@ -126,8 +136,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 # Before `accumulate`, since a segment may be longer than the delay.
                 command_sent(memory.identifier, first, start, reached, command)
                 accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
-        for published in range(1, len(outputs)):
-            outputs[published][start:reached] = memory.margin[0]
+        _publish(memory, start, reached, outputs)
         if reason != DONE:
             return reached, reason
         apply(who, command[begin:stop])

@@ -170,6 +170,11 @@ class Obedience:
         """Table for `piece` and `apply`."""
         return ObedienceTable(self._whole, self._forbidden, self._takeover.table)
 
+    @property
+    def wanted(self) -> tuple[npt.NDArray[np.int64], int]:
+        """Array and index of the number that tells whether learning is requested."""
+        return self._whole, _WANTS
+
     def learn(self, *, wanted: bool) -> None:
         """Start or stop learning as soon as no reaction forbids it."""
         self._whole[_WANTS] = wanted

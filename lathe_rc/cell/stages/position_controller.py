@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Position controller of a slide: PID, sampled link, or the periodic law."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -192,7 +193,9 @@ def _repeat(
         command[k] = held[0]
         held[1] = max(held[1], abs(error[k]))
         if (n + 1) % period == 0:
-            # A log, since a kernel cannot publish; the step function stops when the log is full.
+            # A log, since a kernel cannot publish; the step function stops when the log is full, and a host that does
+            # not read the log then begins it anew.
+            memory.logged[0] %= memory.log.shape[0]
             row = memory.log[memory.logged[0]]
             row[0], row[1] = n + 1, held[1]
             periodic.achieved(memory.state, row[2:])
@@ -234,6 +237,7 @@ class PositionController(Servo):
 
     kind = "position_controller"
     Parameters = PositionControllerParameters
+    goes_on: ClassVar[Mapping[int, str]] = {_TOLD: "the log of periods is full"}
 
     def __init__(self, name: str, parameters: PositionControllerParameters) -> None:
         super().__init__(name, parameters)
@@ -252,7 +256,7 @@ class PositionController(Servo):
             with about(name, "predistortion_file"):
                 self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
-        self._held, self._log, self._logged = np.zeros(2), np.empty((_PERIODS, 8)), np.zeros(1, np.int64)
+        self._held, self._log, self._logged = np.zeros(2), np.zeros((_PERIODS, 8)), np.zeros(1, np.int64)
         self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC

@@ -89,10 +89,6 @@ class Servo(Obedient):
         """Return the warning about a trajectory outside the run."""
         return [f"{self.name}.{doubt}" for doubt in self.trajectory.doubts(seconds)]
 
-    def prepare(self, first: int, samples: int) -> None:
-        """Compute the set point of the samples ahead."""
-        self.trajectory.prepare(first, samples)
-
 
 @kernel
 def pid_along(

@@ -374,6 +374,11 @@ class Supervisor(Stage):
         return Reaction(self._state[_REACTION])
 
     @property
+    def needs_python(self) -> str:
+        """Return why the step needs Python: the monitors of others are no kernels."""
+        return "monitors of others are computed in Python; allowed: none" if self._plain else super().needs_python
+
+    @property
     def memory(self) -> Memory:
         """Current state of the supervisor's step function."""
         # Monitors in Python need every block, so the step function stops in each of them.

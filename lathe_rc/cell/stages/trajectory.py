@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import resources
-from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.messages import MAX_BLOCK, Samples
+from lathe_rc.messages import Samples
 from lathe_rc.signals.example_002 import fill_reference
 from lathe_rc.signals.table import read_table
 
@@ -30,23 +28,47 @@ class TrajectoryParameters(NodeParameters):
     )
 
 
+_STEPS, _LINEAR, _PAPER_002 = range(3)  # kinds of a course
+_KINDS = {"steps": _STEPS, "csv": _LINEAR, "paper_002": _PAPER_002}
+_ROUNDED = 1 + 1e-12  # prevents a step from starting one sample late because of a rounding error
+
+
 class Course(NamedTuple):
-    """Precomputed samples of a set point, for kernels.
+    """Set point over time, for kernels.
 
     Attributes:
-        values: samples computed in advance.
-        span: index of the first sample, and of the one after the last.
+        kind: steps, linear between points, or r(t) of paper 002.
+        step: sampling step [s].
+        times: times of the steps or points [s], increasing, shape (n,).
+        values: set points from these times on, or at these times, shape (n,).
     """
 
+    kind: int
+    step: float
+    times: Samples
     values: Samples
-    span: npt.NDArray[np.int64]
 
 
 @kernel
 def follow(course: Course, first: int, set_point: Samples) -> None:
-    """Fill the set point, shape (n,), from prepared samples starting at ``first``."""
-    begin = first - course.span[0]
-    put(set_point, course.values[begin : begin + set_point.size])
+    """Fill the set point, shape (n,), of the samples starting at ``first``."""
+    if course.kind == _PAPER_002:
+        fill_reference(first, course.step, set_point)
+        return
+    times, values = course.times, course.values
+    stretch = _ROUNDED if course.kind == _STEPS else 1.0
+    past = np.searchsorted(times, course.step * first * stretch, side="right")
+    for k in range(set_point.size):
+        time = course.step * (first + k)
+        while past < times.size and times[past] <= time * stretch:
+            past += 1
+        if past == 0:
+            set_point[k] = 0.0 if course.kind == _STEPS else values[0]
+        elif course.kind == _STEPS or past == times.size or times[past - 1] == time:
+            set_point[k] = values[past - 1]
+        else:
+            slope = (values[past] - values[past - 1]) / (times[past] - times[past - 1])
+            set_point[k] = slope * (time - times[past - 1]) + values[past - 1]
 
 
 class Trajectory:
@@ -57,14 +79,14 @@ class Trajectory:
         parameters: parameter table of the node.
 
     Attributes:
-        course: samples for `follow`.
+        course: set point for `follow`.
 
     Raises:
         InputError: lists differ in length, times do not increase, or a file cannot be used.
     """
 
     def __init__(self, node: str, parameters: TrajectoryParameters) -> None:
-        self._step, self._kind = parameters.step, parameters.trajectory
+        self._kind = parameters.trajectory
         values = parameters.set_point or [0.0]
         times = parameters.set_point_time or [0.0] * min(len(values), 1)
         if self._kind == "csv":
@@ -80,39 +102,17 @@ class Trajectory:
             raise InputError(
                 f"{node}.set_point, set_point_time: {len(values)} values and {len(times)} times; give as many of each"
             )
-        self._times, self._values = np.array(times), np.array(values)
-        if not self._times.size or np.any(np.diff(self._times) <= 0.0):
+        course = Course(
+            _KINDS[self._kind], parameters.step, np.array(times, dtype=float), np.array(values, dtype=float)
+        )
+        if not course.times.size or np.any(np.diff(course.times) <= 0.0):
             where = "trajectory_file" if self._kind == "csv" else "set_point_time"
             raise InputError(f"{node}.{where}: {times[:5]} s; allowed: one time or more, each later than the last")
-
-        self.course = Course(np.empty(MAX_BLOCK), np.zeros(2, np.int64))
+        self.course = course
 
     def doubts(self, seconds: float) -> list[str]:
         """Return a one-line warning if a file begins after the end of a run of ``seconds``."""
-        if self._kind != "csv" or self._times[0] < seconds:
+        if self._kind != "csv" or self.course.times[0] < seconds:
             return []
-        start = f"trajectory_file begins at {self._times[0]:.10g} s, after the end of the run at {seconds:.5g} s"
+        start = f"trajectory_file begins at {self.course.times[0]:.10g} s, after the end of the run at {seconds:.5g} s"
         return [f"{start}: the set point is its first value throughout; times count from the start of the run"]
-
-    def prepare(self, first: int, samples: int) -> None:
-        """Prepare up to 8192 samples starting at ``first``."""
-        values, span = self.course
-        if not span[0] <= first <= first + samples <= span[1]:
-            self.block(first, values[:samples])
-            span[:] = first, first + samples
-
-    def block(self, first: int, set_point: Samples) -> None:
-        """Fill the set point, shape (n,), for samples starting at ``first``."""
-        if self._kind == "paper_002":
-            fill_reference(first, self._step, set_point)
-            return
-        if self._kind == "steps" and first * self._step >= self._times[-1]:
-            set_point.fill(self._values[-1])  # the last value, held for the rest of the run
-            return
-        time = self._step * np.arange(first, first + set_point.size)
-        if self._kind == "csv":
-            set_point[:] = np.interp(time, self._times, self._values)
-            return
-        # The factor prevents a step from starting one sample late because of a rounding error.
-        place = np.searchsorted(self._times, time * (1 + 1e-12), side="right")
-        set_point[:] = np.where(place > 0, self._values[place - 1], 0.0)

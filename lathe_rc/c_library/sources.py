@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of a C library: header, tables, objects, an example that checks it, CMake file and README."""
+
+import hashlib
+import inspect
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from numba.np.random._constants import fi_double, ki_double, wi_double
+
+from lathe_rc import __version__
+from lathe_rc.c_library.library import Library, Parameter, Signal
+from lathe_rc.c_library.object_code import TARGETS, constant_bytes, object_code
+from lathe_rc.c_library.reference import Reference
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+
+_IMAGE = "_image"  # object with the block at the start; no name of a node begins like this
+_GAP = 4  # zero words that are stored, so that there are fewer runs
+_OF_US = re.compile(r"`(lathe_rc\.[a-z_.]+)`")
+_IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
+_FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
+
+
+def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
+    """Return the text files of a library by name.
+
+    Args:
+        library: the library.
+        scenario: name of the scenario, for the comments.
+        target: processor of the objects, for the comments (see `lathe_rc.c_library.object_code.TARGETS`).
+    """
+    runs = _runs(library.image.view(np.uint64))
+    made: dict[str, Any] = {
+        **{name: getattr(library, name) for name in _KEPT},
+        "upper": library.name.upper(),
+        "nodes": ", ".join(part.stage.name for part in library.parts),
+        "scenario": scenario,
+        "target": target,
+        "compiler": TARGETS[target].compiler,
+        "version": __version__,
+        "objects": [*(part.stage.name for part in library.parts), _IMAGE],
+        "runs": [(8 * begin, end - begin) for begin, end in runs],
+        "tapes": [(tape.offset, tape.bytes, tape.length) for tape in library.tapes],
+        "streams": [(stream.state, stream.values, stream.used) for stream in library.streams],
+        "ziggurat": {
+            "k": _listed(f"{word:#x}u" for word in ki_double.tolist()),
+            "w": _listed(map(float.hex, wi_double.tolist())),
+            "f": _listed(map(float.hex, fi_double.tolist())),
+        },
+        "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.goes_on.items()],
+        "formulas": list(_formulas(part.stage for part in library.parts)),
+        "identity": "",
+    }
+    found = {}
+    for name in _FIXED:
+        found[name] = _TEMPLATES.get_template(f"{name}.j2").render(made)
+    found[f"{library.name}.h"] = _TEMPLATES.get_template("NAME.h.j2").render(made)
+    tables = _TEMPLATES.get_template("NAME.c.j2")
+    told = hashlib.sha256(tables.render(made).encode() + library.image.tobytes())
+    made["identity"] = f"0x{told.hexdigest()[:16]}"
+    found[f"{library.name}.c"] = tables.render(made)
+    return found
+
+
+_KEPT = ("name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "room", "size", "left_out")
+
+
+def objects(library: Library, target: str) -> dict[str, bytes]:
+    """Return the object files of a library by name: its stages, and the words of the block that are not 0."""
+    words = library.image.view(np.uint64)
+    content = np.concatenate([words[begin:end] for begin, end in _runs(words)]).tobytes()
+    steps = {part.stage.name: object_code(part.stage.native(), part.symbol, target) for part in library.parts}
+    return {**steps, _IMAGE: constant_bytes(content, f"{library.name}_words", target)}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Result of `export_nodes`.
+
+    Attributes:
+        place: the folder.
+        library: the library.
+        reference: run of the engine with which the example compares it.
+    """
+
+    place: Path
+    library: Library
+    reference: Reference
+
+
+def export_nodes(
+    scenario: Scenario,
+    nodes: Sequence[str] = (),
+    place: Path | None = None,
+    *,
+    name: str | None = None,
+    target: str = "x86-64",
+    block: int | None = None,
+    tune: Collection[str] = (),
+    samples: int = 65536,
+) -> Exported:
+    """Write stages of a scenario as a C library into a new folder.
+
+    Args:
+        scenario: the scenario.
+        nodes: names of the stages; none: all of them.
+        place: folder to make; None: the name with ``-c``, in the current folder.
+        name: name of the library; None: that of the only node or of the scenario.
+        target: one of `lathe_rc.c_library.object_code.TARGETS`.
+        block: largest number of samples in a call; None: the block size of the scenario.
+        tune: see `lathe_rc.c_library.library.Library`.
+        samples: length of the reference [sample].
+
+    Raises:
+        InputError: the folder exists, the name is no identifier, or as for `lathe_rc.c_library.library.Library`.
+        LatheError: a step needs more than libm, or the folder cannot be written.
+    """
+    cell = Cell(scenario.nodes)
+    nodes = nodes or list(cell.stages)
+    name = name or (nodes[0] if len(nodes) == 1 else scenario.name)
+    place = place or Path(f"{name}-c")
+    if not _IDENTIFIER.fullmatch(name):
+        raise InputError(f"--name {name}; allowed: a C identifier of small letters, digits and underscores")
+    if place.exists() or not place.absolute().parent.is_dir():
+        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
+    cell.check(cures=False)
+    library = Library(cell, nodes, name, block or cell.master.shared.block_size, tune)
+    texts, made = sources(library, scenario.name, target), objects(library, target)
+    reference = Reference(library, Cell(scenario.nodes), samples)
+    try:
+        with tempfile.TemporaryDirectory(dir=place.absolute().parent) as made_in:
+            new = Path(made_in) / name
+            (new / "objects").mkdir(parents=True)
+            for file, text in texts.items():
+                (new / file).write_text(text, encoding="utf-8")
+            for file, content in made.items():
+                (new / "objects" / f"{file}.o").write_bytes(content)
+            reference.write(new / "reference.bin")
+            new.rename(place)
+    except OSError as error:
+        raise LatheError(f"{place}: cannot be written ({error.strerror})") from None
+    return Exported(place, library, reference)
+
+
+def _runs(words: np.ndarray) -> list[tuple[int, int]]:
+    """Return the begin and end of the runs of words of which few are 0; all other words are 0."""
+    filled = np.flatnonzero(words)
+    breaks = np.flatnonzero(np.diff(filled) > _GAP)
+    begins, ends = filled[np.r_[0, breaks + 1]], filled[np.r_[breaks, -1]] + 1
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))
+
+
+def _formulas(stages: Iterable[Stage]) -> Iterator[tuple[str, str]]:
+    """Yield the titles and texts of the modules of some stages, and of the modules that their classes refer to."""
+    told: set[str] = set()
+    for stage in stages:
+        named = _OF_US.findall(inspect.getdoc(type(stage)) or "")
+        for name in (type(stage).__module__, *named):
+            module = sys.modules.get(name)
+            if module is None or name in told or not module.__doc__:
+                continue
+            told.add(name)
+            yield name, "\n".join(f"    {line}".rstrip() for line in inspect.cleandoc(module.__doc__).splitlines())
+
+
+def _listed(texts: Iterable[str]) -> str:
+    """Return an initialiser with eight elements in a line."""
+    all_of = list(texts)
+    return ",\n    ".join(", ".join(all_of[k : k + 8]) for k in range(0, len(all_of), 8))
+
+
+def _pairs(rows: Iterable[Iterable[int]]) -> str:
+    return ", ".join("{" + ", ".join(map(str, row)) + "}" for row in rows)
+
+
+def _number(value: float) -> str:
+    if np.isinf(value):
+        return "HUGE_VAL" if value > 0 else "-HUGE_VAL"
+    return float(value).hex()
+
+
+def _described(signal: Signal) -> str:
+    kind = "double" if signal.bytes == 8 else "uint8_t"
+    before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
+    late = f", of {before} before" if signal.delay else ""
+    return f"{kind} [{signal.unit}]{late}" if signal.unit else f"{kind}{late}"
+
+
+def _ranged(parameter: Parameter) -> str:
+    unit = f" {parameter.unit}" if parameter.unit not in ("", "1") else ""
+    limits = f", {parameter.limits}{unit}" if parameter.limits else ""
+    return f"{parameter.doc}; at the start {parameter.value:.10g}{unit}{limits}"
+
+
+_TEMPLATES = Environment(
+    loader=PackageLoader("lathe_rc", "templates/c_library"),
+    undefined=StrictUndefined,
+    keep_trailing_newline=True,
+    autoescape=False,  # noqa: S701 - C and Markdown, not HTML
+)
+_TEMPLATES.globals |= {
+    "pairs": _pairs,
+    "number": _number,
+    "described": _described,
+    "ranged": _ranged,
+    "identifier": lambda name: re.sub(r"\W", "_", name).upper(),
+    "text": json.dumps,
+}

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every law, drive and cell of the scenarios as a C library; with CMake, valgrind, a sanitizer, and on 64-bit ARM."""
+
+import subprocess
+
+import pytest
+from c_libraries import built
+from cells import SCENARIOS
+
+from lathe_rc.c_library.sources import export_nodes
+from lathe_rc.cell.scenario import load
+from lathe_rc.cell.wiring import Cell
+
+SAMPLES = 200_000  # beyond the event of each scenario that has one
+
+
+def told(exported, *command, samples=0):
+    """Output of the example, which must agree with the engine."""
+    place = exported.place
+    done = subprocess.run(
+        [*command, place / "reference.bin", str(samples)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the bits of the engine" in done.stdout
+    return done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=[path.stem for path in SCENARIOS])
+def test_each_cell_has_the_bits_of_the_engine(path, tmp_path):
+    exported = export_nodes(load(path), place=tmp_path / "cell", samples=SAMPLES)
+    assert exported.reference.samples > 40_000
+    told(exported, built(exported.place))
+
+
+def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
+    """One of each different compiled step that the scenarios have."""
+    steps = {}
+    for path in SCENARIOS:
+        for name, stage in Cell(load(path).nodes).stages.items():
+            steps.setdefault(stage.native().name, (path, name))
+    assert len(steps) > 25
+    for number, (path, name) in enumerate(steps.values()):
+        exported = export_nodes(load(path), [name], tmp_path / str(number), name="alone", samples=20_000)
+        told(exported, built(exported.place))
+
+
+def test_cmake_builds_both_libraries_and_the_example(tmp_path):
+    """The commands that ``lathe export c`` prints; no symbol of Python in either library."""
+    exported = export_nodes(load("two_channel"), place=tmp_path / "cell", samples=10_000)
+    for command in (["-B", "build"], ["--build", "build"]):
+        subprocess.run(["cmake", *command], cwd=exported.place, check=True)
+    build = exported.place / "build"
+    told(exported, build / "two_channel_main")
+    libraries = [build / "libtwo_channel.a", build / "libtwo_channel.so"]
+    symbols = subprocess.run(["nm", *libraries], capture_output=True, text=True, check=True).stdout
+    assert not [word for word in ("Py", "numba", "NRT") if word in symbols]
+
+
+def test_valgrind_finds_nothing(tmp_path):
+    exported = export_nodes(load("piston"), ["learning_controller"], tmp_path / "law", samples=20_000)
+    assert "ERROR SUMMARY: 0 errors" in told(
+        exported, "valgrind", "--error-exitcode=7", built(exported.place), samples=1_000_000
+    )
+
+
+def test_the_address_sanitizer_finds_nothing(tmp_path):
+    exported = export_nodes(load("full_cell"), place=tmp_path / "cell", samples=20_000)
+    flags = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
+    told(exported, built(exported.place, *flags), samples=1_000_000)
+
+
+@pytest.mark.parametrize(
+    ("name", "nodes"),
+    [("piston", ["learning_controller"]), ("robust", ["disturbance_controller"]), ("two_channel", [])],
+)
+def test_64_bit_arm_has_the_bits_of_the_engine(name, nodes, tmp_path):
+    """Cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
+    exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", target="aarch64", samples=20_000)
+    told(exported, "qemu-aarch64", built(exported.place, "-static", compiler="aarch64-linux-gnu-gcc"))
