@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of view.md: the piston demo in real time, and its report in a browser, light, dark and narrow.
+"""Makes the pictures of view.md: a piston's report in a browser, light, dark and narrow, and its comparison.
 
 With a bag as second argument, from that bag.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image
 
 import lathe_rc
-from lathe_rc.view import report
+from lathe_rc.view import compare, report
 from place import PICTURES
 
 BROWSER = sys.argv[1] if len(sys.argv) > 1 else "chromium"
@@ -57,3 +57,8 @@ with tempfile.TemporaryDirectory() as folder:
     for place, dark in enumerate((False, True)):
         both.paste(shot(page, NARROW, dark=dark), (place * (NARROW[0] + 20), 0))
     save(both, "report_narrow")
+    slow = Path(folder) / "slow"
+    lathe_rc.run(lathe_rc.load("piston", ["learning_controller.learning_gain=0.4"]), bag=slow)
+    compare.write_comparison({"turned": bag, "slow": slow}, page, ["turned", "slow"])
+    page.write_text(page.read_text(encoding="utf-8").replace(f"{folder}/report", "compare"), encoding="utf-8")
+    save(shot(page, (1000, 1660)), "compare")

@@ -80,6 +80,7 @@ TABLE = {
     "metrology.png": _script("metrology", 5),
     "piezo.png": _script("piezo", 30, "drives"),
     "predistortion.png": _script("predistortion", 5, "force_position"),
+    "compare.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_dark.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_narrow.png": _photograph("report_screenshot", "view.md", " chromium turned"),

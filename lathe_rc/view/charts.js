@@ -3,6 +3,18 @@
 // A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows the whole figure again.
 const { specs: SPECS, data: DATA, chosen: CHOSEN, look: LOOK } = JSON.parse(document.getElementById("figures").textContent);
 const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
+// Inputs of the page that set a parameter of the figures which have it; their parameters are named in usermeta.signals.
+const STEERS = [...document.querySelectorAll("input[data-signal]")], STEERED = {};
+function steer([view, signals]) {
+  for (const each of STEERS) {
+    if (signals.includes(each.dataset.signal) && each.validity.valid && each.value) view.signal(each.dataset.signal, Number(each.value));
+  }
+  return view.runAsync();
+}
+function steerAll() {
+  for (const each of STEERS) document.querySelectorAll(`output[data-signal="${each.dataset.signal}"]`).forEach(told => { told.value = each.value; });
+  Object.values(STEERED).forEach(steer);
+}
 function config(width) {
   const style = getComputedStyle(document.documentElement);
   const found = JSON.parse(JSON.stringify(LOOK), (_, value) => {
@@ -31,6 +43,7 @@ async function draw(name) {
   const options = { actions: false, ast: true, config: config(place.clientWidth), renderer: own.renderer || (name == "parallel-coordinates" ? "canvas" : "svg") };
   const { view } = await vegaEmbed(place, spec, options);
   if (own.box) boxed(name, place, view, own.square);
+  if (own.signals) await steer(STEERED[name] = [view, own.signals]);
 }
 function boxed(name, place, view, square) {
   const enlarge = ends => { if (ends) ENLARGED[name] = ends; else delete ENLARGED[name]; draw(name); };
@@ -66,4 +79,5 @@ document.querySelectorAll("select[data-figure]").forEach(each => each.addEventLi
 let waiting, width = innerWidth;
 addEventListener("resize", () => { if (innerWidth != width) { width = innerWidth; clearTimeout(waiting); waiting = setTimeout(drawAll, 150); } });
 DARK.addEventListener("change", drawAll);
+STEERS.forEach(each => each.addEventListener("input", steerAll));
 drawAll();

@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a bag: one self-contained HTML page.
-
-Strings from a bag are not trusted: they are truncated and reduced to printable characters, and the template escapes
-them.
-"""
+"""Report of a bag: one self-contained HTML page."""
 
 import json
 import os
 import shlex
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,63 +21,35 @@ from lathe_rc.cell.budget import budget
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.files import check_place, replacing
 from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view import report_loop
 from lathe_rc.view.charts import Charts, page_template
+from lathe_rc.view.pages import MOST_ROWS, Grid, check_page, grid, printable, shown, write_page
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
 from lathe_rc.view.report_verdict import assess
 
 _LONGEST_SCENARIO = 200_000  # characters
-_LONGEST_TEXT = 300
-_MOST_ROWS = 200
 _RPM = 60.0 / (2.0 * np.pi)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Table of a report; ``texts`` are the columns without numbers."""
-
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    texts: Sequence[str]
-
-
-def printable(text: str, longest: int = _LONGEST_TEXT) -> str:
-    """Return a string from a bag, truncated and reduced to printable characters, line ends and tabs."""
-    cut = text[:longest] + (f" … ({len(text)} characters)" if len(text) > longest else "")
-    return "".join(letter if letter.isprintable() or letter in "\n\t" else "\ufffd" for letter in cut)
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}" if np.isfinite(value) else "–"
-
-
-def _grid(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], texts: Sequence[str] = (), count: int = 0
-) -> Grid | None:
-    """Return a table of the first rows and the number of omitted rows out of ``count``; None without rows."""
-    cells = [
-        [_number(cell) if isinstance(cell, float) else printable(str(cell)) for cell in row]
-        for row in islice(rows, _MOST_ROWS)
-    ]
-    if count > len(cells):
-        cells.append([f"… and {count - len(cells)} more"])
-    return Grid(columns, cells, texts) if cells else None
+#: Signals that a page draws over time: field, name, axis, factor to the unit of the axis, and page about it.
+SIGNALS = (
+    ("speed_true", "Spindle speed", "speed [1/min]", _RPM, "docs/signals.md"),
+    ("force", "Cutting force", "main cutting force [N]", 1.0, "docs/cutting.md"),
+    ("wear", "Wear", "wear VB [µm]", 1e6, "docs/cutting.md"),
+)
 
 
 def _metrics(form: Form) -> Grid | None:
     rows = []
     for name, revolution in figures.shown_revolutions(form):
         numbers = revolution.numbers
-        waves = f"{numbers['largest_upr']['upr']}: {_number(numbers['largest_upr']['amplitude'])}"
+        waves = f"{numbers['largest_upr']['upr']}: {shown(numbers['largest_upr']['amplitude'])}"
         values = (float(numbers[key]) for key in ("rms", "max", "peak_to_valley", "ront", "ronq"))
         rows.append([numbers["revolution"], name, *values, *map(float, numbers["centre"]), waves, float(numbers["ra"])])
     columns = ("revolution", "", "RMS", "max", "P-V", "RONt", "RONq", "centre x", "centre y", "largest UPR", "Ra")
-    return _grid(columns, rows, ("",))
+    return grid(columns, rows, ("",))
 
 
 def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
@@ -105,11 +72,7 @@ def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts)
 
 
 def _signals(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
-    for field, name, unit, scale, page in (
-        ("speed_true", "Spindle speed", "speed [1/min]", _RPM, "docs/signals.md"),
-        ("force", "Cutting force", "main cutting force [N]", 1.0, "docs/cutting.md"),
-        ("wear", "Wear", "wear VB [µm]", 1e6, "docs/cutting.md"),
-    ):
+    for field, name, unit, scale, page in SIGNALS:
         curves = {topic: series for (topic, own), series in data.curves.signals.items() if own == field and series.size}
         if curves:
             low, high = (np.array([series.extremes for series in curves.values()]) * scale).T
@@ -117,8 +80,8 @@ def _signals(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
                 "name": name,
                 "page": page,
                 "places": charts.place([figures.against_time(data, curves, unit, scale)]),
-                "low": _number(float(low.min())),
-                "high": _number(float(high.max())),
+                "low": shown(float(low.min())),
+                "high": shown(float(high.max())),
                 "group": max(series.group for series in curves.values()),
             }
 
@@ -136,14 +99,14 @@ def _nodes(data: Gathered) -> Grid | None:
         for name, node in data.host.nodes.items()
     )
     columns = ("node", "reports", "worst", "blocks", "lost", "message")
-    return _grid(columns, rows, ("node", "worst", "message"))
+    return grid(columns, rows, ("node", "worst", "message"))
 
 
 def losses(data: Gathered) -> list[str]:
     """Return rejected messages, losses and failures, one line each."""
     host = data.host
     found = [f"reading stopped: {data.stopped}"] if data.stopped else []
-    for topic, tally in islice(data.topics.items(), _MOST_ROWS):
+    for topic, tally in islice(data.topics.items(), MOST_ROWS):
         if tally.open_end and not data.stopped and not data.complete:  # a snapshot ends before the run does
             found.append(f"{topic} does not say that the run ends with its last block: the recording was cut off")
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
@@ -178,13 +141,13 @@ def _topics(data: Gathered) -> Grid | None:
         for topic, tally in data.topics.items()
     )
     columns = ("topic", "type", "messages", "samples", "rate [1/s]", "from [s]", "to [s]", "kB")
-    return _grid(columns, rows, ("topic", "type"), len(data.topics))
+    return grid(columns, rows, ("topic", "type"), len(data.topics))
 
 
 def _events(data: Gathered) -> Grid | None:
     rows = ([each.topic, each.sample, each.sample * data.step_ns * 1e-9, each.text] for each in data.curves.events)
     columns = ("topic", "sample", "time [s]", "action")
-    return _grid(columns, rows, ("topic", "action"), data.curves.event_count)
+    return grid(columns, rows, ("topic", "action"), data.curves.event_count)
 
 
 def _versions(data: Gathered) -> Grid | None:
@@ -194,14 +157,14 @@ def _versions(data: Gathered) -> Grid | None:
         return None
     columns = ("made with", "version")
     rows = [(name, str(version)) for name, version in given.items()] if isinstance(given, dict) else []
-    return _grid(columns, rows, columns, len(rows))
+    return grid(columns, rows, columns, len(rows))
 
 
 def _origins(data: Gathered) -> Grid | None:
     found = origins(data.about)
     rows = ([origin.name, origin.package or "–", ", ".join(origin.used), origin.source] for origin in found)
     columns = ("class of others", "of", "used by", "source")
-    return _grid(columns, rows, columns, len(found))
+    return grid(columns, rows, columns, len(found))
 
 
 def _about(data: Gathered) -> Grid | None:
@@ -210,13 +173,13 @@ def _about(data: Gathered) -> Grid | None:
         for key, text in sorted(data.about.items())
         if key not in (SCENARIO, VERSIONS, ORIGINS)
     ]
-    return _grid(("key", "text"), rows, ("key", "text"), len(rows))
+    return grid(("key", "text"), rows, ("key", "text"), len(rows))
 
 
 def _budget(found: Budget) -> Grid | None:
     rows = [[part.name, part.percent(), part.rms * 1e6, part.largest * 1e6] for part in found.rows]
     rows.append(["form error", "100.0", found.rms * 1e6, found.largest * 1e6])
-    return _grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, ("cause",))
+    return grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, ("cause",))
 
 
 def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
@@ -227,8 +190,8 @@ def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
     for form in data.forms[:1]:
         if form.first and form.last:
             yield "revolutions", str(form.rms.size), ""
-            yield "RMS, first revolution", f"{_number(form.first.numbers['rms'])} µm", ""
-            yield "RMS, last revolution", f"{_number(form.last.numbers['rms'])} µm", ""
+            yield "RMS, first revolution", f"{shown(form.first.numbers['rms'])} µm", ""
+            yield "RMS, last revolution", f"{shown(form.last.numbers['rms'])} µm", ""
     if data.run_id:
         yield "run", printable(data.run_id, 16), ""
 
@@ -313,9 +276,7 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
         >>> report = lathe_rc.write_report("piston_bag", "piston.html")
     """
     bag, page = Path(bag), Path(page)
-    if page.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"-o {page}; allowed: a file name that ends in .html")
-    check_place("-o", page)
+    check_page(page)
     data = gather(bag)
     made_of = None
     if with_budget:
@@ -323,9 +284,5 @@ def write_report(bag: str | os.PathLike[str], page: str | os.PathLike[str], *, w
             made_of = budget(scenario_of(data.about, Path(folder)))
     command = shlex.join(["lathe", "report", str(bag), *(["--budget"] if with_budget else []), "-o", str(page)])
     text = render(data, name_of(bag), command, made_of)
-    try:
-        with replacing(page) as file:
-            file.write(text.encode("utf-8", "replace"))  # strings of a bag may contain lone surrogates
-    except OSError as error:
-        raise LatheError(f"{page}: cannot be written ({error.strerror})") from None
+    write_page(page, text)
     return data

@@ -31,9 +31,16 @@ _ALMOST = 1e-9  # relative difference above which two numbers count as different
 
 #: Dragging selects the range to enlarge.
 BOX: Spec = {"name": "box", "select": {"type": "interval", "translate": False, "zoom": False, "clear": False}}
-_LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolOpacity": 1, "symbolStrokeWidth": 3}
-_LEGEND["columnPadding"] = 24  # a reader's font may be wider than the font used for the layout
-_GRADIENT: Spec = {"orient": "top", "direction": "horizontal", "gradientLength": 260, "columns": 0, "titleLimit": 300}
+LEGEND: Spec = {"orient": "top", "title": None, "labelLimit": 260, "symbolOpacity": 1, "symbolStrokeWidth": 3}
+LEGEND["columnPadding"] = 24  # a reader's font may be wider than the font used for the layout
+_GRADIENT: Spec = {
+    "type": "gradient",
+    "orient": "top",
+    "direction": "horizontal",
+    "gradientLength": 260,
+    "columns": 0,
+    "titleLimit": 300,
+}
 
 
 def _plain(text: str) -> str:
@@ -72,7 +79,7 @@ def colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) 
     domain = [f"_{place}" for place in range(_COLOURS)]
     for label, place in places.items():
         domain[place] = label
-    named = {**_LEGEND, "symbolType": symbol, "values": list(places)} if legend else None
+    named = {**LEGEND, "symbolType": symbol, "values": list(places)} if legend else None
     return {"field": "l", "type": "nominal", "scale": {"domain": domain}, "legend": named}
 
 
@@ -124,6 +131,18 @@ def _downsample(fields: Samples, most: int) -> tuple[Samples, int]:
     return np.add.reduceat(fields, starts) / counts[:, None], group
 
 
+def diverging(title: str, largest: float, linear: float) -> Spec:
+    """Return the colours of a signed map (field ``data``), see `colour_range`, without gaps between its fields."""
+    ticks = [largest, linear] if largest > 3 * linear else [largest]
+    values = [*(-tick for tick in ticks), 0.0, *reversed(ticks)]
+    scale = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest], "range": "diverging"}
+    legend = {**_GRADIENT, "values": values, "format": ".3~g"}
+    return {
+        "color": quantity("data", title, scale=scale, legend=legend),
+        "stroke": quantity("data", title, scale=scale),
+    }
+
+
 def form_map(form: Form, maps: int) -> Spec:
     """Return a map of the radius deviation by revolution and angle; ``maps``: number of maps in the page."""
     fields = um(form.map.rows())
@@ -133,11 +152,7 @@ def form_map(form: Form, maps: int) -> Spec:
     end = form.map.size + 0.5
     up = {"title": "revolution", "start": 0.5, "step": group * form.map.group, "end": end}
     up["scale"] = {**axis_scale(ends=(0.5, end)), "reverse": True}
-    ticks = [largest, linear] if largest > 3 * linear else [largest]
-    values = [*(-tick for tick in ticks), 0.0, *reversed(ticks)]
-    scale = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest], "range": "diverging"}
-    legend = {**_GRADIENT, "values": values, "format": ".3~g"}
-    colour = quantity("data", "radius deviation [µm]", scale=scale, legend=legend)
+    colour = diverging("radius deviation [µm]", largest, linear)["color"]
     return _map(fields, _across(360 / _ACROSS, 45), up, colour)
 
 

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several runs side by side: one self-contained HTML page, made from their bags."""
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lathe_rc import __version__
+from lathe_rc.errors import InputError
+from lathe_rc.view import compare_figures as figures
+from lathe_rc.view import report_figures
+from lathe_rc.view.charts import Charts, page_template
+from lathe_rc.view.pages import Grid, check_page, grid, printable, write_page
+from lathe_rc.view.report import SIGNALS, losses
+from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_gather import Gathered, gather
+from lathe_rc.view.report_verdict import assess
+
+_MOST = 6  # runs, as many as there are colours
+_ABSENT = "–"
+
+
+def _forms(runs: Mapping[str, Gathered]) -> dict[str, Form]:
+    """Return the form of the first tool of each run that has complete revolutions."""
+    return {name: data.forms[0] for name, data in runs.items() if data.forms and data.forms[0].last}
+
+
+def _results(runs: Mapping[str, Gathered]) -> Grid | None:
+    rows = []
+    for name, data in runs.items():
+        found = assess(data, losses(data), None)
+        form = _forms({name: data}).get(name)
+        revolutions = (form.first, form.best, form.last) if form else ()
+        numbers = [float(each.numbers["rms"]) if each else np.nan for each in revolutions] or [np.nan] * 3
+        largest = float(form.last.numbers["max"]) if form and form.last else np.nan
+        wrong = found.wrong[0].text if found.wrong else ""
+        more = f" and {len(found.wrong) - 1} more" if len(found.wrong) > 1 else ""
+        rows.append([name, form.rms.size if form else 0, *numbers, largest, found.verdict.text, wrong + more])
+    columns = ("run", "revolutions", "RMS first", "RMS best", "RMS last", "max last", "verdict", "what went wrong")
+    return grid(columns, rows, ("run", "verdict", "what went wrong"))
+
+
+def _parameters(runs: Mapping[str, Gathered]) -> Grid | None:
+    """Return the parameters that differ, as the scenarios of the bags give them; None if none do."""
+    scenarios = [data.nodes for data in runs.values()]
+    names = {(node, name) for nodes in scenarios for node, values in nodes.items() for name in values}
+    rows = []
+    for node, name in sorted(name for name in names if name[1] != "run_id"):
+        values = [str(nodes.get(node, {}).get(name, _ABSENT)) for nodes in scenarios]
+        if len(set(values)) > 1:
+            rows.append([f"{node}.{name}", *values])
+    return grid(("parameter", *runs), rows, ("parameter", *runs), len(rows))
+
+
+def _signals(runs: Mapping[str, Gathered], charts: Charts) -> Iterator[dict[str, Any]]:
+    """Yield a figure of each plotted signal that any of the runs has."""
+    for field, name, unit, scale, page in SIGNALS:
+        drawn = {
+            f"{run}: {topic}" if len(data.forms) > 1 else run: (data, series)
+            for run, data in runs.items()
+            for (topic, own), series in data.curves.signals.items()
+            if own == field and series.size
+        }
+        if drawn:
+            first = next(iter(drawn.values()))[0]
+            curves = {label: series for label, (_, series) in drawn.items()}
+            yield {
+                "name": name,
+                "page": page,
+                "places": charts.place([report_figures.against_time(first, curves, unit, scale)]),
+            }
+
+
+def render(runs: Mapping[str, Gathered], command: str) -> str:
+    """Return the page.
+
+    Args:
+        runs: data of each run by its name, at least two.
+        command: command that reproduces the page.
+    """
+    charts = Charts()
+    template = page_template(Path(__file__).with_name("compare.html.j2"), printable=printable)
+    with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers, which are shown unchanged
+        forms = _forms(runs)
+        tolerance = max((form.tolerance for form in forms.values()), default=0.0)
+        together = figures.compared(forms, tolerance) if forms else None
+        places = {}
+        if together:
+            charts.data.update(together.data)
+            drawn = {
+                "verdicts": [figures.verdicts(together)],
+                "convergence": [figures.convergence(together)],
+                "maps": figures.maps(together),
+                "profile": [figures.profile(together)],
+                "polar": [figures.polar(together)],
+                "spectrum": [figures.spectrum(together)],
+            }
+            places = {name: charts.place(specs) for name, specs in drawn.items()}
+        text: str = template.render(
+            title=f"Comparison of {printable(', '.join(runs), 200)}",
+            command=printable(command),
+            version=__version__,
+            charts=charts,
+            results=_results(runs),
+            parameters=_parameters(runs),
+            unknown=[name for name, data in runs.items() if not data.nodes],
+            first=next(iter(runs)),
+            together=together,
+            formless=[name for name in runs if name not in forms],
+            figures=places,
+            signals=list(_signals(runs, charts)),
+        )
+    return text
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """Return a short name of each path: the last part, or the whole path where that is not unique.
+
+    Raises:
+        InputError: a path is given twice.
+    """
+    short = [path.stem if path.suffix else path.name for path in paths]
+    names = [name if short.count(name) == 1 else str(path) for name, path in zip(short, paths, strict=True)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"{twice} is given twice; allowed: different runs")
+    return names
+
+
+def check(bags: Mapping[str, Path], page: Path) -> None:
+    """Refuse a comparison that cannot be written.
+
+    Raises:
+        InputError: fewer than two runs or more than six, or the page cannot be created.
+    """
+    if not 2 <= len(bags) <= _MOST:
+        raise InputError(f"runs to compare: {len(bags)}; allowed: 2 to {_MOST}")
+    check_page(page)
+
+
+def write_comparison(bags: Mapping[str, Path], page: Path, given: Sequence[str]) -> None:
+    """Write the comparison of several bags, which `check` accepts.
+
+    Args:
+        bags: path of each bag by the name of its run.
+        page: path of the HTML file.
+        given: arguments of the command that reproduces the page.
+
+    Raises:
+        InputError: not a bag.
+        LatheError: the page cannot be written.
+    """
+    runs = {name: gather(bag) for name, bag in bags.items()}
+    write_page(page, render(runs, shlex.join(["lathe", "compare", *given, "-o", str(page)])))
