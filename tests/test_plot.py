@@ -91,3 +91,13 @@ def test_errors_of_0_have_no_logarithm_to_plot():
     perfect = run()
     perfect.errors.rms[:] = 0.0
     assert plot.drawn(perfect, 80) is None
+
+
+@pytest.mark.parametrize(("tolerance", "above"), [(2e-6, True), (5e-7, False)])
+def test_the_tolerance_is_drawn_on_its_side_of_a_power_of_ten(tolerance, above):
+    """2 µm was drawn on the line of 1 µm."""
+    lines = str(plot.drawn(run(tool={"tolerance": tolerance}), 80)).splitlines()
+    drawn = next(k for k, line in enumerate(lines) if len(re.findall("[⠁-⣿]", line)) > 60)
+    label = next(k for k, line in enumerate(lines) if line.lstrip().startswith("1┤"))
+    assert (drawn < label) == above
+    assert drawn != label

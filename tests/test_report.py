@@ -88,7 +88,7 @@ class TestPage:
     def test_figures_to_enlarge_have_the_numbers_of_the_pictures(self, turned):
         """Each follows the schema of its language; the curve of the form error is that of the recording."""
         specs = {name: spec for name, choices in turned.shown.specs.items() for spec in choices.values()}
-        assert len(specs) == 10  # the polar figure and those of the surface and of the loop have two
+        assert len(specs) == 9  # the polar figure and those of the surface and of the loop have two
         for spec in specs.values():
             alt.Chart.from_dict(of_two_rows(spec))
             assert spec["usermeta"]["box"]
@@ -102,17 +102,23 @@ class TestPage:
 
     def test_pictures_are_whole_svg_without_links(self, turned):
         images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', turned.page)
-        assert len(images) == 8  # two polar ones, spectrum, convergence, surface, two of the loop, speed; maps are JPEG
+        assert len(images) == 7  # two polar ones, spectrum, convergence, surface, two of the loop; maps are JPEG
         for image in images:
             root = ET.fromstring(base64.b64decode(image))  # noqa: S314 - made here
             assert root.tag == "{http://www.w3.org/2000/svg}svg"
             links = [v for element in root.iter() for k, v in element.attrib.items() if k.endswith("href")]
             assert all(link.startswith(("#", "data:image/png")) for link in links)
 
-    def test_names_its_pages_and_the_command_at_every_figure_and_table(self, turned):
+    def test_names_its_pages_at_every_figure_and_table_and_the_command_once(self, turned):
         page, command = turned.page, f"lathe report {turned.bag} -o {turned.bag.parent / 'page.html'}"
-        assert page.count(command) >= page.count("<figure>") + page.count("<table>")
+        assert page.count(command) == 1
+        assert page.count("See docs/") >= page.count("<figure>") + page.count("<table>")
         assert page.count("docs/metrology.md") >= 5
+
+    def test_a_constant_signal_is_a_sentence(self, turned):
+        """As a figure it was a line along an axis with a single number."""
+        assert "Spindle speed. Constant: speed [1/min] 1000." in turned.shown.text
+        assert 'alt="Spindle speed"' not in turned.page
 
     def test_tells_scenario_versions_events_and_what_was_not_recorded(self, turned):
         text = turned.shown.text

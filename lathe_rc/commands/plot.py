@@ -10,7 +10,8 @@ from rich.text import Text
 from lathe_rc import harness, messages
 from lathe_rc.analysis.form_errors import turns_before
 
-_HEIGHT = 14  # height of the plot [lines]
+_ROWS = 12  # approximate height of the plot without frame and ticks [lines]
+_FRAME = 3  # lines of frame and ticks
 _NARROWEST = 40  # smallest width of the plot [characters]
 _POINTS = 4  # points of a curve per character of width
 _STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}  # styles of rich, by plotext's colours
@@ -45,7 +46,6 @@ def drawn(result: harness.Result, width: int) -> Text | None:
         curves.insert(0, (f"tolerance {limit:.4g} µm", "orange+", np.full(rms.size, limit)))
     plotext.clear_figure()  # the figure is global
     plotext.limit_size(False, False)  # noqa: FBT003 - so it is called
-    plotext.plot_size(width, _HEIGHT)
     for part in (plotext.canvas_color, plotext.axes_color, plotext.ticks_color):
         part("default")
     named = Text("form error [µm] by revolution: ")
@@ -54,6 +54,9 @@ def drawn(result: harness.Result, width: int) -> Text | None:
         plotext.plot(revolution, decades, marker="braille", color=colour)
         named.append(f" ━ {label}", style=_STYLES[colour])
     ticks = _decades(min(values.min() for *_, values in curves), max(values.max() for *_, values in curves))
+    count = len(ticks) - 1
+    # Each power of ten is in the middle of a line, so that curves pass its label on the right side.
+    plotext.plot_size(width, count * max(1, round(_ROWS / count)) + 1 + _FRAME)
     plotext.ylim(ticks[0], ticks[-1])
     plotext.yticks(ticks, [f"{10.0**tick:g}" for tick in ticks])
     across = np.unique(np.linspace(revolution[0], revolution[-1], max(2, width // 12)).round().astype(int)).tolist()

@@ -76,12 +76,16 @@ def _signals(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
         curves = {topic: series for (topic, own), series in data.curves.signals.items() if own == field and series.size}
         if curves:
             low, high = (np.array([series.extremes for series in curves.values()]) * scale).T
+            ends = float(low.min()), float(high.max())
+            constant = figures.almost_equal(*ends)  # a figure would show a line along an axis with one number
+            drawn = [] if constant else [figures.against_time(data, curves, unit, scale)]
             yield {
                 "name": name,
                 "page": page,
-                "places": charts.place([figures.against_time(data, curves, unit, scale)]),
-                "low": shown(float(low.min())),
-                "high": shown(float(high.max())),
+                "places": charts.place(drawn) if drawn else [],
+                "unit": unit,
+                "low": shown(ends[0]),
+                "high": shown(ends[1]),
                 "group": max(series.group for series in curves.values()),
             }
 

@@ -376,6 +376,11 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
 
 
+def almost_equal(low: float, high: float) -> bool:
+    """Return True if two numbers differ by no more than rounding errors."""
+    return high - low <= _ALMOST * max(abs(low), abs(high))
+
+
 def against_time(gathered: Gathered, signals: Mapping[str, Envelope], unit: str, scale: float) -> Spec:
     """Return a plot of signals over simulated time, with their extremes as a band.
 
@@ -413,9 +418,8 @@ def timing(host: Host, step: float) -> list[Spec]:
     """Return histograms of the pace, and of block lateness and latency if available; ``step`` in s."""
     pace = _clipped(np.array(host.pace)) * step
     low, high = (float(pace.min()), float(pace.max())) if pace.size else (0.0, 1.0)
-    least = _ALMOST * max(abs(low), abs(high))
-    if high - low <= least:  # nearly equal paces need a range that can be divided into bins
-        low, high = low - 0.5 - least, high + 0.5 + least
+    if almost_equal(low, high):  # such paces need a range that can be divided into bins
+        low, high = low - 0.5 * (1.0 + abs(low) * _ALMOST), high + 0.5 * (1.0 + abs(high) * _ALMOST)
     counts, edges = np.histogram(pace, bins=min(30, max(5, pace.size // 3)), range=(low, high))
     found = [_histogram("pace", counts, edges, ("simulated by wall time [s/s]", "reports"), _GREY, log=False)]
     for name, across, durations, colour in (
