@@ -41,7 +41,7 @@ LAYERS = (
     ),
     Layer("physics, laws", {"plants": "drives, cut, slides, spindle", "control": "learning, PID, decoupling"}),
     Layer("signals", {"signals": "speed, encoder, form"}),
-    Layer("compiled code", {"compiled": "memories and addresses of steps"}),
+    Layer("compiled code", {"compiled": "memories and addresses of steps", "fmi": "models of other tools"}),
 )
 #: Arrows within a layer.
 BESIDE = (("drawing", "analysis"), ("plants", "control"))

@@ -20,6 +20,7 @@ from types import ModuleType
 from lathe_rc.errors import InputError, shown
 
 OPTION = "--allow-code"
+FILES = frozenset({"fmu_file"})  #: parameters whose files are machine code; only the user may name one
 
 _STORAGES = {".mcap", ".db3"}
 _METADATA, _HEAD = "metadata.yaml", b"rosbag2_bagfile_information"

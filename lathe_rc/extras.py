@@ -11,6 +11,7 @@ from types import ModuleType
 from lathe_rc.errors import LatheError
 
 _MODULES = {
+    "fmu": ("fmpy",),
     "formats": ("asammdf", "nptdms", "x3pio"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
@@ -24,6 +25,7 @@ _MODULES = {
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
 _CHECKOUT = {
+    "fmu": "./lathe setup fmu in a checkout",
     "formats": "./lathe setup formats in a checkout",
     "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
     "sweep": "./lathe setup sweep in a checkout",

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lathe_rc import harness
+from lathe_rc import allowed_code, harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.resimulation import resim
 from lathe_rc.cell import batch
@@ -46,7 +46,14 @@ def _runs(scenario: Scenario, folder: Path) -> Iterator[tuple[str, Digests]]:
     bag = folder / "offline"
     yield "offline", harness.run(scenario, mode="offline", bag=bag).digest
     yield "bag", reader.read_bag(bag).digests()
-    yield "simulated again", resim.resimulate(bag).digest
+    # A bag does not hold machine code.
+    code = [
+        f"{node}.{name}={file}"
+        for node, table in scenario.nodes.items()
+        for name in allowed_code.FILES
+        if (file := getattr(table, name, ""))
+    ]
+    yield "simulated again", resim.resimulate(bag, code).digest
     other = scenario.varied({"block_size": _OTHER_BLOCK})
     yield f"blocks of {_OTHER_BLOCK}", harness.run(other, mode="offline").digest
     yield "batch", _in_a_batch(scenario)

@@ -34,6 +34,16 @@ CELL_STATE = f"{PACKAGE}/msg/CellState"
 JOINTS = "sensor_msgs/msg/JointState"
 ALIVE = "alive"  #: topic on which each node asserts its liveliness; it carries no messages
 
+#: types of the topics that carry blocks, by the last component of their names
+BLOCK_TOPICS = {
+    "encoder": ENCODER,
+    "tool": TOOL,
+    "cut": CUT,
+    "command": COMMAND,
+    "state": STATE,
+    "margin": MARGIN,
+}
+
 START_NS = 1_000_000_000  #: simulated time of sample 0 [ns]; a stamp of 0 means "not set" in ROS
 MAX_BLOCK = 8192  #: maximum length of the arrays of a block [sample], as in the .msg files
 

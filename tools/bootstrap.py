@@ -98,7 +98,8 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
     sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
-    wanted = {**sweeps, "docs": ["docs"], "test": ["docs", "formats", "sweep", "test", "view"], "view": ["view"]}
+    test = ["docs", "fmu", "formats", "sweep", "test", "view"]
+    wanted = {**sweeps, "docs": ["docs"], "test": test, "view": ["view"]}
     return wanted.get(next(iter(arguments), ""), [])
 
 

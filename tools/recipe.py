@@ -49,6 +49,7 @@ class Group(NamedTuple):
 
 GROUPS = {
     "docs": Group("docs.in", "5 s, 250 MB", sourced=True, npm=True),
+    "fmu": Group("fmu.in", "5 s, 20 MB", sourced=False),
     "formats": Group("formats.in", "5 s, 60 MB", sourced=True),
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
     "sweep": Group("sweep.in", "5 s, 70 MB", sourced=True),

@@ -404,12 +404,14 @@ def read(
             elif row is not None and row.is_file and isinstance(value, str) and value:
                 place = _stands_for(f"{name}.{key}", value, path.parent, copies)
                 values[key] = str(place)
-                if not (place.is_relative_to(folder.resolve()) or resources.is_own(place)):
+                is_there = place.is_relative_to(folder.resolve()) or resources.is_own(place)
+                if not is_there or key in allowed_code.FILES:
                     outside[name, key] = place
     for text in overrides:
         outside.pop(_override(text, nodes), None)
     for (name, key), place in outside.items():
         what = f"a file outside of the bag {folder}" if copies is None else "a file that the bag does not hold"
+        what = "machine code" if key in allowed_code.FILES else what
         raise InputError(f"{shown(f'{name}.{key} = {place}')}: {what}; allowed: --set {shown(name)}.{key}=FILE")
     return nodes
 

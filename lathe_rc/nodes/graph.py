@@ -133,7 +133,8 @@ def _refused(kind: type[NodeParameters], values: Mapping[str, object]) -> str:
             for name in row.named.others(value):
                 if not registry.permits(name):
                     return f"{row.name} = {shown(repr(name))}: {registry.why_not(name)}"
-        if row.is_file and value and not _may_announce(str(value)):
+        permits = allowed_code.is_named if row.name in allowed_code.FILES else _may_announce
+        if row.is_file and value and not permits(str(value)):
             return f"{row.name} = {shown(repr(value))}: a file that no parameter file of this process names"
     return ""
 

@@ -8,7 +8,7 @@ Tool drives: `drive` and `plant` (common parts), `electrodynamic_actuator`, `pie
 Laws of the tool: `law` and `learner` (common parts), `learning_controller` with `learning_parameters` and
 `learning_step`, `form_law` (common part), `disturbance_controller`, `compound_controller`, `resonant_controller`.
 Feed: `feed_drive`, `servo` and `trajectory` (common parts), `position_controller`, `force_controller`, `decoupler`.
-Safety: `supervisor`, `obedience`, `command_limits`. Building blocks of stages: `tables`, `sampled`.
+Safety: `supervisor`, `obedience`, `command_limits`. Other tools: `fmu`. Building blocks of stages: `tables`, `sampled`.
 """
 
 from lathe_rc.cell.stage import Stage
@@ -41,6 +41,7 @@ _OWN = {
     "force_controller": "force_controller:ForceController",
     "decoupler": "decoupler:DecouplerStage",
     "supervisor": "supervisor:Supervisor",
+    "fmu": "fmu:FmuStage",
 }
 
 #: built-in and third-party stages, by name

@@ -119,15 +119,6 @@ class SupervisorParameters(NodeParameters):
 MEMBERS_LOST = "members_lost"  #: name in place of a monitor's: the host reports that members of the cell are lost
 RESET_REFUSED = "reset refused"  #: likewise: a reset is refused during a retraction or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
-_WATCHED = {
-    "encoder": messages.ENCODER,
-    "tool": messages.TOOL,
-    "cut": messages.CUT,
-    "command": messages.COMMAND,
-    "state": messages.STATE,
-    "margin": messages.MARGIN,
-}  # topic types by the last component of their names
-
 _STATE, _REACTION, _TOLD = range(3)  # indices into the state of the step function
 _ANSWER = 1  # stop reason: the state changes within the block, or a message is due
 
@@ -321,11 +312,11 @@ class Supervisor(Stage):
     def _field(self, name: str, text: str) -> tuple[int, str]:
         """Return the input index and the field for a TOPIC.FIELD parameter, adding or extending the input if needed."""
         topic, _, field = text.rpartition(".")
-        msgtype = _WATCHED.get(topic.rpartition("/")[2], "")
+        msgtype = messages.BLOCK_TOPICS.get(topic.rpartition("/")[2], "")
         known = messages.sample_fields(msgtype) if msgtype else {}
         if field not in known:
             fields = ", ".join(f"{topic}.{each}" for each in known)
-            allowed = fields or f"TOPIC.FIELD with a TOPIC that ends in {', '.join(_WATCHED)}"
+            allowed = fields or f"TOPIC.FIELD with a TOPIC that ends in {', '.join(messages.BLOCK_TOPICS)}"
             raise InputError(f"{self.name}.{name}: {text!r}; allowed: {allowed}")
         place = self._reads(topic, msgtype, (field,))
         port = self._inputs[place]
