@@ -31,6 +31,12 @@ class LossyRunError(LatheError):
     exit_code: ClassVar[int] = 3
 
 
+class PaceError(LatheError):
+    """Failure of a cell with a strict pace to hold it; the message names what lags, and a remedy."""
+
+    exit_code: ClassVar[int] = 4
+
+
 def shown(text: object, longest: int = 200) -> str:
     """Return the beginning of the first line of an external message, in printable characters."""
     first = (str(text).strip().splitlines() or [type(text).__name__])[0]

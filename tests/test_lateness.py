@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from lathe_rc import harness
 from lathe_rc.cell.latency_histogram import Lateness, Percentiles
 from lathe_rc.commands import outcome
+from lathe_rc.errors import InputError, PaceError
 
 
 @given(st.lists(st.floats(0.0, 1e4), min_size=1, max_size=300), st.sampled_from([1, 50, 95, 99, 100]))
@@ -48,6 +49,16 @@ def test_a_paced_run_tells_its_lateness_at_its_end(paced):
     assert list(told.within) == [50, 95, 99]
     assert 0.0 <= within[0] <= within[1] <= within[2] <= told.worst
     assert told.slipped >= 0.0
+
+
+def test_a_strict_pace_that_is_not_held_ends_the_run_with_its_own_exit_code():
+    hasty = {"revolutions": 1.0, "speed_factor": 1e6, "strict_pace": True}
+    late = r"strict_pace: block \d+ is .* ms late; allowed: half a window, .* is the slowest member; try a smaller"
+    with pytest.raises(PaceError, match=late) as failed:
+        harness.run(scenario(spindle_encoder=hasty), mode="composed")
+    assert failed.value.exit_code == 4
+    with pytest.raises(InputError, match="strict_pace with speed_factor = 0: there is no pace"):
+        harness.run(scenario(spindle_encoder={**hasty, "speed_factor": 0.0}), mode="composed")
 
 
 def test_without_a_pace_nothing_is_late():

@@ -407,7 +407,7 @@ def test_the_schedule_makes_up_half_a_window_and_slips_by_more():
     pace.count(1.1, 1)
     pace.slip(1.1)
     assert (pace.due(1), pace.slipped) == (103.1, 1.1)
-    assert pace.figures()["late"] == 1
+    assert pace.figures().late == 1
 
 
 def test_a_pace_that_is_lost_is_known_after_the_first_second():

@@ -69,6 +69,14 @@ class Lateness:
     within: Mapping[int, float]
     slipped: float
 
+    def lines(self) -> list[str]:
+        """Describe the lateness in two lines."""
+        within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in self.within.items())
+        return [
+            f"{self.late} of {self.blocks} blocks late; the schedule slipped by {self.slipped:.3g} s",
+            f"lateness: {within}, worst {self.worst * 1e3:.3g} ms",
+        ]
+
 
 class Percentiles:
     """Percentiles of durations in constant memory, from counts of rounded durations; values are up to 3 % too large.

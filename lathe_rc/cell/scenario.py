@@ -60,7 +60,7 @@ _EVERYONE = "/**"
 _ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
 # Parameters that affect neither the samples nor the messages of a run, and therefore not its identity.
 _HOST_PARAMETERS = {
-    *("run_id", "speed_factor", "simulation_services", "window", "members", "processes", "autostart"),
+    *("run_id", "speed_factor", "strict_pace", "simulation_services", "window", "members", "processes", "autostart"),
     *("stall_reaction", "stall_time", "safe_time", "restart_time", "restart_file"),
 }
 

@@ -12,7 +12,6 @@ from rich.text import Text
 from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.commands import plot, tables
 
 _MOST_EVENTS = 12  # rows of the event table
@@ -54,7 +53,7 @@ def facts(result: harness.Result) -> list[str]:
         *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
-        *(_lateness(result.lateness) if result.lateness else []),
+        *(result.lateness.lines() if result.lateness else []),
         *refused,
     ]
 
@@ -67,15 +66,6 @@ def _margins(result: harness.Result) -> list[str]:
     drives = [f"{name} {margin}" for name, margin in result.drive_margins.items()]
     lines = {"stability margin": margins, "drive margin": drives}
     return [f"{name}: {', '.join(each)}" for name, each in lines.items() if each]
-
-
-def _lateness(lateness: Lateness) -> list[str]:
-    """Describe the lateness of the blocks."""
-    within = ", ".join(f"{percent} % within {seconds * 1e3:.3g} ms" for percent, seconds in lateness.within.items())
-    return [
-        f"{lateness.late} of {lateness.blocks} blocks late; the schedule slipped by {lateness.slipped:.3g} s",
-        f"lateness: {within}, worst {lateness.worst * 1e3:.3g} ms",
-    ]
 
 
 def show_budget(found: Budget) -> None:

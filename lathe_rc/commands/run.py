@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 @options.groups
 @click.option("--revolutions", type=options.POSITIVE, help="length of the run")
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
+@click.option("--strict", is_flag=True, help="exit with 4 when the members are too slow for the pace")
 @click.option("--bag", type=options.PATH, help="folder to record to; must not exist")
 @click.option("--profile", type=options.PATH, help="CSV file to write the last revolution's profile to")
 @click.option("--figure", type=options.PATH, help="PNG to draw the form and its error to")

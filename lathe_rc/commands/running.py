@@ -33,6 +33,7 @@ def run(
     groups: tuple[str, ...],
     revolutions: float | None,
     speed_factor: float | None,
+    strict: bool,
     bag: Path | None,
     profile: Path | None,
     figure: Path | None,
@@ -50,13 +51,15 @@ def run(
         InputError: options contradict each other, or the scenario cannot run.
         LatheError: the run failed, or exceeds the required tolerance.
     """
-    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor)
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor, strict=strict)
     split = scenarios.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
     for option, value in (("--domain", domain), ("--namespace", namespace), ("--start", start)):
         if value is not None and mode == "offline":
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
+    if strict and mode == "offline":
+        raise InputError("--strict with --mode offline, which has no pace; allowed: --mode processes or composed")
     if require_tolerance and not part.tolerances(loaded):
         tools = loaded.of_kind("tool")
         cure = f", or --set {tools[0]}.tolerance=2e-6" if tools else f" ({loaded.name} has no tool)"

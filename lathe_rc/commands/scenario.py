@@ -8,7 +8,12 @@ from lathe_rc.cell.scenario import Scenario
 
 
 def load(
-    name: str, overrides: Sequence[str], *, revolutions: float | None = None, speed_factor: float | None = None
+    name: str,
+    overrides: Sequence[str],
+    *,
+    revolutions: float | None = None,
+    speed_factor: float | None = None,
+    strict: bool = False,
 ) -> Scenario:
     """Load a scenario from a file, or by a name without ``.yaml``, which is also looked up in ``config``.
 
@@ -17,14 +22,15 @@ def load(
         overrides: values of ``--set``.
         revolutions: length of the run; None: as in the scenario.
         speed_factor: pace of the run; None: as in the scenario.
+        strict: whether the run ends when it does not hold its pace, also if the scenario does not say so.
 
     Raises:
         InputError: there is no such scenario, or the scenario is invalid.
     """
     loaded = scenarios.load(name, overrides)
-    asked = {"revolutions": revolutions, "speed_factor": speed_factor}
+    asked = {"revolutions": revolutions, "speed_factor": speed_factor, "strict_pace": strict or None}
     given = {name: value for name, value in asked.items() if value is not None}
-    changes = [f"{node}.{n}={v!r}" for node in loaded.masters for n, v in given.items()]
+    changes = [f"{node}.{n}={str(v).lower()}" for node in loaded.masters for n, v in given.items()]
     return scenarios.load(name, [*overrides, *changes]) if changes else loaded
 
 

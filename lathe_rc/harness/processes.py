@@ -20,7 +20,7 @@ from typing import Any
 
 from lathe_rc import allowed_code, process_launcher
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.errors import InputError, LatheError, LossyRunError, PaceError
 from lathe_rc.extensions import search_path
 from lathe_rc.names import absolute
 from lathe_rc.nodes.report import THROUGHPUT
@@ -335,7 +335,7 @@ class Processes:
         if event["event"] in ("masterless", "interrupted"):
             raise LatheError(self._with_the_lost(event["message"]))
         if event["event"] == "error":
-            kinds = {InputError.exit_code: InputError, LossyRunError.exit_code: LossyRunError}
+            kinds = {kind.exit_code: kind for kind in (InputError, LossyRunError, PaceError)}
             self._lose(node, event["message"], kinds.get(event["exit_code"], LatheError))
             self._is_no_cause(node)
         if event["event"] == "exit" and event["code"] < 0 and self._complete:

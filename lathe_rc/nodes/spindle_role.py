@@ -4,6 +4,7 @@
 import time
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import cast
 
@@ -17,7 +18,7 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, PaceError
 from lathe_rc.nodes.cell_node import CellNode, from_ros
 from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.simulation_services import SimulationServices
@@ -54,6 +55,11 @@ class SpindleRole(StageRole):
         self._simulation: SimulationServices | None = None
 
     def _check_pace(self, table: TimeMasterParameters) -> None:
+        if table.strict_pace and not table.speed_factor:
+            raise InputError(
+                f"{self.node.get_name()}.strict_pace with speed_factor = 0: there is no pace; allowed: a speed_factor "
+                "above 0"
+            )
         if table.members and not table.window and not table.speed_factor:
             raise InputError(
                 f"{self.node.get_name()}.speed_factor = 0 with window = 0: nothing would hold the spindle back; "
@@ -149,7 +155,9 @@ class SpindleRole(StageRole):
                 self._clock_publisher.publish(clock)
             case actions.TellPace():
                 if figures := self.pace.figures():
-                    self.node.reporter("pace", self.node.get_name(), **figures)
+                    self.node.reporter("pace", self.node.get_name(), **asdict(figures))
+                    for line in () if self.node.reporter.attached else figures.lines():  # a harness prints them itself
+                        self.node.get_logger().info(line)
         if self._simulation is not None:
             self._simulation.look()
 
@@ -233,6 +241,12 @@ class SpindleRole(StageRole):
 
     def _tell_lag(self, lag: float) -> None:
         """Warn early that the members cannot hold the pace, and suggest a cheaper grouping with fewer processes."""
+        text = f"the cell holds {1.0 - lag:.0%} of its pace; {self._remedy()}"
+        self.node.get_logger().warning(text)
+        self.node.reporter("behind", self.node.get_name(), message=text)
+
+    def _remedy(self) -> str:
+        """Name the slowest member, and a grouping with fewer processes if there is one."""
         members = self.leads.members.values()
         processes = {member.process for member in members}
         recorders = [member.name for member in members if not member.publishes]
@@ -242,12 +256,19 @@ class SpindleRole(StageRole):
             if len(processes) > 1 + len(recorders)
             else "a smaller speed_factor, a larger block_size"
         )
-        text = f"the cell holds {1.0 - lag:.0%} of its pace; {self.leads.slowest} is the slowest member; try {cure}"
-        self.node.get_logger().warning(text)
-        self.node.reporter("behind", self.node.get_name(), message=text)
+        return f"{self.leads.slowest} is the slowest member; try {cure}"
 
     def fall_behind(self, late: float) -> None:
-        """Postpone the schedule by ``late`` [s]: the members are too slow for the pace."""
+        """Postpone the schedule by ``late`` [s]: the members are too slow for the pace.
+
+        Raises:
+            PaceError: the pace is strict.
+        """
+        if self.table.strict_pace:
+            raise PaceError(
+                f"{self.node.get_name()}.strict_pace: block {self.blocks} is {late * 1e3:.3g} ms late; allowed: half a "
+                f"window, {self.pace.most_late * 1e3:.3g} ms; {self._remedy()}"
+            )
         self.pace.slip(late)
 
     def lead(self) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pace of a run against wall time: the due time of each block, and its lateness."""
 
-from lathe_rc.cell.latency_histogram import PERCENT, Durations, Percentiles
+from lathe_rc.cell.latency_histogram import PERCENT, Durations, Lateness, Percentiles
 
 
 class Pace:
@@ -58,14 +58,9 @@ class Pace:
         self.schedule += late
         self.slipped += late
 
-    def figures(self) -> dict[str, object]:
-        """Return the figures of the run for the harness; empty for a run without a pace."""
+    def figures(self) -> Lateness | None:
+        """Return the lateness of the blocks of the run; None for a run without a pace."""
         if not self._percentiles.count:
-            return {}
-        return {
-            "blocks": self._percentiles.count,
-            "late": self._late,
-            "worst": self._percentiles.worst,
-            "within": {percent: self._percentiles.within(percent) for percent in PERCENT},
-            "slipped": self.slipped,
-        }
+            return None
+        within = {percent: self._percentiles.within(percent) for percent in PERCENT}
+        return Lateness(self._percentiles.count, self._late, self._percentiles.worst, within, self.slipped)

@@ -121,6 +121,7 @@ def test_parameters_are_set_in_a_run_that_is_simulated_again():
             assert "successful: from block" in ros2("param", "set", "/spindle_encoder", "speed_factor", "0.0")
             rest = launch.stdout.read()
             assert launch.wait() == 0, rest
+            assert " blocks late; the schedule slipped by " in rest
         finally:
             launch.send_signal(signal.SIGINT)
             ros2("daemon", "stop")

@@ -38,6 +38,9 @@ class TimeMasterParameters(NodeParameters):
     speed_factor: NonNegative = parameter(
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
     )
+    strict_pace: bool = parameter(
+        default=False, doc="end the run, with exit code 4, when the members are too slow for speed_factor"
+    )
     stall_reaction: Literal["wait", "safe"] = parameter(
         "wait", "what a member leads to that is silent; one whose process has died leads to the safe state"
     )
