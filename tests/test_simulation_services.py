@@ -31,9 +31,9 @@ class Client:
     def call(self, kind, name, **values):
         if name not in self._clients:
             self._clients[name] = self._node.create_client(kind, f"/{name}")
-            assert self._clients[name].wait_for_service(30.0)
+            assert self._clients[name].wait_for_service(120.0), "the first start on a machine compiles kernels"
         future = self._clients[name].call_async(kind.Request(**values))
-        rclpy.spin_until_future_complete(self._node, future, timeout_sec=30.0)
+        rclpy.spin_until_future_complete(self._node, future, timeout_sec=120.0)
         return future.result()
 
     @property
