@@ -18,12 +18,13 @@ from lathe_rc.signals import speed
 
 NOMINAL = 1000 * np.pi / 30
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3
+TAPS = tuple((np.cos(0.3 * np.arange(24.0)) / np.arange(2.0, 26.0)).tolist())  # 8 ms, far longer than the lead
 SWING = speed.harmonic(NOMINAL, np.array([0.1]), np.array([213.0]), np.zeros(1))
 
 
 def follow(law, lead_law, *, points, constant=0.0, spindle=SWING, seconds=0.4, lengths=None):
     """Read a frozen memory through a correction and a drive; returns angle and position."""
-    correction = Correction(law, WN, ZETA, lead=1e-3, lag=0.3e-3)
+    correction = Correction(law, WN, ZETA, lead=1e-3, lag=0.3e-3, taps=TAPS, interval=0.35e-3)
     ahead = {"lead_law": lead_law, "lead_time": TAU, "speed_law": spindle, "constant": constant}
     controller = make(**ahead, correction=correction, nominal=NOMINAL, delay=1000)
     controller.remember(points)
@@ -98,6 +99,17 @@ def test_lead_lag_has_its_response():
     assert_allclose(command[SETTLED], (z * np.exp(1j * waves * angle[SETTLED])).imag, atol=5e-4)
 
 
+def test_fir_filter_has_its_response_at_any_speed():
+    """Each tap has a lead of its own, and the late ones read the cycle before."""
+    waves = 8
+    points = np.sin(waves * np.arange(GRID) * TURN / GRID)
+    for turning in (0.8 * NOMINAL, NOMINAL):
+        angle, command, _ = follow(CorrectionLaw.FIR, LeadLaw.VARIABLE, points=points, spindle=speed.constant(turning))
+        p = 1j * waves * turning
+        z = sum(tap * np.exp(p * (TAU - k * 0.35e-3)) for k, tap in enumerate(TAPS))
+        assert_allclose(command[SETTLED], (z * np.exp(1j * waves * angle[SETTLED])).imag, atol=5e-4)
+
+
 @given(cuts, st.sampled_from(list(CorrectionLaw)), st.sampled_from(list(LeadLaw)))
 def test_cuts_change_nothing(lengths, law, lead_law):
     seconds = sum(lengths) * STEP
@@ -105,9 +117,11 @@ def test_cuts_change_nothing(lengths, law, lead_law):
     assert np.array_equal(whole, follow(law, lead_law, points=POINTS, seconds=seconds, lengths=lengths)[1])
 
 
-def test_lead_lag_without_a_lag_is_refused():
+def test_corrections_without_their_numbers_are_refused():
     with pytest.raises(InputError, match="lag = 0 s with correction lead_lag; allowed: above 0"):
         Correction(CorrectionLaw.LEAD_LAG, WN, ZETA)
+    with pytest.raises(InputError, match=r"0 taps in steps of 0\.001 s with correction fir; allowed: 1"):
+        Correction(CorrectionLaw.FIR, WN, ZETA, interval=1e-3)
 
 
 @given(st.floats(0.0, np.pi), st.floats(0.0, TURN))

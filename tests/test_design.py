@@ -3,11 +3,13 @@
 
 import json
 
+import numpy as np
 import pytest
 from cells import config
 from click.testing import CliRunner
 
 import lathe_rc
+from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.cell import design
 from lathe_rc.cell.design import Design
 from lathe_rc.cell.wiring import Cell
@@ -26,12 +28,15 @@ FAST += ["electrodynamic_actuator.noise_rms=50e-9", "spindle_encoder.counts_per_
 
 @pytest.fixture
 def few(monkeypatch):
-    laws = {name: design.LAWS[name] for name in ("lead, Gaussian Q", "inverse, Gaussian Q", "disturbance")}
+    laws = {
+        name: design.LAWS[name]
+        for name in ("lead, Gaussian Q", "measured, flat Q", "inverse, Gaussian Q", "disturbance")
+    }
     laws["disturbance"] = design.Law(
         "disturbance_controller",
         {"identify": False},
         [{"learned_waves": waves, "observer_bandwidth": 0.0} for waves in (8.0, 60.0)],
-        leads=False,
+        "",
     )
     monkeypatch.setattr(design, "LAWS", laws)
 
@@ -84,10 +89,32 @@ def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, mon
     assert not list(tmp_path.iterdir())
 
 
+def test_an_fir_inverse_is_that_of_the_response_it_is_given():
+    """Of the model or of the points; where these are known badly, and beyond them, it amplifies nothing."""
+    asked = Design(config("piston", *FAST), [DRIVE, OTHER], 0.3)
+    nominal, other = asked._responses(asked.drives)
+    frequency = np.linspace(100.0, 14_000.0, 1400)
+    noise = np.where(frequency < 9000.0, 1e-4, 10.0)
+    known = design.Known(nominal, 0.2e-3, FrequencyResponse(frequency, other(frequency), noise))
+
+    def inverted(drive, at, *, measured):
+        found = known.inverse(1e-3, measured=measured)
+        leads = found["lead_time"] - found["correction_interval"] * np.arange(len(found["correction_taps"]))
+        return np.exp(1j * np.outer(at, leads)) @ found["correction_taps"] * drive(at)
+
+    band, beyond = np.linspace(200.0, 7000.0, 400), np.linspace(10_500.0, 20_000.0, 100)
+    for drive, others, measured in ((nominal, other, False), (other, nominal, True)):
+        assert np.abs(np.angle(inverted(drive, band, measured=measured))).max() < 0.4
+        assert np.abs(np.angle(inverted(others, band, measured=measured))).max() > 1.5
+    of_model, of_points = (np.abs(inverted(np.ones_like, beyond, measured=each)).max() for each in (False, True))
+    assert (of_points < 1.0, of_model > 10.0) == (True, True)
+
+
 def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
     asked = Design(config("piston"), [{}], 0.3)
     (drive,) = asked._responses(asked.drives)
-    tried = [values for alike in design.LAWS["inverse, Gaussian Q"].settings(1.9e-3, 0.36e-3) for values in alike]
+    known = design.Known(drive, 0.36e-3, None)
+    tried = [values for alike in design.LAWS["inverse, Gaussian Q"].settings(known) for values in alike]
     assert max(asked._margin_of(design.LAWS["inverse, Gaussian Q"], values, [drive]) for values in tried[-40:]) > 0.9
     assert asked._settings(design.LAWS["inverse, Gaussian Q"])
 

@@ -192,17 +192,24 @@ class LearningLoop:
             read, first, second = derivative_responses(radians)
             per_second = self.grid / (2 * np.pi) * speed
             return np.asarray(read + a1 * per_second * first + a2 * per_second**2 * second)
-        if law is CorrectionLaw.LEAD_LAG:
+        if law is CorrectionLaw.FIR:
+            later = np.exp(-1j * waves * self._lead(speed) * (correction.interval / self.lead_time))
+            factor = np.polynomial.polynomial.polyval(later, np.array(correction.taps))
+        elif law is CorrectionLaw.LEAD_LAG:
             factor = (1 + p * correction.lead) / (1 + p * correction.lag)
         else:
             angular = 1j * waves * self.nominal
             factor = (1 + a1 * p + a2 * p**2) / (1 + a1 * angular + a2 * angular**2)
         return np.asarray(cubic_response(radians) * factor)
 
+    def _lead(self, speed: float) -> float:
+        """Return the lead angle [rad]."""
+        return self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
+
     def corrected_drive(self, waves: Array, speed: float) -> Complex:
         """Compute Z (drive, lead, correction, interpolators) at ``waves`` per revolution and a ``speed`` [rad/s]."""
         frequency = waves * speed
-        lead = self.lead_time * (speed if self.variable_lead else self.nominal) + self.constant_lead
+        lead = self._lead(speed)
         measured = cubic_response(frequency * self.step)
         return np.asarray(self.drive(frequency) * np.exp(1j * waves * lead) * self._correction(waves, speed) * measured)
 

@@ -178,7 +178,7 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
     """Return the cause ``model``: the model of a correction differs from the drive."""
     off: dict[str, Value] = {}
     for node, table in _learners(scenario).items():
-        if table.correction not in ("none", "lead_lag"):
+        if table.correction not in ("none", "lead_lag", "fir"):
             off |= {f"{node}.{name}": value for name, value in models.of_drives(node, scenario.nodes).items()}
     return {"model": Cause(off)}
 

@@ -12,12 +12,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.analysis.fir_inverse import fir_inverse
 from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell import batch
@@ -38,6 +40,9 @@ _SHAPES = ((2.5, 1e-4), (1.7, 1e-4), (1.4, 1e-3))  # begin of its stop band over
 _WIDTHS = np.geomspace(20e-6, 1e-3, 10)  # [s] q_time of the other ones
 _WAVES = (5.0, 8.0, 12.0, 20.0, 35.0, 60.0)  # of the disturbance law
 _LEARNING, _OBSERVERS = (1000.0, 3000.0, 8000.0), (0.0, 500.0, 2000.0, 4000.0)  # [rad/s]
+_PENALTIES = (1e-4, 1e-3, 1e-2)  # ρ of an FIR inverse
+_TAPS, _AHEAD, _DENSE = 64, 2.0, 1024  # its length, its lead and its interval in lags of the drive, points of a model
+_PER_LAG = 16
 _RUNS = 12  # settings of a law that are run
 #: parameters of the replaced controller that its law keeps
 _COMMON = {"feedback_delay", "reaction_delay", "retract_velocity", "retract_acceleration", "retract_jerk"}
@@ -51,24 +56,62 @@ class Law:
         kind: kind of the controller.
         fixed: parameters that distinguish the law.
         filters: parameters of its filter, each a choice between robustness and error.
-        leads: whether it has a lead and a gain.
-        inverts: whether its correction removes the lag of the drive's model but for the delay.
+        lead: what its lead compensates: the lag of the drive, the delay that a second-order inverse leaves, or the
+            response of the nominal drive or as measured, by an FIR inverse; empty for a law without lead and gain.
     """
 
     kind: str
     fixed: Values
     filters: Sequence[Values]
-    leads: bool = True
-    inverts: bool = False
+    lead: Literal["", "lag", "delay", "model", "measured"] = "lag"
 
-    def settings(self, lag: float, delay: float) -> Iterator[Sequence[Values]]:
-        """Yield settings that differ in the lead alone, for a drive of a ``lag`` and ``delay`` [s]."""
-        if not self.leads:
-            yield from ([each] for each in self.filters)
-            return
-        leads = (_LEADS * (max(delay, 0.1 * lag) if self.inverts else lag)).tolist()
-        for each, gain in product(self.filters, _GAINS):
-            yield [{**each, "learning_gain": gain, "lead_time": lead} for lead in leads]
+    def settings(self, drive: "Known") -> Iterator[Sequence[Values]]:
+        """Yield settings that differ in the lead alone, for a drive."""
+        leads: Sequence[Values] = [{}]
+        if self.lead in ("lag", "delay"):
+            time = drive.lag if self.lead == "lag" else max(drive.delay, 0.1 * drive.lag)
+            leads = [{"lead_time": lead} for lead in (_LEADS * time).tolist()]
+        elif self.lead:
+            leads = [drive.inverse(penalty, measured=self.lead == "measured") for penalty in _PENALTIES]
+        gains: Sequence[Values] = [{"learning_gain": gain} for gain in _GAINS] if self.lead else [{}]
+        for each, gain in product(self.filters, gains):
+            yield [{**each, **gain, **lead} for lead in leads]
+
+
+class Known(NamedTuple):
+    """Nominal drive as a law may know it.
+
+    Attributes:
+        response: response of its position to its command.
+        delay: its delay [s]; 0 if unknown.
+        measured: points of its measured response; None if unknown.
+    """
+
+    response: Response
+    delay: float
+    measured: FrequencyResponse | None
+
+    @property
+    def lag(self) -> float:
+        """Lag at low frequencies [s]."""
+        return lag(self.response)
+
+    def inverse(self, penalty: float, *, measured: bool) -> Values:
+        """Return an FIR inverse of the response of the model, or as ``measured`` and 0 beyond."""
+        interval = self.lag / _PER_LAG
+        frequency = np.linspace(np.pi / interval / _DENSE, np.pi / interval, _DENSE)
+        value, floor = np.asarray(self.response(frequency)), np.full(_DENSE, penalty)
+        if measured and (points := self.measured) is not None:
+            value, noise = np.where(frequency > points.frequency[-1], 0.0, value), np.zeros(_DENSE)
+            inside = (frequency >= points.frequency[0]) & (frequency <= points.frequency[-1])
+            value[inside] = np.interp(frequency[inside], points.frequency, points.value)
+            if points.deviation is not None:
+                deviation = points.deviation * np.abs(points.value)
+                noise[inside] = 2.0 * np.interp(frequency[inside], points.frequency, deviation) ** 2
+            floor += noise
+        lead_time = _AHEAD * self.lag
+        taps = fir_inverse(frequency, value, floor, lead_time=lead_time, interval=interval, taps=_TAPS)
+        return {"lead_time": lead_time, "correction_interval": interval, "correction_taps": taps.tolist()}
 
 
 _FLAT: list[Values] = [
@@ -82,10 +125,10 @@ LAWS: Mapping[str, Law] = {
     "lead, exponential Q": Law("learning_controller", {"q_filter": "exponential"}, _SMOOTH),
     "lead, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian"}, _SMOOTH),
     "lead, flat Q": Law("learning_controller", {"q_filter": "fir"}, _FLAT),
-    "inverse, Gaussian Q": Law(
-        "learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, inverts=True
-    ),
-    "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, inverts=True),
+    "inverse, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, "delay"),
+    "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, "delay"),
+    "zero phase, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "model"),
+    "measured, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "measured"),
     "disturbance": Law(
         "disturbance_controller",
         {"identify": False},
@@ -93,7 +136,7 @@ LAWS: Mapping[str, Law] = {
             {"learned_waves": waves, "learning_bandwidth": bandwidth, "observer_bandwidth": observer}
             for waves, bandwidth, observer in product(_WAVES, _LEARNING, _OBSERVERS)
         ],
-        leads=False,
+        "",
     ),
 }  # fmt: skip
 
@@ -171,6 +214,7 @@ class Design:
         drives: parameters of each drive by the names of ``electrodynamic_actuator``; the first drive is the nominal
             one.
         margin: drive margin that each drive of the set must leave.
+        measured: measured response of the nominal drive; None if there is none.
 
     Attributes:
         node: name of the learning controller.
@@ -181,8 +225,14 @@ class Design:
         InputError: the scenario has no tool with a tolerance, or not one learning controller and one drive.
     """
 
-    def __init__(self, scenario: Scenario, drives: Sequence[Values], margin: float) -> None:
-        self._margin = margin
+    def __init__(
+        self,
+        scenario: Scenario,
+        drives: Sequence[Values],
+        margin: float,
+        measured: FrequencyResponse | None = None,
+    ) -> None:
+        self._margin, self._measured = margin, measured
         self.refused: LatheError | None = None
         cell = Cell(scenario.nodes)
         learners = [stage for stage in cell.stages.values() if isinstance(stage, Learner)]
@@ -214,9 +264,10 @@ class Design:
         the one with the smallest error.
         """
         found = []
-        for name in LAWS:
-            watch(name)
-            found.append(self._candidate(name))
+        for name, law in LAWS.items():
+            if law.lead != "measured" or self._measured:
+                watch(name)
+                found.append(self._candidate(name))
         return sorted(found, key=_rank)
 
     def _with(self, base: Scenario, law: Law, values: Values) -> Scenario:
@@ -261,7 +312,7 @@ class Design:
         known = self._nominal.nodes[self._drive.name].drive_models().values()
         delay = next((value for each in known if isinstance(value := each.get("delay"), float)), 0.0)
         kept: list[Values] = []
-        for alike in law.settings(max(map(lag, responses)), delay):
+        for alike in law.settings(Known(responses[0], delay, self._measured)):
             tried = [(self._margin_of(law, values, responses), values) for values in alike]
             margin, best = max(tried, key=lambda pair: pair[0])
             kept += [best] if margin >= self._margin else []

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     "--drive",
     "measured",
     type=options.PATH,
-    help="parameters of the drive as lathe fit drive writes them, with the set beside it (FILE.drives.csv)",
+    help="parameters of the drive as lathe fit drive writes them, with the set and the measured points "
+    "beside it (FILE.drives.csv, FILE.points.csv)",
 )
 @click.option("--margin", type=click.FloatRange(0, 1), default=0.3, show_default=True, help="least drive margin [1]")
 @options.overrides
@@ -46,14 +47,18 @@ def design(
     learning controller.
     """
     from lathe_rc import files
+    from lathe_rc.analysis import frequency_response
     from lathe_rc.cell.design import Design
     from lathe_rc.commands import scenario as scenarios
+    from lathe_rc.signals.measurement_file import read
 
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
     place = output or Path(f"{loaded.name}-designed.yaml")
     files.check_place("--output", place)
     drives = _drives(measured) if measured else [{}]
-    made = Design(loaded, drives, margin)
+    points = measured.with_suffix(".points.csv") if measured else None
+    response = frequency_response.of_measurement(read(points, {})) if points and points.exists() else None
+    made = Design(loaded, drives, margin, response)
     found = made.candidates(lambda law: click.echo(law, err=True) if sys.stderr.isatty() else None)
     best = found[0]
     reason = f"; the first reason: {made.refused}" if made.refused else ""
@@ -131,5 +136,6 @@ def _show(found: list["Candidate"], drives: int, place: Path, node: str) -> None
         f"error: largest of the last 10 revolutions; margin, worst, good from and effort: worst of {drives} drives"
     )
     for name, value in found[0].values.items():
-        out.print(f"{node}.{name}: {value:.4g}" if isinstance(value, float) else f"{node}.{name}: {value}")
+        told = f"{value:.4g}" if isinstance(value, float) else value
+        out.print(f"{node}.{name}: {f'{len(value)} values' if isinstance(value, list) else told}")
     out.print(f"scenario: {place}; lathe run {place}", soft_wrap=True)

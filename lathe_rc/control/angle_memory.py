@@ -41,8 +41,8 @@ NO_CHUNK = -(1 << 62)  # lower than the index of any grid point
 DONE, CYCLE_ENDED, AHEAD, JUMPED, SMOOTH, BEHIND = 0, 1, 2, 3, 4, 5  #: reasons for `advance` to return
 LOG = 64  #: largest number of completed cycles in the log
 
-_BACK = 8  # number of grid points by which a jittering angle may step back behind the cycle being read
-ROOM = _BACK + 8  #: number of grid points stored in addition to a cycle, for the points around a read position
+BACK = 8  #: number of grid points by which a jittering angle may step back behind the cycle being read
+AROUND = 8  #: number of grid points stored in addition to these and a cycle, for the points around a read position
 
 
 @inlined
@@ -63,7 +63,10 @@ class AngleMemory(NamedTuple):
         join_below: largest error of a cycle at which the channel joins [m].
         ratio, reach: parameters of an exponential Q; if ``ratio`` is negative, chunks are smoothed outside the kernel.
         law, looks_ahead: correction law, and number of grid points that it reads ahead.
+        back: number of grid points by which a read may stay behind the cycle being read.
+        oldest: lead of the oldest read, relative to the lead.
         settings: parameters of the correction.
+        taps: filter of the correction FIR.
         memory: learned points [m]; their number is a power of two.
         chunk: points of the previous cycle, smoothed by Q.
         scratch: scratch array for smoothing.
@@ -85,7 +88,10 @@ class AngleMemory(NamedTuple):
     reach: int
     law: int
     looks_ahead: int
+    back: int
+    oldest: float
     settings: Array
+    taps: Array
     memory: Array
     chunk: Array
     scratch: Array
@@ -164,7 +170,7 @@ def find(
         # Points to be read must already be learned, and not yet be overwritten by the next cycle.
         if np.floor((angle[k] + lead[k]) * per_radian - cycle) + looks_ahead >= point + count:
             return k, count, AHEAD, ended
-        if np.floor((angle[k] + lead[k]) * per_radian) + _BACK < point + count:
+        if np.floor((angle[k] + m.oldest * lead[k]) * per_radian) + m.back < point + count:
             return k, count, BEHIND, ended
         if ended:
             return k + 1, count, CYCLE_ENDED, 0
@@ -237,7 +243,7 @@ def _learn(
     cycle, memory, chunk, whole = m.cycle, m.memory, m.chunk, m.whole
     k = max(start, min(arrives, angle.size))
     reason = DONE
-    last = whole[NEXT] + memory.size - cycle - ROOM  # limit up to which no point still to be read is overwritten
+    last = whole[NEXT] + memory.size - cycle - m.back - AROUND  # limit: no point still to be read is overwritten
     while reason == DONE and k < angle.size and whole[NEXT] < last:
         point = whole[NEXT]
         stop = min(point + PIECE, last)
@@ -290,6 +296,14 @@ def _send(m: AngleMemory, start: int, stop: int, angle: Array, told: Array) -> N
     per_radian, lead, rate, bend = m.grid / _TURN, m.ahead[0], m.ahead[1], m.ahead[2]
     if m.law == 0:
         read_along(m.memory, per_radian, m.cycle, angle[start:stop], lead[start:stop], m.work, told[start:stop])
+        return
+    if m.law == 5:
+        for k in range(start, stop):
+            told[k] = 0.0
+            for j in range(m.taps.size):
+                place = (angle[k] + (1.0 - j * m.settings[0]) * lead[k]) * per_radian - m.cycle
+                i = int(np.floor(place))
+                told[k] += m.taps[j] * read(m.memory, i, place - i)
         return
     for k in range(start, stop):
         place = (angle[k] + lead[k]) * per_radian - m.cycle

@@ -7,6 +7,8 @@
     second_order_inverse_dynamic  the same with p² = Ω²s² + (dΩ/dt)·s
     exact                         Wk2, then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
                                   angle domain, then its inverse in time
+    fir                           Σ hk·e^{-pkT'}: the memory read with a lead of its own for each tap hk, from T0
+                                  in steps of T' back; an inverse of a response (`lathe_rc.analysis.fir_inverse`)
 
 The drive model is e^{-pτ}/(1 + a1·p + a2·p²) with a1 = 2ζ/ωn and a2 = 1/ωn²; the lead compensates its delay τ.
 """
@@ -31,6 +33,7 @@ class CorrectionLaw(IntEnum):
     SECOND_ORDER_INVERSE = 2
     SECOND_ORDER_INVERSE_DYNAMIC = 3
     EXACT = 4
+    FIR = 5
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,11 @@ class Correction:
         damping: ζ of the drive model.
         lead: T1 of the lead-lag term [s].
         lag: T2 of the lead-lag term [s]; above 0 for the law LEAD_LAG.
+        taps: hk of the law FIR.
+        interval: T' between its taps [s].
 
     Raises:
-        InputError: the lead-lag term has no lag.
+        InputError: the lead-lag term has no lag, or the FIR filter no taps.
     """
 
     law: CorrectionLaw
@@ -53,10 +58,22 @@ class Correction:
     damping: float
     lead: float = 0.0
     lag: float = 0.0
+    taps: tuple[float, ...] = ()
+    interval: float = 0.0
 
     def __post_init__(self) -> None:
         if self.law is CorrectionLaw.LEAD_LAG and not self.lag > 0.0:
             raise InputError(f"lag = {self.lag:g} s with correction lead_lag; allowed: above 0")
+        if self.law is CorrectionLaw.FIR and not (self.taps and self.interval > 0.0):
+            raise InputError(
+                f"{len(self.taps)} taps in steps of {self.interval:g} s with correction fir; allowed: 1 or more, "
+                "in steps above 0"
+            )
+
+    @property
+    def span(self) -> float:
+        """Time from the first tap to the last one of the law FIR [s]; 0 for other laws."""
+        return self.interval * (len(self.taps) - 1) if self.law is CorrectionLaw.FIR else 0.0
 
     @property
     def inverse(self) -> tuple[float, float]:

@@ -94,6 +94,11 @@ class RepetitiveController:
     ) -> None:
         self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
         self.preview = preview
+        lead = preview.table.lead_time
+        # The taps may read points of the cycle before, at up to twice the nominal speed.
+        before = 2.0 * nominal * max(correction.span - lead, 0.0) * grid / _TURN
+        back = angle_memory.BACK + math.ceil(before)
+        self._spare = back + angle_memory.AROUND
         room: dict[str, Any] = {name: np.zeros(shape) for name, shape in _ROOM.items()}
         whole, real = np.zeros(angle_memory.INTEGERS, dtype=np.int64), np.zeros(angle_memory.REALS)
         whole[angle_memory.LEARNS], whole[angle_memory.JOINED] = 1, np.isinf(join_below)
@@ -107,7 +112,10 @@ class RepetitiveController:
             join_below=join_below,
             law=int(correction.law),
             looks_ahead=correction.looks_ahead,
+            back=back,
+            oldest=1.0 - correction.span / lead if correction.span else 1.0,
             settings=np.zeros(7),
+            taps=np.array(correction.taps),
             memory=self._room_for(q),
             **self._smoother(q),
             **room,
@@ -165,6 +173,8 @@ class RepetitiveController:
         settings = self.table.settings
         settings[:2] = correction.inverse
         settings[2] = self._nominal
+        if correction.law is CorrectionLaw.FIR:
+            settings[0] = correction.interval / self.preview.table.lead_time
         if correction.law is CorrectionLaw.LEAD_LAG:
             decay = np.exp(-self._step / correction.lag)
             rest = (1.0 - decay) * correction.lag / self._step
@@ -199,7 +209,7 @@ class RepetitiveController:
 
         Its length is a power of two, for indices by a mask.
         """
-        return np.zeros(1 << (self._cycle + q.chunk + q.reach + angle_memory.ROOM).bit_length())
+        return np.zeros(1 << (self._cycle + q.chunk + q.reach + self._spare).bit_length())
 
     @staticmethod
     def _smoother(q: QFilter) -> dict[str, Any]:
@@ -264,7 +274,7 @@ class RepetitiveController:
             AngleLostError: the spindle turned so fast that the memory would have been read at points not yet learned,
                 or turned back to points already overwritten, or its angle jumped.
         """
-        wanted = self._correction.law is not CorrectionLaw.NONE
+        wanted = self._correction.law not in (CorrectionLaw.NONE, CorrectionLaw.FIR)
         n = angle.size
         if n > self.table.ahead.shape[1]:
             self.table = self.table._replace(windows=np.empty((2, n + 3)), ahead=np.empty((3, n)))

@@ -59,7 +59,8 @@ class LearningController(Learner):
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         self.parameters = parameters
         super().__init__(name, parameters)
-        self.tunable = ("learning_gain", "lead_time", *_OF_Q.get(parameters.q_filter, ("q_time",)))
+        lead = () if parameters.correction == "fir" else ("lead_time",)
+        self.tunable = ("learning_gain", *lead, *_OF_Q.get(parameters.q_filter, ("q_time",)))
         self._q = parameters.make_q(name)
         self._controller = RepetitiveController(
             grid=parameters.points_per_revolution,
@@ -176,7 +177,8 @@ class LearningController(Learner):
             lag -= self.correction.inverse[0]
         elif parameters.correction == "lead_lag":
             lag -= self.correction.lead - self.correction.lag
-        yield ({"lead_time": float(f"{part * lag:.3g}")} for part in _LEADS)
+        if parameters.correction != "fir":
+            yield ({"lead_time": float(f"{part * lag:.3g}")} for part in _LEADS)
         q = [("q_time", max(parameters.q_time, _LEAST_Q), 1.25)]
         if parameters.q_filter == "fir":
             q = [("q_pass", parameters.q_pass, 0.8), ("q_stop", parameters.q_stop, 0.8)]
@@ -274,7 +276,7 @@ class LearningController(Learner):
             period=parameters.step,
             by_time=parameters.law == "time_periodic",
             falls_back=parameters.fall_back == "constant_lead",
-            rates=self.correction.law is not CorrectionLaw.NONE,
+            rates=self.correction.law not in (CorrectionLaw.NONE, CorrectionLaw.FIR),
             finer=len(parameters.finer),
             identifies=parameters.identify,
             margin=self._margin,

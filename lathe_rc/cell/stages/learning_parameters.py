@@ -57,14 +57,23 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
     acceleration_window: Annotated[int, Ge(1), Le(65536)] = parameter(
         1, "dΩ/dt is the measured speed's difference over so many samples", "sample"
     )
-    correction: Literal["none", "lead_lag", "second_order_inverse", "second_order_inverse_dynamic", "exact"] = (
-        parameter("none", "1/W0 beside the lead; exact: Wk2 then Wk1 (000, eqs 13-14), for which T0 counts in full")
+    correction: Literal["none", "lead_lag", "second_order_inverse", "second_order_inverse_dynamic", "exact", "fir"] = (
+        parameter(
+            "none",
+            "1/W0 beside the lead; exact: Wk2 then Wk1 (000, eqs 13-14), for which T0 counts in full; fir: "
+            "correction_taps, the first of which has the lead T0",
+        )
     )
     correction_model: Literal["given", "identified"] = parameter(
         "given", "drive model of the correction: the one below, or the one identified as long as the channel learns"
     )
     lead_lag_lead: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T1", "s")
     lead_lag_lag: Annotated[float, Ge(0), Le(1)] = parameter(0.0, "correction lead_lag: T2", "s")
+    correction_taps: list[float] = parameter(
+        [],
+        "correction fir: the command is their sum with the memory, each read correction_interval later than the last",
+    )
+    correction_interval: Annotated[float, Ge(0), Le(0.1)] = parameter(0.0, "correction fir: time between its taps", "s")
     q_filter: Annotated[str, Named(Q_FILTERS, ("fir",))] = parameter(
         "exponential", "kind of the zero-phase Q; fir: flat up to q_pass"
     )
@@ -177,15 +186,20 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         """Return the correction of a node with its given model.
 
         Raises:
-            InputError: a lead-lag term has no lag.
+            InputError: a lead-lag term has no lag, or an FIR filter no taps or no lead.
         """
-        with about(node, "lead_lag_lag"):
+        if self.correction == "fir" and not self.lead_time > 0.0:
+            raise InputError(f"{node}.lead_time = 0 s with correction fir; allowed: above 0")
+        named = ("correction_taps", "correction_interval") if self.correction == "fir" else ("lead_lag_lag",)
+        with about(node, *named):
             return Correction(
                 _CORRECTIONS[self.correction],
                 self.model_natural_frequency,
                 self.model_damping,
                 self.lead_lag_lead,
                 self.lead_lag_lag,
+                tuple(self.correction_taps),
+                self.correction_interval,
             )
 
     @property
