@@ -110,6 +110,14 @@ def test_an_fir_inverse_is_that_of_the_response_it_is_given():
     assert (of_points < 1.0, of_model > 10.0) == (True, True)
 
 
+def test_an_fir_inverse_that_the_cycle_is_too_short_for_is_refused():
+    taps = ["learning_controller.correction=fir", f"learning_controller.correction_taps={[1.0] * 50}"]
+    with pytest.raises(InputError, match=r"50 correction_taps in .* 0.05 s; allowed: up to 0.031"):
+        Cell(config("piston", *taps, "learning_controller.correction_interval=1e-3").nodes)
+    with pytest.raises(InputError, match="lead_time = 0 s with correction fir"):
+        Cell(config("piston", *taps, "learning_controller.lead_time=0.0").nodes)
+
+
 def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
     asked = Design(config("piston"), [{}], 0.3)
     (drive,) = asked._responses(asked.drives)

@@ -96,7 +96,7 @@ class RepetitiveController:
         self.preview = preview
         lead = preview.table.lead_time
         # The taps may read points of the cycle before, at up to twice the nominal speed.
-        before = 2.0 * nominal * max(correction.span - lead, 0.0) * grid / _TURN
+        before = 2.0 * nominal * max(correction.span - lead, 0.0) * grid / _TURN if correction.span else 0.0
         back = angle_memory.BACK + math.ceil(before)
         self._spare = back + angle_memory.AROUND
         room: dict[str, Any] = {name: np.zeros(shape) for name, shape in _ROOM.items()}

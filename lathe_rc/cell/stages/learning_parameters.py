@@ -186,10 +186,18 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         """Return the correction of a node with its given model.
 
         Raises:
-            InputError: a lead-lag term has no lag, or an FIR filter no taps or no lead.
+            InputError: a lead-lag term has no lag, or an FIR filter no taps or no lead, or it reaches too far back.
         """
-        if self.correction == "fir" and not self.lead_time > 0.0:
-            raise InputError(f"{node}.lead_time = 0 s with correction fir; allowed: above 0")
+        if self.correction == "fir":
+            longest = self.lead_time + np.pi * self.cycle_revolutions / self.nominal_speed
+            if not self.lead_time > 0.0:
+                raise InputError(f"{node}.lead_time = 0 s with correction fir; allowed: above 0")
+            taps, interval = len(self.correction_taps), self.correction_interval
+            if (span := taps * interval) > longest:
+                raise InputError(
+                    f"{node}: {taps} correction_taps in steps of {interval:g} s reach over {span:.4g} s; "
+                    f"allowed: up to {longest:.4g} s, the lead_time and half a cycle"
+                )
         named = ("correction_taps", "correction_interval") if self.correction == "fir" else ("lead_lag_lag",)
         with about(node, *named):
             return Correction(
