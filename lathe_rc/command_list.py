@@ -17,7 +17,7 @@ COMMANDS = {
     "correct": "Correct the programmed form of the next part.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",
     "design": "Find the learning law of a scenario for a measured drive.",
-    "export": "Export a recording as tables, or stages as a C library.",
+    "export": "Export a recording as tables, or stages as C libraries or FMUs.",
     "fit": "Fit models to measurements.",
     "measure": "Measure the part turned in a recorded run.",
     "new": "Create a law, drive, stage or study of your own.",

@@ -93,6 +93,18 @@ def object_code(step: CompiledStep, symbol: str, target: str) -> bytes:
         InputError: the step cannot be compiled.
         LatheError: its code needs a function that is not in libm, such as one of Python.
     """
+    machine, module = _module(step, symbol, target)
+    return bytes(machine.emit_object(module))
+
+
+def assembly(step: CompiledStep, symbol: str, target: str) -> str:
+    """Return the code of a step as assembly; arguments and errors as for `object_code`."""
+    machine, module = _module(step, symbol, target)
+    return str(machine.emit_assembly(module))
+
+
+def _module(step: CompiledStep, symbol: str, target: str) -> tuple[Any, Any]:
+    """Return LLVM's processor, and the step's intermediate code for it."""
     chosen = TARGETS[target]
     machine = _machine(chosen)
     inner, text = step.intermediate_code()
@@ -118,7 +130,7 @@ def object_code(step: CompiledStep, symbol: str, target: str) -> bytes:
     needed = {each.name for each in module.functions if each.is_declaration and not each.name.startswith("llvm.")}
     if foreign := needed - _LIBM - _LIBC - {*_RUNTIME.values()}:
         raise LatheError(f"its compiled step calls {', '.join(sorted(foreign))}; allowed: the functions of libm")
-    return bytes(machine.emit_object(module))
+    return machine, module
 
 
 def temporary_arrays(step: CompiledStep) -> int:

@@ -7,7 +7,7 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,10 +76,20 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
 _KEPT = ("name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "room", "size", "left_out")
 
 
+def words(library: Library) -> np.ndarray:
+    """Return the words of the block before the first sample that are stored, shape (n,), uint64."""
+    found = library.image.view(np.uint64)
+    return np.concatenate([found[begin:end] for begin, end in _runs(found)])
+
+
+def identity(library: Library, texts: Mapping[str, str]) -> str:
+    """Return the hash of a library's tables and state, from the files that `sources` returns."""
+    return hashlib.sha256(texts[f"{library.name}.c"].encode() + library.image.tobytes()).hexdigest()
+
+
 def objects(library: Library, target: str) -> dict[str, bytes]:
     """Return the object files of a library by name: its stages, and the words of the block that are not 0."""
-    words = library.image.view(np.uint64)
-    content = np.concatenate([words[begin:end] for begin, end in _runs(words)]).tobytes()
+    content = words(library).tobytes()
     steps = {part.stage.name: object_code(part.stage.native(), part.symbol, target) for part in library.parts}
     return {**steps, _IMAGE: constant_bytes(content, f"{library.name}_words", target)}
 
@@ -97,6 +107,19 @@ class Exported:
     place: Path
     library: Library
     reference: Reference
+
+
+def library_of(
+    scenario: Scenario, nodes: Sequence[str], name: str | None, block: int | None, tune: Collection[str]
+) -> Library:
+    """Return stages of a scenario as a library (arguments and errors as for `export_nodes`)."""
+    cell = Cell(scenario.nodes)
+    nodes = nodes or list(cell.stages)
+    name = name or (nodes[0] if len(nodes) == 1 else scenario.name)
+    if not _IDENTIFIER.fullmatch(name):
+        raise InputError(f"--name {name}; allowed: a C identifier of small letters, digits and underscores")
+    cell.check(cures=False)
+    return Library(cell, nodes, name, block or cell.master.shared.block_size, tune)
 
 
 def export_nodes(
@@ -126,16 +149,11 @@ def export_nodes(
         InputError: the folder exists, the name is no identifier, or as for `lathe_rc.c_library.library.Library`.
         LatheError: a step needs more than libm, or the folder cannot be written.
     """
-    cell = Cell(scenario.nodes)
-    nodes = nodes or list(cell.stages)
-    name = name or (nodes[0] if len(nodes) == 1 else scenario.name)
+    library = library_of(scenario, nodes, name, block, tune)
+    name = library.name
     place = place or Path(f"{name}-c")
-    if not _IDENTIFIER.fullmatch(name):
-        raise InputError(f"--name {name}; allowed: a C identifier of small letters, digits and underscores")
     if place.exists() or not place.absolute().parent.is_dir():
         raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
-    cell.check(cures=False)
-    library = Library(cell, nodes, name, block or cell.master.shared.block_size, tune)
     texts, made = sources(library, scenario.name, target), objects(library, target)
     reference = Reference(library, Cell(scenario.nodes), samples)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command group ``lathe export``: signals of a bag as CSV, Parquet or NumPy files, and stages as a C library."""
+"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries or FMUs."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ class _BagUnlessNamed(click.Group):
 
 @click.group(cls=_BagUnlessNamed)
 def export() -> None:
-    """Export a recording as tables, or stages of a scenario as a C library; without a command: a recording."""
+    """Export a recording as tables, or stages of a scenario as a C library or FMU; without a command: a recording."""
 
 
 @export.command()
@@ -83,3 +83,27 @@ def c_library(
     exported = ", ".join(part.stage.name for part in done.library.parts)
     click.echo(f"{done.place}: {exported}; state of {done.library.size} bytes")
     click.echo(f"next: cd {done.place} && cmake -B build && cmake --build build && build/{done.library.name}_main")
+
+
+@export.command()
+@click.argument("nodes", nargs=-1, metavar="[NODE]...", shell_complete=completers.nodes)
+@click.option("--scenario", required=True, shell_complete=completers.scenarios, help="whose tables the nodes have")
+@options.overrides
+@click.option("--name", help="of the model, a C identifier; default: that of the node or, if several, the scenario")
+@click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: NAME.fmu, here")
+@click.option("--fmi", type=click.Choice(["2", "3"]), default="3", show_default=True, help="version of FMI: 2.0 or 3.0")
+@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@options.allow_code
+def fmu(
+    nodes: tuple[str, ...], scenario: str, overrides: tuple[str, ...], output: Path | None, fmi: str, **how: Any
+) -> None:
+    """Export NODEs of a scenario, wired together, as an FMU for co-simulation; none: all of them."""
+    from lathe_rc.c_library.fmu import export_fmu
+    from lathe_rc.commands import scenario as scenarios
+
+    place, library = export_fmu(scenarios.load(scenario, overrides), nodes, output, fmi=int(fmi), **how)
+    for line in library.left_out:
+        click.echo(f"warning: not in the FMU, the importer has to cause it: {line}", err=True)
+    exported = ", ".join(part.stage.name for part in library.parts)
+    counts = f"{len(library.inputs)} inputs, {len(library.outputs)} outputs, {len(library.parameters)} parameters"
+    click.echo(f"{place}: {exported}; {counts}, a step of {library.step:.9g} s")
