@@ -61,7 +61,7 @@ def _source_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-_SOURCES = _source_hash()
+SOURCES = _source_hash()
 
 
 def cache_folder() -> Path:
@@ -70,7 +70,7 @@ def cache_folder() -> Path:
     Numba detects changes in a kernel's own file, but not in the kernels that it calls, so with a cache shared between
     versions of the source, outdated code would run. Each version of the source therefore has its own folder.
     """
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / _SOURCES
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / SOURCES
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
@@ -137,7 +137,7 @@ class _Place(_CacheLocator):
         return str(cache_folder() / self.get_suitable_cache_subpath(self._py_file))
 
     def get_source_stamp(self) -> str:
-        return _SOURCES
+        return SOURCES
 
     def get_disambiguator(self) -> str:
         return str(self._line)
@@ -172,7 +172,7 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file = _Files(self.cache_path, self._impl.filename_base, _SOURCES)
+        self._cache_file = _Files(self.cache_path, self._impl.filename_base, SOURCES)
 
     def save_overload(self, sig: object, data: object) -> None:
         try:

@@ -9,7 +9,9 @@ from pathlib import Path
 from lathe_rc.errors import InputError
 
 SNAPSHOT = "lathe_rc.snapshot"  #: metadata entry with the section of the run that the bag covers, and the triggers
+GONE_ON = "lathe_rc.gone_on"  #: metadata entry with the first sample of a run that goes on from a checkpoint
 
+_MOST_SAMPLES = 2**48
 _MOST_TRIGGERS = 1000  # triggers of a snapshot that are listed individually
 
 
@@ -68,7 +70,7 @@ def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
         span = told["first_sample"], told["samples"]
     except (ValueError, KeyError, TypeError, RecursionError):
         span = None, None
-    if not all(type(number) is int and 0 <= number < 2**48 for number in span):
+    if not all(type(number) is int and 0 <= number < _MOST_SAMPLES for number in span):
         raise InputError(
             f"{SNAPSHOT} = {text[:80]!r} in the bag; allowed: what a recorder writes, with first_sample and samples"
         )
@@ -76,13 +78,17 @@ def span_of(about: Mapping[str, str]) -> tuple[int, int] | None:
 
 
 def first_sample(about: Mapping[str, str]) -> int:
-    """Return the first sample of a bag: 0, or the beginning of a snapshot.
+    """Return the first sample of a bag: 0, or the beginning of a snapshot or of a run from a checkpoint.
 
     Args:
         about: strings from the bag's metadata.
 
     Raises:
-        InputError: the snapshot entry is not in the recorder's format.
+        InputError: an entry is not in the recorder's format.
     """
-    span = span_of(about)
-    return span[0] if span else 0
+    if span := span_of(about):
+        return span[0]
+    text = about.get(GONE_ON, "0")
+    if not (text.isascii() and text.isdigit() and int(text[:16]) < _MOST_SAMPLES):
+        raise InputError(f"{GONE_ON} = {text[:80]!r} in the bag; allowed: the first sample of the run")
+    return int(text)

@@ -55,14 +55,16 @@ class Collector:
 
     Args:
         cell: the running cell.
-        samples: length of the run [sample].
+        samples: number of samples to collect.
         topics: relative names of the topics to collect; None: all.
+        first: index of the first sample.
 
     Raises:
         InputError: the cell has no such topic.
     """
 
-    def __init__(self, cell: Cell, samples: int, topics: Collection[str] | None = None) -> None:
+    def __init__(self, cell: Cell, samples: int, topics: Collection[str] | None = None, first: int = 0) -> None:
+        self._first = first
         known = {**cell.dense, **cell.sparse}
         self._sources = known if topics is None else {topic: known[topic] for topic in topics if topic in known}
         if missing := [topic for topic in topics or () if topic not in known]:
@@ -83,7 +85,7 @@ class Collector:
         """Process a chunk of the run, as a sink of the engine."""
         for topic, whole in self._dense.items():
             for name, array in dense[topic].items():
-                whole[name][first : first + samples] = array
+                whole[name][first - self._first :][:samples] = array
         for topic, kept in self._sparse.items():
             kept.extend(sparse.get(topic, ()))
 
@@ -97,4 +99,4 @@ class Collector:
                 part.add(messages.stamp_ns(framed), framed)
         types = {f"/{topic}": source.type for topic, source in self._sources.items()}
         dense = {f"/{topic}": signals for topic, signals in self._dense.items()}
-        return Recording(types, dense, sparse, self._step_ns)
+        return Recording(types, dense, sparse, self._step_ns, self._first)

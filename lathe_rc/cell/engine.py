@@ -2,7 +2,8 @@
 """Offline host: all stages of a cell in one program."""
 
 import gc
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NoReturn, Protocol, TypeVar
 
 import numpy as np
@@ -39,6 +40,11 @@ class Engine:
         heard: relative topics requested by the sinks, or ``TOPIC.FIELD`` for a single field of a topic; None: all.
             Other signals are not kept, and other sparse messages are not created.
 
+    Attributes:
+        stages: the stages of the cell.
+        first: index of the first sample of the run.
+        samples: index after its last sample.
+
     Raises:
         InputError: the run is endless.
     """
@@ -65,11 +71,35 @@ class Engine:
         self._tapes = Tapes(topics, self._piece, passing, self._chunk)
         self._program = Program(wires, self._tapes, self._chunk)
 
+    def start_at(self, sample: int, past: Mapping[str, Signals]) -> None:
+        """Start at a sample whose state the stages have, instead of at sample 0.
+
+        Args:
+            sample: the first sample of the run.
+            past: see `past`.
+
+        Raises:
+            InputError: ``past`` lacks samples that a delayed reader needs.
+        """
+        self.first = sample
+        self._tapes.restart(sample, past)
+        self._program.begin(self._stages, sample)
+
+    @property
+    def reached(self) -> int:
+        """Number of samples that all stages have computed."""
+        return self._program.reached
+
+    @property
+    def past(self) -> dict[str, Signals]:
+        """Samples before the one reached that delayed readers need, by relative topic and field (copies)."""
+        return self._tapes.past(self._program.reached)
+
     def _take(self, cell: Cell) -> None:
         """Load the stages of a cell."""
-        self.samples = cell.samples
+        self.first, self.samples = 0, cell.samples
         self._wiring, self._block = cell.wiring, cell.master.shared.block_size
-        self._stages = list(cell.stages.values())
+        self.stages, self._stages = cell.stages, list(cell.stages.values())
         for stage in self._stages:
             names = {remapped(stage.shared, topic): topic for topic in stage.sparse_topics}
             stage.unheard = {topic for name, topic in names.items() if name not in self._heard}
@@ -90,8 +120,12 @@ class Engine:
         self._program.begin(self._stages)
         return True
 
-    def run(self, sinks: Iterable[Sink]) -> None:
+    def run(self, sinks: Iterable[Sink], stops: Mapping[int, Callable[[], object]] = MappingProxyType({})) -> None:
         """Run the cell to completion.
+
+        Args:
+            sinks: receivers of the results.
+            stops: functions to call when all samples before a given one have been computed.
 
         Raises:
             DivergedError: a requested sample is NaN or infinite; the message names the first.
@@ -102,18 +136,26 @@ class Engine:
         try:
             # NaN and infinity are reported here, so NumPy's warnings are redundant.
             with np.errstate(over="ignore", invalid="ignore"):
-                for _ in self.steps(list(sinks)):
+                for _ in self.steps(list(sinks), stops):
                     pass
         finally:
             gc.unfreeze()
 
-    def steps(self, sinks: Sequence[Sink]) -> Iterator[int]:
+    def steps(
+        self, sinks: Sequence[Sink], stops: Mapping[int, Callable[[], object]] = MappingProxyType({})
+    ) -> Iterator[int]:
         """Run chunk by chunk, yielding the sample index after each chunk; raise the same errors as `run`."""
-        for first in range(0, self.samples, self._piece):
+        for first in range(self.first, self.samples, self._piece):
             self._tapes.advance(first)
-            broken = False
+            broken, end = False, min(first + self._piece, self.samples)
             try:
-                broken = self._program.run(min(first + self._piece, self.samples), finite=bool(sinks))
+                for stop in sorted({end, *(sample for sample in stops if first < sample < end)}):
+                    self._begun = self._program.reached
+                    broken = self._program.run(stop, finite=bool(sinks))
+                    if broken:
+                        break
+                    if stop in stops:
+                        stops[stop]()
             finally:
                 # A chunk with a NaN or infinite sample is useless to sinks, unlike the samples before another error.
                 if not broken:
@@ -126,7 +168,7 @@ class Engine:
         """Raise the error that a node would raise: it names the first NaN or infinite sample, in the newest chunk."""
         found: list[tuple[int, int, str]] = []
         end = self._program.reached
-        first = (end - 1) // self._chunk * self._chunk
+        first = self._begun + (end - 1 - self._begun) // self._chunk * self._chunk
         for topic, source in self._wiring.dense.items():
             for name, array in self._tapes.view(topic, first, end - first).items():
                 try:

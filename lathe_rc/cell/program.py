@@ -15,6 +15,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.compiled.step import BROKEN, AddressTable, broken
 from lathe_rc.compiled.struct_view import Integers, address, call, floats
+from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 
@@ -98,7 +99,39 @@ class Tapes:
             array.fill(0)
         self.begin = 0
 
+    def past(self, end: int) -> dict[str, Signals]:
+        """Return copies of the samples before ``end`` that delayed readers need, by topic and field."""
+        found: dict[str, Signals] = {}
+        for (topic, name), delay in self._delays.items():
+            if delay:
+                found.setdefault(topic, {})[name] = self.view(topic, end, delay, delay, [name])[name].copy()
+        return found
 
+    def restart(self, first: int, past: Mapping[str, Signals]) -> None:
+        """Reset to the state before sample ``first``.
+
+        Args:
+            first: sample index.
+            past: the samples before it, as returned by `past`; there may be more than needed.
+
+        Raises:
+            InputError: a reader needs older samples.
+        """
+        self.rewind()
+        self.begin = first
+        for (topic, name), delay in self._delays.items():
+            kept = past.get(topic, {}).get(name, _NONE)
+            size = min(delay, kept.size)
+            if size < min(delay, first):  # samples before sample 0 are zero
+                raise InputError(
+                    f"/{topic}.{name} is read {delay} samples late, and the checkpoint holds {kept.size} past samples; "
+                    "allowed: no longer delay"
+                )
+            if size:
+                self._arrays[topic, name][self.history - size : self.history] = kept[-size:]
+
+
+_NONE = np.empty(0)
 NOT_FINITE = -3  #: reason why a program has stopped: a number is not finite
 _NOBODY = np.empty(0, np.int64)
 
@@ -263,12 +296,12 @@ class Program:
         self._where = np.zeros(3, np.int64)
         self.begin([each.stage for each in stages])
 
-    def begin(self, stages: Sequence[Stage]) -> None:
-        """Restart at sample 0 with other stages that have the same ports."""
+    def begin(self, stages: Sequence[Stage], first: int = 0) -> None:
+        """Restart at sample ``first`` with other stages that have the same ports."""
         self._stages = stages
-        self.number, self.ends = 0, [0] * len(stages)
-        self._where[:] = 0
-        self._told = [0] * len(stages)
+        self.number, self.ends = 0, [first] * len(stages)
+        self._where[:] = first, 0, 0
+        self._told = [first] * len(stages)
         self._sparse: list[list[Sparse]] = [[] for _ in stages]
         for number in range(len(stages)):
             self._load(number)

@@ -59,7 +59,7 @@ TABLES = _Tables()
 _EVERYONE = "/**"
 _ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
 # Parameters that affect neither the samples nor the messages of a run, and therefore not its identity.
-_HOST_PARAMETERS = {
+HOST_PARAMETERS = {
     *("run_id", "speed_factor", "strict_pace", "simulation_services", "window", "members", "processes", "autostart"),
     *("stall_reaction", "stall_time", "safe_time", "restart_time", "restart_file"),
 }
@@ -440,7 +440,7 @@ def _fingerprint(table: NodeParameters) -> str:
     """Return a hash of the parameters of a table that affect a run; empty if there are none."""
     if isinstance(table, RecorderParameters):
         return ""
-    values = table.model_dump(exclude=_HOST_PARAMETERS | table.judging)
+    values = table.model_dump(exclude=HOST_PARAMETERS | table.judging)
     for row in type(table).rows().values():
         if row.is_path and values[row.name]:
             values[row.name] = content(Path(values[row.name]))

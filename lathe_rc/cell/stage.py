@@ -621,6 +621,9 @@ class Stage(ABC):
         if other.rooms == self.rooms:
             self._room = other.room
 
+    def forget(self) -> None:  # noqa: B027 - most stages keep no such results
+        """Forget results that depend on parameters other than those now given, after a start from a checkpoint."""
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the pickled state, without addresses and scratch arrays."""
         tuned = {name: getattr(self.parameters_now, name) for name in self.tunable}

@@ -46,11 +46,12 @@ def _events(result: harness.Result) -> Table:
 def facts(result: harness.Result) -> list[str]:
     """Return one line each on error growth, tolerance, blocks, pace and rejected messages."""
     refused = [f"{count} messages refused from {sender}" for sender, count in result.refused.items()]
-    surface = result.surface
+    surface, first, step = result.surface, result.recording.first, result.scenario.shared.step
     return [
         *(each.told() for each in (result.growth, result.verdict) if each),
         *_margins(result),
         *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
+        *([f"gone on from sample {first}, {first * step:.4g} s"] if first else []),
         f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(result.lateness.lines() if result.lateness else []),

@@ -21,6 +21,15 @@ if TYPE_CHECKING:
 @click.option("--speed-factor", type=click.FloatRange(min=0), help="pace against real time; 0: as fast as possible")
 @click.option("--strict", is_flag=True, help="exit with 4 when the members are too slow for the pace")
 @click.option("--bag", type=options.PATH, help="folder to record to; must not exist")
+@click.option(
+    "--checkpoint",
+    "checkpoints",
+    type=(str, options.PATH),
+    multiple=True,
+    metavar="WHEN FILE",
+    help="write the state of the cell at revolution:R, second:T or sample:N; repeatable",
+)
+@click.option("--from", "start_from", type=options.PATH, metavar="FILE", help="go on from a checkpoint")
 @click.option("--profile", type=options.PATH, help="CSV file to write the last revolution's profile to")
 @click.option("--figure", type=options.PATH, help="PNG to draw the form and its error to")
 @options.overrides

@@ -35,6 +35,8 @@ def run(
     speed_factor: float | None,
     strict: bool,
     bag: Path | None,
+    checkpoints: tuple[tuple[str, Path], ...],
+    start_from: Path | None,
     profile: Path | None,
     figure: Path | None,
     overrides: tuple[str, ...],
@@ -70,6 +72,8 @@ def run(
         picture.check_place(figure)
     if profile:
         check_place("--profile", profile)
+    for _, path in checkpoints:
+        check_place("--checkpoint", path)
     result = watched(
         loaded,
         mode=mode,
@@ -78,6 +82,8 @@ def run(
         domain=domain,
         namespace=namespace or "/",
         start=start or "fork",
+        start_from=start_from,
+        checkpoints=dict(checkpoints),
     )
     if profile:
         part.write_profile(profile, result.recording, result.part, [result.errors.rms.size - 1])
@@ -89,8 +95,9 @@ def run(
     else:
         asks_for_snapshots = loaded.recorder[1].mode != "continuous"
         note = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
-        files = {name: path for name, path in (("profile", profile), ("figure", figure)) if path}
-        outcome.show(result, files, note=note, budget=found)
+        files = [(name, path) for name, path in (("profile", profile), ("figure", figure)) if path]
+        files += [(f"checkpoint at {when}", path) for when, path in checkpoints]
+        outcome.show(result, dict(files), note=note, budget=found)
     if require_tolerance and result.verdict and not result.verdict.in_tolerance:
         alike = " with the same --set" if overrides else ""
         hint = "" if found else f"; lathe budget {scenario}{alike} tells why"

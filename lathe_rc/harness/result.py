@@ -179,6 +179,7 @@ class Result:
         return {
             "scenario": self.scenario.name,
             "mode": self.mode,
+            "first_sample": self.recording.first,
             "simulated_s": self.simulated_s,
             "wall_s": self.wall_s,
             "real_time_factor": self.real_time_factor,

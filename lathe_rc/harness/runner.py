@@ -10,16 +10,21 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 from lathe_rc import messages, process_launcher
+from lathe_rc.cell import checkpoint
 from lathe_rc.cell.ahead import compile_ahead
+from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wiring import Cell
+from lathe_rc.cell.wiring import Cell, new_stage
+from lathe_rc.errors import InputError
 from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder
 from lathe_rc.harness.result import Mode, Result
 from lathe_rc.messages import Signals
@@ -37,6 +42,8 @@ def run(
     domain: int | None = None,
     namespace: str = "/",
     start: Start = "fork",
+    start_from: str | os.PathLike[str] | None = None,
+    checkpoints: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
 ) -> Result:
     """Run a scenario to its end.
 
@@ -54,10 +61,13 @@ def run(
         namespace: ROS namespace of the cell; cells with different namespaces can share a domain.
         start: ``fork``: processes are forks of a server with preloaded imports; ``spawn``: each process is a new
             interpreter.
+        start_from: checkpoint from which the run goes on; None: it starts at sample 0.
+        checkpoints: files to which the state of the cell is written, by point of time: ``revolution:R``, ``second:T``
+            or ``sample:N``. Only offline; the state in the other hosts is the same.
 
     Raises:
-        InputError: the scenario is invalid, the run does not fit into memory, or the bag's folder exists or has no
-            parent folder.
+        InputError: the scenario is invalid, the checkpoint is not one of this cell, the run does not fit into memory,
+            or the bag's folder exists or has no parent folder.
         LatheError: a node failed or was killed; a requested bag is still readable.
         LossyRunError: a free-running cell lost blocks.
 
@@ -72,9 +82,15 @@ def run(
     """
     if mode != "offline" and start == "fork":
         process_launcher.server()  # the server imports while the cell is checked
-    cell = Cell(scenario.nodes)
+    if mode != "offline" and (start_from or checkpoints):
+        raise InputError(f"a checkpoint with mode {mode}; allowed: offline, where the state is the same")
+    begun = checkpoint.load(Path(start_from), scenario) if start_from else None
+    cell = Cell(scenario.nodes, stage=begun.stage if begun else new_stage)
+    if begun:
+        begun.check(cell)
     cell.check()
     check_room(cell)
+    places = {checkpoint.sample_of(when, cell.master): Path(path) for when, path in checkpoints.items()}
     for event, told in (("unchecked", cell.unchecked), ("warning", cell.warnings)):
         for what in told:
             watch({"event": event, "node": cell.master.name, "message": what})
@@ -83,7 +99,14 @@ def run(
         from lathe_rc.bag.writing.writer import refuse_existing
 
         refuse_existing(place)
-    result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
+    samples = cell.samples if mode == "offline" else cell.expected_samples
+    watch({"event": "checked", "node": cell.master.name, "samples": samples, "step": scenario.shared.step})
+    for left in compile_ahead(cell.stages.values()):
+        watch({"event": "compiling", "node": left[0], "nodes": left})
+    if mode == "offline":
+        result = _offline(scenario, cell, place, watch, begun, places)
+    else:
+        result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
     result = replace(
         result,
         unchecked=cell.unchecked,
@@ -109,12 +132,6 @@ def _run(
     namespace: str,
     start: Start,
 ) -> Result:
-    samples = cell.samples if mode == "offline" else cell.expected_samples
-    watch({"event": "checked", "node": cell.master.name, "samples": samples, "step": scenario.shared.step})
-    for left in compile_ahead(cell.stages.values()):
-        watch({"event": "compiling", "node": left[0], "nodes": left})
-    if mode == "offline":
-        return _offline(scenario, cell, bag, watch)
     from lathe_rc.bag import reader
     from lathe_rc.bag.repairing import recover
 
@@ -188,21 +205,35 @@ class _Watcher:
         self._watch({"event": "progress", "node": "", "samples": first + samples})
 
 
-def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[Event], None]) -> Result:
+def _offline(
+    scenario: Scenario,
+    cell: Cell,
+    bag: Path | None,
+    watch: Callable[[Event], None],
+    begun: Checkpoint | None,
+    checkpoints: Mapping[int, Path],
+) -> Result:
     engine = Engine(cell)
-    collector = Collector(cell, engine.samples)
+    if begun:
+        engine.start_at(begun.sample, begun.past)
+    if early := [path for sample, path in checkpoints.items() if sample <= engine.first]:
+        raise InputError(f"{early[0]}: a checkpoint before the run goes on, at sample {engine.first}; allowed: later")
+    first, samples = engine.first, engine.samples - engine.first
+    collector = Collector(cell, samples, first=first)
     sinks: list[Sink] = [collector, _Watcher(watch)]
+    if begun and bag is not None and scenario.recorder[1].mode != "continuous":
+        raise InputError("snapshots of a run from a checkpoint; allowed: --set recorder.mode=continuous, or no bag")
     recorder = snapshots = None
     if bag is not None:
         from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots
 
         snapshots = begin_snapshots(bag, scenario, cell)
-        recorder = OfflineRecorder(cell, engine.samples, begin(bag, scenario, snapshots), snapshots)
+        recorder = OfflineRecorder(cell, engine.samples, begin(bag, scenario, snapshots), snapshots, first)
         sinks.append(recorder)
     start = time.monotonic()
     try:
         watch({"event": "block0", "node": cell.master.name})
-        engine.run(sinks)
+        engine.run(sinks, {sample: partial(_keep, scenario, engine, path) for sample, path in checkpoints.items()})
     finally:
         if recorder:
             recorder.close()
@@ -213,4 +244,8 @@ def _offline(scenario: Scenario, cell: Cell, bag: Path | None, watch: Callable[[
     for name, events in waiting.items():
         watch({"event": "not_reached", "node": name, "events": events})
     recording = collector.recording()
-    return Result(scenario, "offline", engine.samples, wall, kept, found, recording, not_reached=waiting)
+    return Result(scenario, "offline", samples, wall, kept, found, recording, not_reached=waiting)
+
+
+def _keep(scenario: Scenario, engine: Engine, path: Path) -> None:
+    checkpoint.save(path, checkpoint.take(scenario, engine))

@@ -38,6 +38,7 @@ class Merger:
         run_id: ID of the run.
         step_ns: sampling step [ns].
         samples: samples per block; the last block may be shorter.
+        first: index of the first sample.
 
     Attributes:
         rows: number of rows written so far.
@@ -55,7 +56,9 @@ class Merger:
         run_id: str,
         step_ns: int,
         samples: int,
+        first: int = 0,
     ) -> None:
+        self._first, self._start_ns = first, START_NS + first * step_ns
         self._writer, self._run_id, self._step_ns, self._length = writer, run_id, step_ns, samples
         self._topics = [Dense(topic, *dense[topic], writer.channel(topic)) for topic in sorted(dense)]
         self._places = {each.topic: place for place, each in enumerate(self._topics)}
@@ -154,7 +157,7 @@ class Merger:
 
     def _lacks(self, row: int, source: str, messages: int) -> bool:
         """Return whether sparse messages from a source, up to the end of a row, are still missing."""
-        end_ns = START_NS + (row + 1) * self._length * self._step_ns
+        end_ns = self._start_ns + (row + 1) * self._length * self._step_ns
         came = sum(each.log_ns < end_ns and self._sparse[each.topic] == source for each in self._waiting)
         return self._written[source] + came < messages
 
@@ -162,10 +165,11 @@ class Merger:
         """Return the row of a topic's next block, after checking that the block fits this row."""
         row = self._ends[place]
         short = samples != self._length and not (last and (self._tail is None or self._tail.plan.samples == samples))
-        if first != row * self._length or short or (self._final is not None and row > self._final):
+        expected = self._first + row * self._length
+        if first != expected or short or (self._final is not None and row > self._final):
             raise LatheError(
                 f"topics are not cut into the same blocks: {self._topics[place].topic} brings {samples} samples "
-                f"from {first}; expected {self._length} from {row * self._length}, fewer only at the end of the run"
+                f"from {first}; expected {self._length} from {expected}, fewer only at the end of the run"
             )
         if last:
             self._end(place, row)
@@ -193,14 +197,14 @@ class Merger:
         if samples != self._length:
             if self._tail is None:
                 self._tail = RowBuffer(Plan(self._topics, self._run_id, self._step_ns, samples), 1)
-                self._tail.begin(row * self._length)
+                self._tail.begin(self._first + row * self._length)
             return self._tail, 0
         number, within = divmod(row, self._buffer_rows)
         buffer = self._buffers.get(number)
         if buffer is None:
             buffer = self._free.pop() if self._free else RowBuffer(self._plan, self._buffer_rows)
             self._buffers[number] = buffer
-            buffer.begin(number * self._buffer_rows * self._length)
+            buffer.begin(self._first + number * self._buffer_rows * self._length)
         return buffer, within
 
     # ---- output --------------------------------------------------------------------------------------
@@ -233,13 +237,13 @@ class Merger:
             end -= 1
         if self._waiting:
             earliest = min(single.log_ns for single in self._waiting)
-            end = min(end, (earliest - START_NS) // self._step_ns // self._length)
+            end = min(end, (earliest - self._start_ns) // self._step_ns // self._length)
         return max(end, self.rows + 1)
 
     def _write(self, buffer: RowBuffer, within: int, end: int) -> None:
         """Write rows of one buffer up to row ``end``, after the sparse messages due before the first row."""
         first = self.rows
-        first_ns = START_NS + (first * self._length + buffer.plan.samples - 1) * self._step_ns
+        first_ns = self._start_ns + (first * self._length + buffer.plan.samples - 1) * self._step_ns
         due = sorted(single for single in self._waiting if single.log_ns <= first_ns) if self._waiting else []
         if due:
             self._waiting = [single for single in self._waiting if single.log_ns > first_ns]
@@ -255,7 +259,7 @@ class Merger:
             data = buffer.bytes[within + skip : within + end - self.rows].reshape(-1).data
             self._writer.write_rows(buffer.plan.rows, first_ns + skip * buffer.plan.rows.period_ns, data)
         self.rows, self.samples = end, (end - 1) * self._length + buffer.plan.samples
-        self.log_ns = START_NS + (self.samples - 1) * self._step_ns
+        self.log_ns = self._start_ns + (self.samples - 1) * self._step_ns
         self.complete = self._final is not None and end > self._final
         # A used buffer already has its template and step; a new one would cost a copy of the template for each row.
         if end % self._buffer_rows == 0 and buffer is not self._tail:
@@ -271,7 +275,7 @@ class Merger:
         for place, end in enumerate(self._ends):
             for row in range(self.rows, end):
                 buffer, within = self._at(row)
-                stamp = START_NS + (row * self._length + buffer.plan.samples - 1) * self._step_ns
+                stamp = self._start_ns + (row * self._length + buffer.plan.samples - 1) * self._step_ns
                 left.append(_Single(stamp, self._topics[place].topic, 0, buffer.message(place, within)))
         for single in sorted(left):
             self._writer.write(single.topic, single.log_ns, single.data)

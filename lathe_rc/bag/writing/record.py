@@ -8,6 +8,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
+from lathe_rc.bag.snapshot import GONE_ON
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
@@ -80,12 +81,15 @@ class OfflineRecorder:
 
     Args:
         cell: the running cell.
-        samples: length of the run.
+        samples: index after the last sample of the run.
         writer: writer of the bag.
         snapshots: snapshot output instead of or in addition to the bag, if any.
+        first: index of the first sample.
     """
 
-    def __init__(self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None) -> None:
+    def __init__(
+        self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None, first: int = 0
+    ) -> None:
         shared = cell.master.shared
         self._snapshots = snapshots
         self._cell, self._samples, self._writer = cell, samples, writer
@@ -102,7 +106,10 @@ class OfflineRecorder:
             run_id=shared.run_id,
             step_ns=shared.step_ns,
             samples=shared.block_size,
+            first=first,
         )
+        if first:
+            writer.tell({GONE_ON: str(first)})
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Divide a chunk into blocks and write the blocks."""

@@ -261,6 +261,10 @@ class LearningController(Learner):
         self._margins.forget_suprema()
         self._controller.retune(self._q, parameters.learning_gain, parameters.make_preview(self.name))
 
+    def forget(self) -> None:
+        """Forget the tabulated margins, which depend on gain, lead and Q."""
+        self._margins.forget_suprema()
+
     # ---- samples ------------------------------------------------------------------------------------
 
     @property

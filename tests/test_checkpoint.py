@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints: a run that goes on from one gives the bits of the uninterrupted run."""
+
+import json
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lathe_rc
+from lathe_rc.bag import check
+from lathe_rc.cell import checkpoint
+from lathe_rc.cell.recording import Recording
+from lathe_rc.errors import InputError
+from lathe_rc.files import sealed, unsealed
+from tests.bags import lathe
+
+LONG = ["spindle_encoder.revolutions=5"]
+SCENARIOS = (
+    *("piston", "full_cell", "supervised_two_channel", "periodic", "robust", "gauged", "loaded_cutting", "vibration"),
+    *("supervised_turning", "series"),
+)
+_HEAD = len(b"lathe_rc checkpoint 1\n")
+
+
+def rest(whole: Recording, first: int) -> dict[str, str]:
+    """Return the digests of a recording from a sample on."""
+    dense = {topic: {name: array[first:] for name, array in part.items()} for topic, part in whole.dense.items()}
+    sparse = {}
+    for topic, part in whole.sparse.items():
+        count = sum(message.index < first for message in whole.messages(topic))
+        sparse[topic] = type(part)(part.stamps[count:], {name: found[count:] for name, found in part.values.items()})
+        # Without any message there are no fields either.
+        sparse[topic] = sparse[topic] if sparse[topic].stamps else type(part)()
+    return Recording(whole.types, dense, sparse, whole.step_ns).digests()
+
+
+def gone_on(name: str, folder: Path, count: int, seed: int = 1) -> None:
+    """Check that a scenario gives the same bits from each of some random samples on."""
+    scenario = lathe_rc.load(name, LONG)
+    samples = lathe_rc.run(scenario).samples
+    places = sorted((np.random.default_rng([seed, *name.encode()]).permutation(samples - 1)[:count] + 1).tolist())
+    whole = lathe_rc.run(scenario, checkpoints={f"sample:{place}": folder / f"{place}" for place in places})
+    assert whole.digest == lathe_rc.run(scenario).digest, "checkpoints change nothing"
+    for place in places:
+        found = lathe_rc.run(scenario, start_from=folder / f"{place}")
+        assert (found.recording.first, found.samples) == (place, samples - place)
+        assert found.digest == rest(whole.recording, place), f"{name} from sample {place}"
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_run_goes_on_from_any_sample_with_the_same_bits(name: str, tmp_path: Path) -> None:
+    """A run that goes on from a checkpoint at a random sample gives the bits of the uninterrupted run."""
+    gone_on(name, tmp_path, 2)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_run_goes_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:
+    """The same from 20 random samples of each of ten scenarios."""
+    gone_on(name, tmp_path, 20, seed=2)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a checkpoint of the piston before revolution 3."""
+    path = tmp_path_factory.mktemp("learned") / "piston.ckpt"
+    lathe_rc.run(lathe_rc.load("piston", LONG), checkpoints={"revolution:3": path})
+    return path
+
+
+def test_the_first_revolution_after_a_checkpoint_at_a_revolution_is_complete(learned: Path) -> None:
+    whole, found = (lathe_rc.run(lathe_rc.load("piston", LONG), start_from=path) for path in (None, learned))
+    assert np.array_equal(found.errors.rms, whole.errors.rms[3:])
+
+
+@pytest.mark.parametrize("changed", [{"learning_gain": 0.3}, {"lead_time": 1.3e-3}, {"q_time": 9e-5}])
+def test_other_parameters_act_from_the_checkpoint_on(changed: dict[str, float], learned: Path) -> None:
+    """A run with other parameters gives the bits of one in which an event sets them at the checkpoint."""
+    ((key, value),) = changed.items()
+    first = checkpoint.sample_of("revolution:3", lathe_rc.cell.wiring.Cell(lathe_rc.load("piston", LONG).nodes).master)
+    other = lathe_rc.load("piston", [*LONG, f"learning_controller.{key}={value}"])
+    event = f"learning_controller.events=['sample {first}: set {key} {value}']"
+    told = lathe_rc.run(lathe_rc.load("piston", [*LONG, event])).recording
+    found = lathe_rc.run(other, start_from=learned).recording
+    for topic, signals in found.dense.items():
+        for name, array in signals.items():
+            assert np.array_equal(array, told.dense[topic][name][first:]), f"{topic}.{name}"
+
+
+def test_events_behind_the_checkpoint_are_not_repeated_and_new_ones_act(tmp_path: Path) -> None:
+    before = lathe_rc.load("piston", [*LONG, "learning_controller.events=['revolution 1: freeze']"])
+    lathe_rc.run(before, checkpoints={"revolution:2": tmp_path / "file"})
+    events = "learning_controller.events=['revolution 1: freeze', 'revolution 4: learn']"
+    after = lathe_rc.load("piston", [*LONG, events])
+    found = lathe_rc.run(after, start_from=tmp_path / "file")
+    assert [event.text for event in found.event_log] == ["learn"]
+    assert found.digest == rest(lathe_rc.run(after).recording, found.recording.first)
+
+
+REFUSED = {
+    "nominal_rpm=900.0": "goes on only with the parameters of the checkpoint; allowed: spindle_encoder.nominal_rpm",
+    "electrodynamic_actuator.delay=1.0e-3": "the state of electrodynamic_actuator depends on what differs here",
+    "spindle_encoder.revolutions=2.0": "the run ends at",
+    "learning_controller.feedback_delay=20000": "allowed:",
+    "seed=1": "goes on only with the parameters of the checkpoint; allowed: spindle_encoder.seed = 0",
+}
+
+
+@pytest.mark.parametrize(("override", "why"), REFUSED.items())
+def test_parameters_on_which_the_state_depends_are_refused(override: str, why: str, learned: Path) -> None:
+    with pytest.raises(InputError, match=why) as caught:
+        lathe_rc.run(lathe_rc.load("piston", [*LONG, override]), start_from=learned)
+    assert "\n" not in str(caught.value)
+
+
+def changed(path: Path, **told: object) -> bytes:
+    """Return the content of a checkpoint with some entries replaced."""
+    content = json.loads(zlib.decompress(bytes(unsealed(path.read_bytes()))[_HEAD:]))
+    whole = path.read_bytes()[:_HEAD] + zlib.compress(json.dumps({**content, **told}).encode())
+    return sealed(whole)
+
+
+def test_damaged_foreign_and_other_versions_files_are_refused_in_one_line(learned: Path, tmp_path: Path) -> None:
+    """A damaged, foreign or mismatched file is refused in one line, and one that names code is not run."""
+    good, file = learned.read_bytes(), tmp_path / "file"
+    flipped = bytearray(good)
+    flipped[len(good) // 2] ^= 1
+    code = ["attributes", {"_model": ["object", "os:_wrap_close", {}]}]
+    wrong = {
+        "not a checkpoint": b"PK" + good,
+        "damaged": bytes(flipped),
+        "checksum": good[:-200],
+        "made with lathe_rc": changed(learned, made_with={"lathe_rc": "0.0.1"}),
+        "not the state of spindle_encoder": changed(learned, stages={"spindle_encoder": ["list", []]}),
+        "not the state of learning_controller .*no class of data": changed(
+            learned, stages=dict.fromkeys(lathe_rc.load("piston").nodes) | {"learning_controller": code}
+        ),
+        "holds no node spindle_encoder": changed(learned, nodes={}),
+        "cannot be read": b"",
+    }
+    for why, content in wrong.items():
+        file.write_bytes(content)
+        place = tmp_path / "missing" if why == "cannot be read" else file
+        with pytest.raises(InputError, match=why) as caught:
+            lathe_rc.run(lathe_rc.load("piston", LONG), start_from=place)
+        assert "\n" not in str(caught.value)
+
+
+def test_the_bag_of_a_run_from_a_checkpoint_is_sound(learned: Path, tmp_path: Path) -> None:
+    """The bag begins at the checkpoint, passes its check, and gives the digests of the run."""
+    found = lathe_rc.run(lathe_rc.load("piston", LONG), start_from=learned, bag=tmp_path / "bag")
+    checked = check.check(tmp_path / "bag")
+    assert (checked.lost, checked.wrong, checked.first) == ([], [], found.recording.first)
+    assert checked.digests == found.digest == lathe_rc.read_bag(tmp_path / "bag").digests()
+
+
+def test_the_command_writes_checkpoints_and_goes_on_from_them(learned: Path, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    told = lathe("run", "piston", "--revolutions", "4", "--checkpoint", "revolution:3", str(file)).stdout
+    assert f"checkpoint at revolution:3: {file}" in told.replace("\n", "")
+    found = json.loads(lathe("run", "piston", "--revolutions", "5", "--from", str(file), "--json").stdout)
+    whole = lathe_rc.run(lathe_rc.load("piston", LONG))
+    assert found["digest"] == rest(whole.recording, found["first_sample"])
