@@ -18,9 +18,10 @@ from lathe_rc import harness
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.scenario import new_stage
 from lathe_rc.cell.stage import Output, Stage
 from lathe_rc.cell.stage_cache import Start, UnknownPartError
-from lathe_rc.cell.wiring import Cell, new_stage
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import COMMAND
 

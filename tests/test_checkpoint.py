@@ -14,6 +14,7 @@ from lathe_rc.cell import checkpoint
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 from lathe_rc.files import sealed, unsealed
+from lathe_rc.sweep import row
 from tests.bags import lathe
 
 LONG = ["spindle_encoder.revolutions=5"]
@@ -87,6 +88,38 @@ def test_other_parameters_act_from_the_checkpoint_on(changed: dict[str, float], 
     for topic, signals in found.dense.items():
         for name, array in signals.items():
             assert np.array_equal(array, told.dense[topic][name][first:]), f"{topic}.{name}"
+
+
+def test_a_batch_gives_the_bits_of_single_runs_from_each_checkpoint(learned: Path, tmp_path: Path) -> None:
+    """Cells of a batch that start from two checkpoints, or from none, give the bits of single runs."""
+    lathe_rc.run(lathe_rc.load("piston", LONG), checkpoints={"revolution:2": tmp_path / "early"})
+    base = lathe_rc.load("piston", LONG).named()
+    varied = [
+        base.varied({"spindle_encoder.start_from": str(start), "learning_controller.learning_gain": gain})
+        for gain in (0.5, 0.6, 0.7)
+        for start in (learned, learned, tmp_path / "early", "")
+    ]
+    for outcome in lathe_rc.run_many(varied, threads=1):
+        alone = lathe_rc.run(outcome.scenario)
+        assert np.array_equal(outcome.kept.rms, alone.errors.rms), outcome.scenario
+    (found,) = lathe_rc.run_many([varied[0]], ["tool"])
+    assert found.kept.digests()["/tool"] == lathe_rc.run(varied[0]).digest["/tool"]
+
+
+def test_rows_of_a_sweep_go_on_from_the_checkpoint(learned: Path) -> None:
+    """The row of a cell has the digest, the revolutions and the verdict of the run from the checkpoint."""
+    told = f"spindle_encoder.start_from={learned}"
+    scenario = lathe_rc.load("piston", [*LONG, told, "tool.tolerance=5.0e-6"])
+    found, alone = row.compute(scenario, {}, [], [row.measure("tool.error:max", scenario)]), lathe_rc.run(scenario)
+    assert (found["digest"], found["samples"]) == (row.digest(alone.recording, []), alone.samples)
+    assert found["tool.in_tolerance_from"] == alone.verdict.since
+    assert found["tool.error:max"] == alone.errors.largest[-1]
+
+
+def test_a_node_refuses_a_checkpoint(learned: Path) -> None:
+    """A cell of nodes starts at sample 0, and says so."""
+    with pytest.raises(InputError, match="allowed: offline"):
+        lathe_rc.run(lathe_rc.load("piston", LONG), mode="composed", start_from=learned)
 
 
 def test_events_behind_the_checkpoint_are_not_repeated_and_new_ones_act(tmp_path: Path) -> None:

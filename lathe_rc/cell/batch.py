@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any, Generic, Protocol, TypeVar, overload
 
 from lathe_rc import messages
-from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
+from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
@@ -160,7 +160,7 @@ def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> O
     try:
         cell = runner.cell(scenario)
         cell.check(cures=False)
-        return Outcome(scenario, runner.run(cell, keep(cell, cell.samples)))
+        return Outcome(scenario, runner.run(cell, keep(cell, cell.samples - cell.first)))
     except LatheError as error:
         return Outcome(scenario, None, error)
     finally:
@@ -175,11 +175,14 @@ class Errors:
         self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
         read = {self._encoder: "angle_true", self._tool: "error"}
         self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read.items() if topic]
-        self._errors = RunningErrors()
+        self._errors, self._first, self._before = RunningErrors(), cell.first, 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Process a chunk of the run, as a sink of the engine."""
         if self._encoder and self._tool:
+            if first == self._first > 0:
+                self._before = turns_before(dense[self._encoder]["angle_true"])
+                self._errors = RunningErrors(self._before)
             self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
 
     def kept(self) -> FormErrors:
@@ -200,7 +203,7 @@ class Topics(Collector):
     """
 
     def __init__(self, cell: Cell, samples: int, topics: Collection[str]) -> None:
-        super().__init__(cell, samples, topics)
+        super().__init__(cell, samples, topics, cell.first)
         self.heard = topics
 
     def kept(self) -> Recording:

@@ -16,6 +16,7 @@ import re
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,12 @@ import numpy as np
 
 from lathe_rc import __version__
 from lathe_rc.cell.changes import Change, ClashError, Restoring, changes
-from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of
+from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of, new_stage
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.time_master import TimeMaster
-from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.files import DamagedError, contents, sealed, unsealed, written
@@ -41,6 +40,7 @@ _HEAD = b"lathe_rc checkpoint 1\n"
 _MOST = 2**28  # largest file, and largest content [B]
 _WHEN = re.compile(r"(revolution|second|sample):([0-9.eE+-]+)")
 _FREE = frozenset({"revolutions", "events", "faults", "block_size", "joint_state_period", "allow_faults"})
+_START_FROM = "start_from"
 _NUMBERS = "biuf"  # allowed kinds of array elements
 
 
@@ -69,20 +69,20 @@ class Checkpoint:
     path: Path = Path()
     _starts: dict[str, Stage] = field(default_factory=dict, compare=False, repr=False)
 
-    def check(self, cell: Cell) -> None:
+    def check(self, stages: Iterable[str], master: TimeMaster) -> None:
         """Check that a cell has the nodes of the checkpoint, and runs longer.
 
         Raises:
             InputError: it does not.
         """
-        if other := cell.stages.keys() ^ self.nodes.keys():
+        if other := {*stages} ^ self.nodes.keys():
             raise InputError(
                 f"{self.path} holds the nodes {', '.join(self.nodes)}, and {', '.join(sorted(other))} is missing here "
                 "or there; allowed: the same nodes"
             )
-        if (cell.master.samples or math.inf) <= self.sample:
+        if (master.samples or math.inf) <= self.sample:
             raise InputError(
-                f"{self.path} is the state at sample {self.sample}, and the run ends at {cell.master.samples}; "
+                f"{self.path} is the state at sample {self.sample}, and the run ends at {master.samples}; "
                 "allowed: a longer run (revolutions)"
             )
 
@@ -148,16 +148,21 @@ class Checkpoint:
 
 
 def _values(table: NodeParameters) -> dict[str, Any]:
-    return table.model_dump(mode="json", exclude={*HOST_PARAMETERS, *table.judging})
+    return table.model_dump(mode="json", exclude={*HOST_PARAMETERS, *table.judging, _START_FROM})
 
 
-def take(scenario: Scenario, engine: Engine) -> Checkpoint:
-    """Return a checkpoint of a running engine, between two samples.
+def take(scenario: Scenario, stages: Mapping[str, Stage], sample: int, past: Mapping[str, Signals]) -> Checkpoint:
+    """Return a checkpoint of the running stages of a scenario.
+
+    Args:
+        scenario: the scenario of the run.
+        stages: its stages, which have computed all samples before ``sample``.
+        sample: number of samples computed.
+        past: samples that delayed readers need.
 
     Raises:
         LatheError: a third-party stage contains something that is not data.
     """
-    stages = engine.stages
     nodes = {name: (kind_of(name, stage.shared.stage), _values(stage.shared)) for name, stage in stages.items()}
     told: dict[str, Change | None] = {}
     for name, stage in stages.items():
@@ -167,10 +172,10 @@ def take(scenario: Scenario, engine: Engine) -> Checkpoint:
         scenario.name,
         scenario.identity,
         _made_with(kind for kind, _ in nodes.values()),
-        engine.reached,
+        sample,
         nodes,
         told,
-        engine.past,
+        past,
     )
 
 
@@ -247,20 +252,38 @@ def save(path: Path, found: Checkpoint) -> None:
         file.write(sealed(_HEAD + zlib.compress(json.dumps(told, default=_encoded).encode(), 1)))
 
 
-def load(path: Path, scenario: Scenario) -> Checkpoint:
+def begun_of(nodes: Mapping[str, NodeParameters]) -> Checkpoint | None:
+    """Return the checkpoint that the time master of some nodes names; None without one.
+
+    Raises:
+        InputError: see `load`.
+    """
+    path = next(filter(None, (getattr(table, _START_FROM, "") for table in nodes.values())), "")
+    kinds = {kind_of(name, table.stage) for name, table in nodes.items()}
+    try:
+        return _loaded(path, frozenset(kinds & {*STAGES}), Path(path).stat().st_mtime_ns) if path else None
+    except OSError as error:
+        raise InputError(f"{path}: the checkpoint cannot be read ({error.strerror})") from None
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: str, kinds: frozenset[str], changed: int) -> Checkpoint:  # noqa: ARG001 - the time is part of the key
+    return load(Path(path), kinds)
+
+
+def load(path: Path, kinds: Iterable[str]) -> Checkpoint:
     """Read a checkpoint.
 
     Args:
         path: file written by `save`.
-        scenario: scenario that is to go on.
+        kinds: kinds of the stages that are to go on.
 
     Raises:
         InputError: the file cannot be read, is no checkpoint, is damaged, or was made by another version.
     """
     try:
         told = _content(path)
-        kinds = [scenario.kind(name) for name in scenario.nodes]
-        made, here = dict(told["made_with"]), _made_with(kind for kind in kinds if kind in STAGES)
+        made, here = dict(told["made_with"]), _made_with(kinds)
         nodes = {name: (kind, values) for name, (kind, values) in told["nodes"].items()}
         found = Checkpoint(
             told["scenario"], told["identity"], made, int(told["sample"]), nodes, told["stages"], told["past"], path

@@ -70,20 +70,7 @@ class Engine:
         passing = [(topic, name) for topic, names in fields.items() for name in names if name not in kept[topic]]
         self._tapes = Tapes(topics, self._piece, passing, self._chunk)
         self._program = Program(wires, self._tapes, self._chunk)
-
-    def start_at(self, sample: int, past: Mapping[str, Signals]) -> None:
-        """Start at a sample whose state the stages have, instead of at sample 0.
-
-        Args:
-            sample: the first sample of the run.
-            past: see `past`.
-
-        Raises:
-            InputError: ``past`` lacks samples that a delayed reader needs.
-        """
-        self.first = sample
-        self._tapes.restart(sample, past)
-        self._program.begin(self._stages, sample)
+        self._restart(cell)
 
     @property
     def reached(self) -> int:
@@ -97,7 +84,7 @@ class Engine:
 
     def _take(self, cell: Cell) -> None:
         """Load the stages of a cell."""
-        self.first, self.samples = 0, cell.samples
+        self.first, self.samples = cell.first, cell.samples
         self._wiring, self._block = cell.wiring, cell.master.shared.block_size
         self.stages, self._stages = cell.stages, list(cell.stages.values())
         for stage in self._stages:
@@ -116,9 +103,13 @@ class Engine:
         if cell.wiring is not self._wiring or block != self._block or _heard(cell, heard) != self._heard:
             return False
         self._take(cell)
-        self._tapes.rewind()
-        self._program.begin(self._stages)
+        self._restart(cell)
         return True
+
+    def _restart(self, cell: Cell) -> None:
+        """Start at the first sample of a cell."""
+        self._tapes.restart(self.first, cell.begun.past if cell.begun else {})
+        self._program.begin(self._stages, self.first)
 
     def run(self, sinks: Iterable[Sink], stops: Mapping[int, Callable[[], object]] = MappingProxyType({})) -> None:
         """Run the cell to completion.

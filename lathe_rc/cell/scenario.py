@@ -20,6 +20,7 @@ from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
@@ -75,6 +76,11 @@ def kind_of(node: str, stage: object) -> str:
     if kind not in TABLES:
         raise InputError(f"{node}: no stage {shown(kind)!r}; {TABLES.instead(kind)}; set {node}.stage")
     return kind
+
+
+def new_stage(name: str, table: NodeParameters) -> Stage:
+    """Create the stage of a node."""
+    return STAGES[kind_of(name, table.stage)](name, table)
 
 
 class _Text(str):

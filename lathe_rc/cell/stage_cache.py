@@ -22,7 +22,6 @@ from numba.core.types import Type
 
 from lathe_rc.cell.parameters import NodeParameters, Table
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.wiring import new_stage
 from lathe_rc.compiled.step import Entry
 from lathe_rc.extensions import is_ours
 
@@ -131,18 +130,23 @@ class StageCache:
     def __init__(self) -> None:
         self._stages: dict[str, Stage] = {}
         self._starts: dict[str, Start | None] = {}  # of stages requested again; None if not resettable
+        self._new: object = None
 
-    def take(self, name: str, table: NodeParameters) -> Stage:
-        """Return the stage of a node: the cached one if its table is equal, otherwise a new one.
+    def take(self, name: str, table: NodeParameters, new: Callable[[str, NodeParameters], Stage]) -> Stage:
+        """Return the stage of a node: the cached one if its table is equal, otherwise a ``new`` one.
 
         The first stage with a table is not cached, since the next cell may have a different table.
         """
+        if new != self._new:  # stages from another checkpoint have another state
+            self._new = new
+            self._stages.clear()
+            self._starts.clear()
         before = self._stages.get(name)
         again = before is not None and _same(before, table)
         if before is not None and again and (start := self._starts.get(name)):
             start.rewind()
             return before
-        made = self._stages[name] = new_stage(name, table)
+        made = self._stages[name] = new(name, table)
         if before is not None:
             made.take_room(before)
         if not again:

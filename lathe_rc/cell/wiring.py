@@ -12,8 +12,9 @@ from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
 from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.cell.checkpoint import Checkpoint, begun_of
 from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
-from lathe_rc.cell.scenario import kind_of
+from lathe_rc.cell.scenario import kind_of, new_stage
 from lathe_rc.cell.stage import Input, Output, Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.learner import Loop
@@ -144,9 +145,7 @@ def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> 
     return source
 
 
-def new_stage(name: str, table: NodeParameters) -> Stage:
-    """Create the stage of a node."""
-    return STAGES[kind_of(name, table.stage)](name, table)
+NewStage = Callable[[str, NodeParameters], Stage]  #: factory of a new stage
 
 
 class Cell:
@@ -155,9 +154,10 @@ class Cell:
     Args:
         nodes: table of each node by name; nodes other than stages are ignored.
         unknown: members known only by their topics, by name.
-        stage: factory of the stage for a name and table.
+        stage: factory of the stage for a name and table, which may call a function for a new one.
 
     Attributes:
+        begun: checkpoint from which the run goes on; None: it starts at sample 0.
         unknown: members known only by their topics, by name.
         unchecked: omissions of `check`, caused by unknown members, or by third-party laws or drives that do not provide
             the necessary data; one line each.
@@ -180,18 +180,23 @@ class Cell:
         nodes: Mapping[str, NodeParameters],
         unknown: Mapping[str, Unknown] | None = None,
         *,
-        stage: Callable[[str, NodeParameters], Stage] = new_stage,
+        stage: Callable[[str, NodeParameters, NewStage], Stage] = lambda name, table, new: new(name, table),
     ) -> None:
         self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
         self.loops: dict[str, list[Loop]] = {}
         self._tables = nodes
+        self.begun: Checkpoint | None = begun_of(nodes)
+        new = self.begun.stage if self.begun else new_stage
         with explain_overflow(nodes):
-            made = {name: stage(name, table) for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
+            named = {name: table for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}
+            made = {name: stage(name, table, new) for name, table in named.items()}
         ports = tuple(map(_ports, made.values()))
         self.wiring = _wire(ports, self.unknown) if self.unknown else _wire_alike(ports)
         self.dense, self.sparse = self.wiring.dense, self.wiring.sparse
         self.stages = {name: made[name] for name in self.wiring.order}
+        if self.begun:
+            self.begun.check(self.stages, self.master)
 
     def publisher(self, topic: str, question: str) -> Stage | None:
         """Return the stage that publishes a topic; None for an unknown member, which leaves the question open."""
@@ -232,8 +237,13 @@ class Cell:
         return self.master.speed_range()
 
     @property
+    def first(self) -> int:
+        """Index of the first sample of a run."""
+        return self.begun.sample if self.begun else 0
+
+    @property
     def samples(self) -> int:
-        """Return the length of a run [sample].
+        """Return the index after the last sample of a run.
 
         Raises:
             InputError: the run is endless, its length is unknown in advance, or there is no time master.

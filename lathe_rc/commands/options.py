@@ -56,6 +56,10 @@ start = click.option(
     help="processes are forked from one that has imported everything, or interpreters of their own; default: fork",
 )
 
+start_from = click.option(
+    "--from", "start_from", type=PATH, metavar="FILE", help="checkpoint from which the cell goes on"
+)
+
 length = click.option("--revolutions", type=POSITIVE, help="length of each run")
 
 # --- sweep and tuning

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     metavar="WHEN FILE",
     help="write the state of the cell at revolution:R, second:T or sample:N; repeatable",
 )
-@click.option("--from", "start_from", type=options.PATH, metavar="FILE", help="go on from a checkpoint")
+@options.start_from
 @click.option("--profile", type=options.PATH, help="CSV file to write the last revolution's profile to")
 @click.option("--figure", type=options.PATH, help="PNG to draw the form and its error to")
 @options.overrides

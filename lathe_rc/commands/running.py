@@ -53,7 +53,8 @@ def run(
         InputError: options contradict each other, or the scenario cannot run.
         LatheError: the run failed, or exceeds the required tolerance.
     """
-    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, speed_factor=speed_factor, strict=strict)
+    given = {"revolutions": revolutions, "speed_factor": speed_factor}
+    loaded = scenarios.load(scenario, overrides, strict=strict, start_from=start_from, **given)
     split = scenarios.split(loaded, groups)
     if groups and mode != "processes":
         raise InputError(f"--group with --mode {mode}; allowed: --mode processes")
@@ -82,7 +83,6 @@ def run(
         domain=domain,
         namespace=namespace or "/",
         start=start or "fork",
-        start_from=start_from,
         checkpoints=dict(checkpoints),
     )
     if profile:

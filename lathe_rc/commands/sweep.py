@@ -112,6 +112,7 @@ def space_of(
 )
 @options.overrides
 @options.length
+@options.start_from
 @click.option("--out", type=options.PATH, help="folder of the results; default: sweep-SCENARIO")
 @options.scheduler
 @options.workers
@@ -127,6 +128,7 @@ def run(
     cells: Path | None,
     overrides: tuple[str, ...],
     revolutions: float | None,
+    start_from: Path | None,
     out: Path | None,
     scheduler: str | None,
     workers: int | None,
@@ -139,7 +141,7 @@ def run(
     from lathe_rc.commands.progress import SweepWatch
 
     check_crew(scheduler, workers)
-    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
     if not (vary or draw or cells or seeds > 1):
         raise InputError("nothing varies; allowed: --vary, --draw, --cells or --seeds (lathe run computes one cell)")
     space = space_of(vary, draw, tie, sample, seeds, cells)

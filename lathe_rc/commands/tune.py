@@ -67,6 +67,7 @@ _STEPS = 5  # number of displayed steps of the history
 @options.measures
 @options.overrides
 @options.length
+@options.start_from
 @click.option("--out", type=options.PATH, help="folder of the results; default: tune-SCENARIO")
 @options.scheduler
 @options.workers
@@ -84,6 +85,7 @@ def tune(
     trials: int,
     overrides: tuple[str, ...],
     revolutions: float | None,
+    start_from: Path | None,
     out: Path | None,
     scheduler: str | None,
     workers: int | None,
@@ -103,7 +105,7 @@ def tune(
         raise InputError(f"--worst with --percentile {percentile:g}; allowed: one of them")
     if (worst or percentile is not None) and not over and seeds == 1:
         raise InputError(f"{'--worst' if worst else '--percentile'} of one cell; allowed: with --over or --seeds")
-    loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
     drawn = [text for text in over if text.partition("=")[2].strip().startswith(_LAWS)]
     varied = [text for text in over if text not in drawn]
     place = out or Path(f"tune-{loaded.name}")

@@ -17,13 +17,12 @@ from types import MappingProxyType
 from lathe_rc import messages, process_launcher
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.ahead import compile_ahead
-from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wiring import Cell, new_stage
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder
 from lathe_rc.harness.result import Mode, Result
@@ -82,12 +81,11 @@ def run(
     """
     if mode != "offline" and start == "fork":
         process_launcher.server()  # the server imports while the cell is checked
-    if mode != "offline" and (start_from or checkpoints):
+    if start_from:
+        scenario = scenario.varied({f"{name}.start_from": os.fspath(start_from) for name in scenario.masters})
+    cell = Cell(scenario.nodes)
+    if mode != "offline" and (cell.begun or checkpoints):
         raise InputError(f"a checkpoint with mode {mode}; allowed: offline, where the state is the same")
-    begun = checkpoint.load(Path(start_from), scenario) if start_from else None
-    cell = Cell(scenario.nodes, stage=begun.stage if begun else new_stage)
-    if begun:
-        begun.check(cell)
     cell.check()
     check_room(cell)
     places = {checkpoint.sample_of(when, cell.master): Path(path) for when, path in checkpoints.items()}
@@ -104,7 +102,7 @@ def run(
     for left in compile_ahead(cell.stages.values()):
         watch({"event": "compiling", "node": left[0], "nodes": left})
     if mode == "offline":
-        result = _offline(scenario, cell, place, watch, begun, places)
+        result = _offline(scenario, cell, place, watch, places)
     else:
         result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
     result = replace(
@@ -210,18 +208,15 @@ def _offline(
     cell: Cell,
     bag: Path | None,
     watch: Callable[[Event], None],
-    begun: Checkpoint | None,
     checkpoints: Mapping[int, Path],
 ) -> Result:
     engine = Engine(cell)
-    if begun:
-        engine.start_at(begun.sample, begun.past)
     if early := [path for sample, path in checkpoints.items() if sample <= engine.first]:
         raise InputError(f"{early[0]}: a checkpoint before the run goes on, at sample {engine.first}; allowed: later")
     first, samples = engine.first, engine.samples - engine.first
     collector = Collector(cell, samples, first=first)
     sinks: list[Sink] = [collector, _Watcher(watch)]
-    if begun and bag is not None and scenario.recorder[1].mode != "continuous":
+    if cell.begun and bag is not None and scenario.recorder[1].mode != "continuous":
         raise InputError("snapshots of a run from a checkpoint; allowed: --set recorder.mode=continuous, or no bag")
     recorder = snapshots = None
     if bag is not None:
@@ -248,4 +243,4 @@ def _offline(
 
 
 def _keep(scenario: Scenario, engine: Engine, path: Path) -> None:
-    checkpoint.save(path, checkpoint.take(scenario, engine))
+    checkpoint.save(path, checkpoint.take(scenario, engine.stages, engine.reached, engine.past))

@@ -49,6 +49,10 @@ class StageRole(Role):
 
     def __init__(self, node: CellNode) -> None:
         self.node = node
+        if getattr(node.table, "start_from", ""):
+            raise InputError(
+                f"{node.get_name()}.start_from of a node; allowed: an offline run, which has the same bits"
+            )
         with explain_overflow({node.get_name(): node.table}):
             self.stage = STAGES[node.kind](node.get_name(), node.table)
         compile_kernels(self.stage)  # so that the first block takes no longer than the next

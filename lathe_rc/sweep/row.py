@@ -34,7 +34,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from lathe_rc import __version__, messages
-from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
+from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.parameters import Value
@@ -145,9 +145,11 @@ class _Keeper(Errors):
             self._hash.update(_bytes(dense[self._tool]["error"]))
         elif self._measures and self._encoder:
             angle = dense[self._encoder]["angle_true"]
+            if first == self._first > 0:
+                self._turns = RunningErrors(turns_before(angle))
             self._turns.add(angle, angle)
         for asked, kept in self._measures:
-            kept[first : first + samples] = dense[asked.topic][asked.field]
+            kept[first - self._first :][:samples] = dense[asked.topic][asked.field]
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
         """Return the result columns of a completed run."""
@@ -164,7 +166,7 @@ class _Keeper(Errors):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
                 found[f"tool.{name}_errors"] = values
         if self._tolerance:
-            found["tool.in_tolerance_from"] = judge(errors.largest, self._tolerance).since or None
+            found["tool.in_tolerance_from"] = judge(errors.largest, self._tolerance, self._before).since or None
         return found
 
 
@@ -221,9 +223,9 @@ def compute(
         row["seed"] = scenario.shared.seed
         cell = bench.cell(scenario)
         cell.check(cures=False)
-        keeper = _Keeper(cell, cell.samples, measures)
+        keeper = _Keeper(cell, cell.samples - cell.first, measures)
         started = True  # from here on an InputError is a failure of the run, not of the check
-        row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples}
+        row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples - cell.first}
     except LatheError as error:
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
