@@ -71,10 +71,9 @@ def run(
         )
     if figure:
         picture.check_place(figure)
-    if profile:
-        check_place("--profile", profile)
-    for _, path in checkpoints:
-        check_place("--checkpoint", path)
+    written = [("--profile", profile)] if profile else []
+    for option, path in written + [("--checkpoint", path) for _, path in checkpoints]:
+        check_place(option, path)
     result = watched(
         loaded,
         mode=mode,
