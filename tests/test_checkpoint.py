@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bags import lathe, sized
 
 import lathe_rc
 from lathe_rc.bag import check
@@ -15,7 +16,6 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 from lathe_rc.files import sealed, unsealed
 from lathe_rc.sweep import row
-from tests.bags import lathe
 
 LONG = ["spindle_encoder.revolutions=5"]
 SCENARIOS = (
@@ -60,7 +60,7 @@ def test_a_run_goes_on_from_any_sample_with_the_same_bits(name: str, tmp_path: P
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_run_goes_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:
     """The same from 20 random samples of each of ten scenarios."""
-    gone_on(name, tmp_path, 20, seed=2)
+    gone_on(name, tmp_path, sized(20), seed=2)
 
 
 @pytest.fixture(scope="module")
