@@ -31,6 +31,7 @@ GRIDS: dict[str, dict[str, list[object]]] = {
         "observer_bandwidth": [1000.0, 1500.0, 1750.0, 2000.0, 2250.0, 2500.0, 3000.0],
         "control_bandwidth": [1000.0, 1250.0, 1500.0, 1750.0, 2000.0, 2250.0, 2500.0],
     },
+    "norm.": {"highest_order": [8, 10, 12, 16], "change_weight": [0.03, 0.1, 0.3, 1.0]},
     "ours": {
         "learned_waves": [6.0, 7.5, 9.0, 11.0], "learning_bandwidth": [3000.0, 8000.0],
         "observer_bandwidth": [0.0, 400.0, 700.0, 1200.0], "identify": [False, True],

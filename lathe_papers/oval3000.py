@@ -68,6 +68,10 @@ LAWS: dict[str, cells.Values] = {
     },
     "AFC": {**_ANY, "stage": "resonant_controller", "highest_order": 12, "rate": 12.0},
     "ADRC": {**_ANY, "stage": "adrc", "observer_bandwidth": 2000.0, "control_bandwidth": 1750.0},
+    "norm.": {
+        **_ANY, "stage": "norm_optimal_controller", "command_acceleration": 1000.0,
+        "highest_order": 8, "change_weight": 1.0,
+    },
     "ours": {
         **_ANY, "stage": "disturbance_controller", "identification_bandwidth": 3000.0,
         "learned_waves": 7.5, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,

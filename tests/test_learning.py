@@ -147,6 +147,22 @@ def test_a_drive_in_error_by_the_margin_diverges_in_a_run(part, diverges):
     assert (contraction > 1.0) == diverges
 
 
+def test_equal_weights_of_four_cycles_halve_the_random_part_of_the_error():
+    found = {}
+    for cycles in (1, 4):
+        law = {"cycle_weights": [1.0] * cycles}
+        sensor = {"noise_rms": 2e-6}
+        result = run(
+            spindle_encoder={"revolutions": 40.0},
+            learning_controller=law,
+            electrodynamic_actuator=sensor,
+            tool={"profile": "harmonics", "harmonic_order": [2], "harmonic_amplitude": [100e-6]},
+        )
+        error = form_error(result)[: 40 * 3840].reshape(40, -1)[-20:]
+        found[cycles] = np.std(error - error.mean(axis=0))
+    assert found[4] == pytest.approx(0.5 * found[1], rel=0.15)
+
+
 def test_last_revolution_agrees_with_the_formula():
     """Harmonic by harmonic; at 1000 rpm a revolution is 3840 samples."""
     order = np.array([1, 2, 4, 8, 12, 16, 19])

@@ -70,6 +70,36 @@ def learn(error, revolutions, controller=None, *, turning=SPEED, lengths=None, d
     return angle, *turn(controller or make(), angle, past, late, turning=turning, lengths=lengths)
 
 
+def test_cycles_are_weighted_and_a_new_memory_has_none_before_it():
+    """Errors that are constant over a cycle against the recursion; a frozen memory stays."""
+    weights, errors = np.array([0.5, 0.3, 0.2]), np.array([1.0, -0.4, 0.7, 0.2, 0.9, -0.3])
+    controller = make(weights=(5.0, 3.0, 2.0))
+    angle = np.arange(int(6.2 * TURN / (SPEED * STEP))) * (SPEED * STEP)
+    past = np.concatenate((np.zeros(DELAY), angle))[: angle.size]
+    cycle = np.minimum(past // TURN, 5).astype(int)
+    learned, wanted, inner = [], 0.0, slice(100, 900)
+
+    def go(start, stop):
+        part = slice(start, stop)
+        given = {"angle": angle[part], "past_angle": past[part], "speed": np.full(stop - start, SPEED)}
+        list(controller.block(start, **given, error=errors[cycle[part]], command=np.empty(stop - start)))
+
+    start = 0
+    for k in range(6):
+        stop = int(np.searchsorted(past, (k + 0.95) * TURN))
+        if k == 3:
+            controller.clear()
+            learned, wanted = [], 0.0
+        controller.learning = k != 5
+        go(start, stop)
+        start = stop
+        if k != 5:
+            learned.insert(0, wanted + errors[k])
+            known = weights[: len(learned[:3])]
+            wanted = float(known @ learned[:3] / known.sum())
+        assert_allclose(controller.memory()[inner], wanted, atol=1e-9, err_msg=str(k))
+
+
 # --- the interpolators
 
 

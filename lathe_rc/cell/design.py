@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.analysis.cycle_weights import of_gaussian_process
 from lathe_rc.analysis.fir_inverse import fir_inverse
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.frequency_response import FrequencyResponse
@@ -43,6 +44,7 @@ _LEARNING, _OBSERVERS = (1000.0, 3000.0, 8000.0), (0.0, 500.0, 2000.0, 4000.0)  
 _PENALTIES = (1e-4, 1e-3, 1e-2)  # ρ of an FIR inverse
 _TAPS, _AHEAD, _DENSE = 64, 2.0, 1024  # its length, its lead and its interval in lags of the drive, points of a model
 _PER_LAG = 16
+_ORDERS, _WEIGHTS = (6, 8, 12, 16, 24), (0.01, 0.1, 1.0)  # of the norm-optimal law
 _RUNS = 12  # settings of a law that are run
 #: parameters of the replaced controller that its law keeps
 _COMMON = {"feedback_delay", "reaction_delay", "retract_velocity", "retract_acceleration", "retract_jerk"}
@@ -118,7 +120,10 @@ _FLAT: list[Values] = [
     {"q_pass": float(band), "q_stop": float(stop * band), "q_ripple": ripple}
     for band, (stop, ripple) in product(_BANDS, _SHAPES)
 ]
+_FLAT_OF_CYCLES = _FLAT[:: len(_SHAPES)]  # those that several cycles are weighted with
 _SMOOTH: list[Values] = [{"q_time": float(width)} for width in _WIDTHS]
+_CYCLES: Sequence[list[float]] = [[1.0] * count for count in (2, 4, 8)]
+_PROCESSES: Sequence[list[float]] = [of_gaussian_process(8, *each) for each in ((10.0, 0.3), (30.0, 1.0), (100.0, 3.0))]
 _INVERSE: Values = {"correction": "second_order_inverse"}
 #: laws by name
 LAWS: Mapping[str, Law] = {
@@ -129,6 +134,24 @@ LAWS: Mapping[str, Law] = {
     "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, "delay"),
     "zero phase, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "model"),
     "measured, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "measured"),
+    "high order, flat Q": Law(
+        "learning_controller",
+        {"q_filter": "fir", "correction": "fir"},
+        [{**each, "cycle_weights": weights} for each in _FLAT_OF_CYCLES for weights in _CYCLES],
+        "model",
+    ),
+    "Gaussian process": Law(
+        "learning_controller",
+        {"q_filter": "fir", "correction": "fir"},
+        [{**each, "cycle_weights": weights} for each in _FLAT_OF_CYCLES for weights in _PROCESSES],
+        "model",
+    ),
+    "norm-optimal": Law(
+        "norm_optimal_controller",
+        {},
+        [{"highest_order": orders, "change_weight": weight} for orders in _ORDERS for weight in _WEIGHTS],
+        "",
+    ),
     "disturbance": Law(
         "disturbance_controller",
         {"identify": False},
@@ -251,6 +274,12 @@ class Design:
         )
         if not self._tolerance:
             raise InputError(f"design of {scenario.name}: no tolerance; allowed: tool.tolerance above 0")
+        self._limits = {
+            f"command_{name}": limit
+            for limits in self._drive.limits().values()
+            for name, limit in vars(limits).items()
+            if math.isfinite(limit)
+        }
         self._scenario = scenario
         fields = type(self._drive.shared).model_fields
         prefix = f"{self._drive.name}.{'coarse_' if 'coarse_damping' in fields else ''}"
@@ -275,6 +304,7 @@ class Design:
         before, table = base.nodes[self.node], TABLES[law.kind]
         common = table.model_fields.keys() & before.model_fields_set & (_COMMON | SharedParameters.model_fields.keys())
         kept = {name: getattr(before, name) for name in common}
+        kept |= {name: limit for name, limit in self._limits.items() if name in table.model_fields}
         return base.with_node(self.node, table.read(self.node, {**kept, "stage": law.kind, **law.fixed, **values}))
 
     def _responses(self, drives: Sequence[Values]) -> list[Response]:

@@ -67,7 +67,10 @@ class AngleMemory(NamedTuple):
         oldest: lead of the oldest read, relative to the lead.
         settings: parameters of the correction.
         taps: filter of the correction FIR.
-        memory: learned points [m]; their number is a power of two.
+        memory: learned points [m], weighted over the cycles if there are several weights; their number is a power of
+            two.
+        weights: weights of the newest learned cycles.
+        history: learned points of as many cycles [m]; unused with a single weight.
         chunk: points of the previous cycle, smoothed by Q.
         scratch: scratch array for smoothing.
         windows: angles and errors of a block, preceded by the last three before it, shape (2, n + 3) or more.
@@ -93,6 +96,8 @@ class AngleMemory(NamedTuple):
     settings: Array
     taps: Array
     memory: Array
+    weights: Array
+    history: Array
     chunk: Array
     scratch: Array
     windows: Array
@@ -177,6 +182,19 @@ def find(
     return angle.size, count, DONE, ended
 
 
+@inlined
+def _weigh(m: AngleMemory, point: int, count: int) -> None:
+    """Replace learned points by their weighted mean over the newest cycles, of which there are fewer at first."""
+    history, mask = m.history, m.memory.size - 1
+    for place in range(point, point + count):
+        history[place % history.size] = m.memory[place & mask]
+        total, sum_of_weights = 0.0, 0.0
+        for k in range(min(m.weights.size, max(place - m.whole[FROM], 0) // m.cycle + 1)):
+            total += m.weights[k] * history[(place - k * m.cycle) % history.size]
+            sum_of_weights += m.weights[k]
+        m.memory[place & mask] = total / sum_of_weights
+
+
 @kernel
 def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: Array, errors: Array) -> None:
     """Learn ``count`` grid points starting at ``point``, each from an error interpolated between four samples."""
@@ -199,9 +217,13 @@ def _learn_piece(m: AngleMemory, point: int, count: int, learning: int, angles: 
             if point + j >= whole[FROM]:
                 y += delta[j] * (gain if ramp == 0.0 else gain * soft((point + j - whole[FROM]) / ramp))
             memory[(point + j) & mask] = y
+        if m.weights.size > 1:
+            _weigh(m, point, count)
     else:
         for j in range(count):
             memory[(point + j) & mask] = memory[(point + j - cycle) & mask]
+            if m.weights.size > 1:
+                m.history[(point + j) % m.history.size] = memory[(point + j) & mask]
     # Summed one by one: the order must not depend on the division of the points into chunks.
     squares, largest = real[SQUARES], real[LARGEST]
     end = cycle - 1 - point % cycle

@@ -4,13 +4,17 @@
     M(φ) = Q·M(φ - θ) + γ·δ(φ)          learned memory (paper 001, Fig. 2; γ = 1 in the papers)
     A(φ) = (1/W0)·M(φ - θ + lead)       set point of the drive (paper 000, eq. 21, as reads of a single memory)
 
+With several weights wi, whose sum is 1, M(φ - iθ) weighted by wi replaces M(φ - θ) in both equations, so that random
+parts of the error, which differ from cycle to cycle, act by √Σwi². Where Q - γZ is within the unit circle,
+learning converges with any weights.
+
 θ is the cycle angle. With the spindle angle as φ, this is Fig. 1b of paper 000; with Ω0·t as φ, the cycle is the
 fixed time θ/Ω0, as in Fig. 1a. The lead (`lead`), the zero-phase Q (`q_filter`) and 1/W0 (`correction`) have
 modules of their own.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +74,7 @@ class RepetitiveController:
         delay: number of samples until a measured error is available.
         join_below: largest error of a cycle [m] at which the channel begins to learn; inf for an immediate start.
         step: sampling step [s].
+        weights: weights of the newest cycles, the newest first; only their ratios matter.
 
     Attributes:
         table: memory and law for `lathe_rc.control.angle_memory.advance`.
@@ -91,6 +96,7 @@ class RepetitiveController:
         delay: int,
         join_below: float,
         step: float,
+        weights: Sequence[float] = (1.0,),
     ) -> None:
         self._cycle, self._q, self._nominal, self._step = grid * revolutions, q, nominal, step
         self.preview = preview
@@ -117,6 +123,8 @@ class RepetitiveController:
             settings=np.zeros(7),
             taps=np.array(correction.taps),
             memory=self._room_for(q),
+            weights=np.array(weights) / sum(weights),
+            history=np.zeros(self._cycle * len(weights) if len(weights) > 1 else 1),
             **self._smoother(q),
             **room,
             sample=np.zeros(angle_memory.PIECE, dtype=np.int64),

@@ -6,7 +6,8 @@ Form and tool: `form`, `tool`, `gauge`, `vibration`.
 Tool drives: `drive` and `plant` (common parts), `electrodynamic_actuator`, `piezo_actuator`, `series_drive`, and
 `loaded_drive`, which includes the cut; `cutting_process`.
 Laws of the tool: `law` and `learner` (common parts), `learning_controller` with `learning_parameters` and
-`learning_step`, `form_law` (common part), `disturbance_controller`, `compound_controller`, `resonant_controller`.
+`learning_step`, `form_law` (common part), `disturbance_controller`, `compound_controller`, `resonant_controller`,
+`norm_optimal_controller`.
 Feed: `feed_drive`, `servo` and `trajectory` (common parts), `position_controller`, `force_controller`, `decoupler`.
 Safety: `supervisor`, `obedience`, `command_limits`. Other tools: `fmu`. Building blocks of stages: `tables`, `sampled`.
 """
@@ -26,6 +27,7 @@ _OWN = {
     "disturbance_controller": "disturbance_controller:DisturbanceController",
     "compound_controller": "compound_controller:CompoundController",
     "resonant_controller": "resonant_controller:ResonantController",
+    "norm_optimal_controller": "norm_optimal_controller:NormOptimalController",
     "electrodynamic_actuator": "electrodynamic_actuator:ElectrodynamicActuator",
     "piezo_actuator": "piezo_actuator:PiezoActuator",
     "series_drive": "series_drive:SeriesDriveStage",

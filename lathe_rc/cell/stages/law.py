@@ -19,7 +19,8 @@ from lathe_rc.jit import inlined
 from lathe_rc.messages import Samples, Signals
 
 _TURN = 2.0 * np.pi
-_DIVERGED = 1  # stop reason of the step
+_DIVERGED, _ASKS = 1, 2  # stop reasons of the step
+_NEVER = np.zeros(1, np.int64)  # of a law that never asks
 
 
 class Now(NamedTuple):
@@ -99,6 +100,7 @@ class LawMemory(NamedTuple):
         period: sampling step [s].
         senses: whether the law reads the drive's measured position.
         learns: whether events permit learning, shape (1,).
+        asks: whether the law asks for `Law.asked` after this sample, shape (1,).
     """
 
     law: Any
@@ -108,6 +110,7 @@ class LawMemory(NamedTuple):
     period: float
     senses: bool
     learns: npt.NDArray[np.int64]
+    asks: npt.NDArray[np.int64]
 
 
 def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
@@ -130,6 +133,10 @@ def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:
                 sensed = position[k] if memory.senses else 0.0
                 now = Now(n, n * memory.period, angle[k], speed[k], error[k], error_angle[k], learning, sensed)
                 command[k] = sample(memory.law, now)
+                if memory.asks[0]:
+                    memory.asks[0] = 0
+                    apply(who, command[start : k + 1])
+                    return k + 1, _ASKS
             apply(who, command[start:stop])
             start = stop
         return command.size, DONE
@@ -250,7 +257,17 @@ class Law(Sampled, Learner):
     def memory(self) -> LawMemory:
         """Current memory of the step of the control law."""
         delay, period = self.parameters.feedback_delay, self.parameters.step
-        return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns)
+        asks = getattr(self.law, "asks", _NEVER)
+        return LawMemory(self.law, self._guard, self.listener, delay, period, self.senses, self._learns, asks)
+
+    def asked(self) -> None:
+        """Change the memory between two samples, after a sample that set ``asks`` of the memory, shape (1,), to 1."""
+
+    @property
+    def needs_python(self) -> str:
+        """Return why the step needs Python: a law that asks changes its memory there."""
+        asks = f"{self.kind} computes its memory in Python; allowed: a law without `asked`"
+        return asks if hasattr(self.law, "asks") else super().needs_python
 
     @property
     def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
@@ -267,5 +284,8 @@ class Law(Sampled, Learner):
         """
         if reason == OBEY:
             return super().serve(reason, first, reached, inputs, outputs)
+        if reason == _ASKS:
+            self.asked()
+            return []
         ended, allowed = np.sqrt(self._guard.sums[[_ENDED, _ALLOWED]]).tolist()
         raise self._diverged(first + reached, ended, allowed)

@@ -74,6 +74,7 @@ class LearningController(Learner):
             delay=parameters.feedback_delay,
             join_below=parameters.join_below or np.inf,
             step=parameters.step,
+            weights=parameters.weights(name),
         )
         self._joined = self._controller.joined
         # The step stops at the end of a cycle only if that affects later samples; otherwise it is reported later.

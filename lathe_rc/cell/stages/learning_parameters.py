@@ -90,6 +90,9 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
     join_below: NonNegative = parameter(
         0.0, "the channel learns from the first cycle on whose largest error is within this; 0: at once", "m"
     )
+    cycle_weights: list[NonNegative] = parameter(
+        [1.0], "weights of the newest cycles in what the drive is sent, the newest first; only their ratios matter"
+    )
     finer: list[str] = parameter(
         [], "drives after this channel: their motion is added to the tool's error, so that it learns its own error"
     )
@@ -181,6 +184,16 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
                 continue
             return f"; as with {' and '.join(f'{name} = {value:g}' for name, value in rounded.items())}"
         return "; as with more points_per_revolution"
+
+    def weights(self, node: str) -> list[float]:
+        """Return the weights of the newest cycles.
+
+        Raises:
+            InputError: none of them is above 0.
+        """
+        if not self.cycle_weights or not self.cycle_weights[0] > 0.0:
+            raise InputError(f"{node}.cycle_weights = {self.cycle_weights}; allowed: one or more, the first above 0")
+        return self.cycle_weights
 
     def make_correction(self, node: str) -> Correction:
         """Return the correction of a node with its given model.
