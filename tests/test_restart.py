@@ -238,6 +238,7 @@ def test_a_parameter_that_was_set_for_the_next_cycle_is_set_by_the_process_that_
             "get_name": lambda: OWN,
             "get_logger": lambda: SimpleNamespace(info=print),
             "reporter": lambda *_, **__: 0,
+            "announced": lambda _: (cell.nodes,),
         }
         protocol = SimpleNamespace(master=master, resumed=print, members={})
         node = SimpleNamespace(table=cell.nodes[OWN], full_name=f"/{OWN}", protocol=protocol, **quiet)
