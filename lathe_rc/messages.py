@@ -154,7 +154,12 @@ def values_of(msgtype: str, data: bytes) -> dict[str, Any]:
     Raises:
         ValueError: the bytes are not a message of this type.
     """
-    return {name: value for name, value in vars(decode(msgtype, data)).items() if name not in NOT_SIGNALS}
+    return signals_of(decode(msgtype, data))
+
+
+def signals_of(message: Any) -> dict[str, Any]:
+    """Return the fields of a message, without its constants, header, source and run ID."""
+    return {name: getattr(message, name) for name, _ in fields(message.__msgtype__) if name not in NOT_SIGNALS}
 
 
 def decode(msgtype: str, data: bytes) -> Any:

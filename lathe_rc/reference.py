@@ -120,7 +120,10 @@ def _ports(stage: Stage) -> Iterator[str]:
         yield f"From outside the cell it reads `{topic}` (`{msgtype}`)."
     outputs = [[f"`{port.topic}`", f"`{port.type}`", "every block"] for port in stage.outputs]
     outputs += [[f"`{topic}`", f"`{kind}`", _WHEN[kind]] for topic, kind in stage.sparse_topics.items()]
-    yield _table(["output", "type", "when"], outputs)
+    if outputs:
+        yield _table(["output", "type", "when"], outputs)
+    if not stage.inputs and not outputs:
+        yield "Its parameters name its topics."
     if stage.actions:
         known = ", ".join(f"`{action}`" for action in stage.actions)
         tuned = ", ".join(f"`{name}`" for name in stage.tunable)

@@ -34,7 +34,7 @@ from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.cell import scenario, state_file
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario
-from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters
+from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.fit import fit as fit_command
@@ -134,7 +134,8 @@ def _states() -> list[bytes]:
 
 
 def _trajectory(path: Path) -> None:
-    Trajectory("fuzz", TrajectoryParameters(trajectory="csv", trajectory_file=str(path))).block(0, np.empty(64))
+    read = Trajectory("fuzz", TrajectoryParameters(trajectory="csv", trajectory_file=str(path)))
+    follow(read.course, 0, np.empty(64))
 
 
 def _profile(path: Path) -> None:

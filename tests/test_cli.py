@@ -27,7 +27,17 @@ CELL = """
 /electrodynamic_actuator: {ros__parameters: {}}
 /tool: {ros__parameters: {}}
 """
-KEYS = ["scenario", "mode", "simulated_s", "wall_s", "real_time_factor", "revolutions", "blocks", "dropped"]
+KEYS = [
+    "scenario",
+    "mode",
+    "first_sample",
+    "simulated_s",
+    "wall_s",
+    "real_time_factor",
+    "revolutions",
+    "blocks",
+    "dropped",
+]
 KEYS += ["lateness_s", "refused", "events", "not_reached", "unchecked", "warnings", "stability_margin", "drive_margin"]
 KEYS += ["error_um", "tolerance_um", "growth_um", "along_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]

@@ -16,7 +16,7 @@ from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
-from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals, full
+from lathe_rc.messages import START_NS, Samples, Signals, full, signals_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ class SparseTopic:
 
     def add(self, stamp: int, message: Any) -> None:
         """Append a message with its time stamp."""
-        self.append(stamp, {name: value for name, value in vars(message).items() if name not in NOT_SIGNALS})
+        self.append(stamp, signals_of(message))
 
     def append(self, stamp: int, values: Mapping[str, Any]) -> None:
         """Append the values of a message with its time stamp."""

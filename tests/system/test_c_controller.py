@@ -4,6 +4,7 @@
 import re
 import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ import test_foreign
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.c_library.sources import export_nodes
+
+pytestmark = pytest.mark.system
 
 FOLDER = Path(__file__).parents[2] / "examples" / "c_controller"
 LAW = {"identify": False, "feedback_delay": 3200}
@@ -32,7 +35,7 @@ def test_a_c_program_gives_the_command_of_the_cell(domain, tmp_path, monkeypatch
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    member = (FOLDER / "udp_member.py", "--ros-args", "-p", f"port:={port}")
+    member = (sys.executable, FOLDER / "udp_member.py", "--ros-args", "-p", f"port:={port}")
     monkeypatch.setitem(test_foreign.PROGRAMS, "learning_controller", member)
     with subprocess.Popen([program, str(port)], stdout=subprocess.PIPE, text=True) as controller:
         with test_foreign.cell(domain, tmp_path / "bag", ["learning_controller"], ["tool", "recorder"], **nodes) as (

@@ -156,14 +156,14 @@ class NormOptimalController(FormLaw):
     def _learn(self, memory: Memory) -> None:
         parameters, speed = self.parameters, float(memory.place[_SPEED])
         orders = parameters.highest_order
-        model = self._model(speed * np.arange(orders + 1))
+        model = self._model(speed * np.arange(orders + 1, dtype=float))
         weight = np.abs(model) ** 2 + parameters.change_weight
         error = memory.sums[0] - 1j * memory.sums[1]
         change = model.conj() * error / weight
         wanted = np.concatenate((memory.given[0] + change.real, memory.given[1, 1:] - change.imag[1:]))
         form = np.concatenate((memory.sums[2], memory.sums[3, 1:]))
         weights = np.concatenate((weight[:1], 0.5 * weight[1:], 0.5 * weight[1:]))
-        angle = np.arange(_PER_WAVE * orders) * (_TURN / (_PER_WAVE * orders))
+        angle = np.arange(_PER_WAVE * orders, dtype=float) * (_TURN / (_PER_WAVE * orders))
         limits = (parameters.command_stroke, parameters.command_velocity, parameters.command_acceleration)
         rows = [waves(angle, orders, k) * (speed**k / limit) for k, limit in enumerate(limits) if limit]
         if rows:
