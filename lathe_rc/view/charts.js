@@ -33,7 +33,7 @@ async function draw(name) {
   else { spec.width = place.clientWidth; spec.datasets = DATA; }
   const own = spec.usermeta || {};
   if (own.square) {
-    spec.width = spec.height = Math.min(place.clientWidth, own.square) - 2 * MARGIN;
+    spec.width = spec.height = Math.min(place.clientWidth, own.square) - 2 * MARGIN - (own.axes || 0);
     spec.autosize = "pad"; // otherwise the margins would reduce the width, but not the height
   }
   for (const [channel, ends] of Object.entries(ENLARGED[name] || {})) {

@@ -10,6 +10,7 @@ from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
 
 _SQUARE = 460  # [px] size of the locus
+_AXES = 50  # [px] width of its labels beside it
 _LABELLED = (1, 2, 5, 10, 20, 50, 100)  # harmonics with a label in the locus
 _APART = 0.12  # least distance of two labels
 _TOP, _EDGE = 2.0, 1.25  # ends of the axes
@@ -46,7 +47,8 @@ def _locus(curve: LoopCurve) -> Spec:
     names = rows(u=factor.real[kept], v=factor.imag[kept], t=[f"{waves[k]:.0f}" for k in kept])
     where = {"scale": axis_scale(ends=(-size, size)), "axis": {"tickCount": 5}}
     place = {"x": quantity("u", "real part", **where), "y": quantity("v", "imaginary part", **where)}
-    own = {"order": {"field": "k"}, "color": colours({"factor": LAST}, legend=False)}
+    shade = colours({"factor": LAST, "worst": FIRST}, legend=False)
+    own = {"order": {"field": "k"}, "color": shade}
     shown = tip(n="waves per revolution", f="magnitude")
     return figure(
         _SQUARE,
@@ -66,9 +68,9 @@ def _locus(curve: LoopCurve) -> Spec:
                 "encoding": {"color": own["color"], "tooltip": shown},
             },
             *_texts(names, align="left", dx=6, dy=-6),
-            *_worst(curve, rows(u=factor[_at(curve)].real, v=np.array([factor[_at(curve)].imag]))),
+            *_worst(curve, rows(u=factor[_at(curve)].real, v=np.array([factor[_at(curve)].imag])), "worst", shade),
         ],
-        usermeta={"square": _SQUARE},
+        usermeta={"square": _SQUARE, "axes": _AXES},
     )
 
 
@@ -76,12 +78,11 @@ def _at(curve: LoopCurve) -> int:
     return int(np.argmin(np.abs(curve.waves - max(curve.margin.waves, LEAST))))
 
 
-def _worst(curve: LoopCurve, place: Rows) -> Rows:
-    """Return the mark of the least margin with its label."""
-    data = [{**row, "t": f"margin {curve.margin}", "l": "worst"} for row in place]
+def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec) -> Rows:
+    """Return the mark of the least margin with its label, in the colour of another label."""
+    data = [{**row, "t": f"margin {curve.margin}", "l": label} for row in place]
     mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
-    colour = colours({"worst": FIRST}, legend=False)
-    return [{"data": {"values": data}, "mark": mark, "encoding": {"color": colour}}, *_texts(data, dy=16)]
+    return [{"data": {"values": data}, "mark": mark, "encoding": {"color": shade}}, *_texts(data, dy=16)]
 
 
 def _over_waves(curve: LoopCurve) -> Spec:
@@ -123,6 +124,6 @@ def _over_waves(curve: LoopCurve) -> Spec:
                     "color": {"value": "#888"},
                 },
             },
-            *_worst(curve, worst),
+            *_worst(curve, worst, _ERROR, shade),
         ],
     )

@@ -77,8 +77,8 @@ def test_the_report_is_quiet(page, tmp_path):
     assert visit.console == []
     assert visit.requests == []
     assert "Error map" in visit.document
-    assert visit.document.count('class="drawn"') == 7  # the figures are drawn by the script that the page allows
-    assert visit.document.count('class="chart vega-embed') == 8  # the polar figure has two
+    assert visit.document.count('class="drawn"') == 9  # the figures are drawn by the script that the page allows
+    assert visit.document.count('class="chart vega-embed') == 12  # the polar figure has two, and so have the loops
 
 
 # Runs in the page once its figures stand: marks a field of one, then clicks twice.
@@ -162,7 +162,7 @@ def test_a_telephone_shows_the_page_without_scrolling_sideways(page, tmp_path, s
     told = json.loads(html.unescape(re.search(r"<title>(.*)</title>", visit.document)[1]))
     assert told["width"] == told["frame"] >= 400  # less a scroll bar
     assert (told["paper"], told["ink"], told["labels"]) == (paper, ink, [labels])
-    assert len(told["charts"]) == 8
+    assert len(told["charts"]) == 12
     assert all(250 < width <= 420 for width in told["charts"])
 
 
@@ -192,13 +192,13 @@ def test_figures_are_painted_with_and_without_scripts_and_on_paper(page, tmp_pat
 def test_every_figure_of_the_report_renders(page, tmp_path):
     """The images in a page of our own, with a script that the report forbids itself."""
     images = re.findall(r'<img src="data:[^"]+"', page.read_text(encoding="utf-8"))
-    assert len(images) == 8  # map, two polar ones, spectrum, convergence, speed, force, wear
+    assert len(images) == 12  # map, two polar ones, spectrum, convergence, two of each loop, speed, force, wear
     script = "onload=\"document.title=[...document.images].map(i=>i.naturalWidth+'x'+i.naturalHeight).join()\""
     gallery = tmp_path / "gallery.html"
     gallery.write_text(f"<body {script}>{'>'.join(images)}></body>", encoding="utf-8")
     title = re.search(r"<title>(.*)</title>", Visit(gallery, tmp_path).document)
     sizes = [tuple(map(int, size.split("x"))) for size in title[1].split(",")]
-    assert len(sizes) == 8
+    assert len(sizes) == 12
     assert all(width > 400 and height > 150 for width, height in sizes)
 
 
