@@ -12,6 +12,8 @@ from lathe_rc.c_library.sources import export_nodes
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 
+pytestmark = pytest.mark.system
+
 SAMPLES = 200_000  # beyond the event of each scenario that has one
 
 
