@@ -54,6 +54,7 @@ _PROMPT = 100_000_000
 _SETBACK = 1_000_000_000  # [ns] by which the system clock may be set back without harm
 _LONG = 10.0  # [s] of wall time until the next message, from which on the wait is reported
 _SETTLED = 0.5  # [s] of wall time without a new reader or node, after which the replay begins
+_ALONE = 4.0  # [s] the same while no other node is found: participants announce themselves again every 3 s
 _LOOK = 0.05  # [s] of wall time between polls of services and signals
 
 
@@ -273,7 +274,7 @@ class Replayer:
     def _find_readers(self) -> None:
         """Wait until no further reader is found: readers that are there already receive the first message."""
         before, since = [-1], time.monotonic()
-        while time.monotonic() - since < _SETTLED:
+        while time.monotonic() - since < (_SETTLED if before[-1] > 1 else _ALONE):
             found = [*map(self._readers, sorted(self._topics)), len(self._node.get_node_names())]
             if found != before:
                 before, since = found, time.monotonic()
