@@ -168,7 +168,7 @@ class Recipe:
         advice = "correct msg_defs/, or remove .lathe/, then call again"
         # Beside a sourced ROS 2 that has the whole package there must be no second one of its name.
         there = self._ros and any(Path(prefix, "share", SIMULATION.name).exists() for prefix in self._ros.prefixes)
-        with Step("messages", "40 s", advice, lock) as step:
+        with Step("messages", "90 s", advice, lock) as step:
             step.run(
                 *colcon("--paths", ROOT / "msg_defs", *([] if there else [ROOT / SIMULATION])),
                 *("--cmake-args", *cmake_options(PYTHON), *(() if self._ros else (PYTHON_ALONE,))),
