@@ -27,10 +27,10 @@ def compare(runs: Sequence[Path], output: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="lathe-compare-") as folder:
         bags = dict(zip(comparing.names_of(runs), runs, strict=True))
         comparing.check(bags, output)
-        for name, path in bags.items():
+        for number, (name, path) in enumerate(bags.items()):
             if not measured.is_bag(path):
                 allowed_code.allow_own_code()
-                bags[name] = Path(folder) / str(len(list(Path(folder).iterdir())))
+                bags[name] = Path(folder) / str(number)
                 harness.run(scenarios.load(str(path), []), bag=bags[name])
         comparing.write_comparison(bags, output, [str(path) for path in runs])
     click.echo(f"comparison: {output}")

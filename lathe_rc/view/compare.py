@@ -28,11 +28,11 @@ def _forms(runs: Mapping[str, Gathered]) -> dict[str, Form]:
     return {name: data.forms[0] for name, data in runs.items() if data.forms and data.forms[0].last}
 
 
-def _results(runs: Mapping[str, Gathered]) -> Grid | None:
+def _results(runs: Mapping[str, Gathered], forms: Mapping[str, Form]) -> Grid | None:
     rows = []
     for name, data in runs.items():
         found = assess(data, losses(data), None)
-        form = _forms({name: data}).get(name)
+        form = forms.get(name)
         revolutions = (form.first, form.best, form.last) if form else ()
         numbers = [float(each.numbers["rms"]) if each else np.nan for each in revolutions] or [np.nan] * 3
         largest = float(form.last.numbers["max"]) if form and form.last else np.nan
@@ -104,7 +104,7 @@ def render(runs: Mapping[str, Gathered], command: str) -> str:
             command=printable(command),
             version=__version__,
             charts=charts,
-            results=_results(runs),
+            results=_results(runs, forms),
             parameters=_parameters(runs),
             unknown=[name for name, data in runs.items() if not data.nodes],
             first=next(iter(runs)),

@@ -6,7 +6,7 @@ figure finds its own fields by their positions.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,11 @@ class Compared:
     shown: int
     sizes: Mapping[str, tuple[Samples, Samples]]
     tolerance: float
+
+    @property
+    def rows(self) -> int:
+        """Return the number of rows of each map."""
+        return len(next(iter(self.maps.values())))
 
     @property
     def data(self) -> dict[str, Rows]:
@@ -96,35 +101,38 @@ def _steered(runs: Compared, spec: Spec, **usermeta: object) -> Spec:
     return {**spec, "params": params, "usermeta": {"signals": ["revolution", "tolerance"], **usermeta}}
 
 
-def _placed(width: int, rows_: int, step: int, maps: str) -> Rows:
+def _placed(runs: Compared, width: int, maps: str) -> Rows:
     """Return transforms that find map, row, column and first revolution of each number of a data set."""
     return [
         {"window": [{"op": "row_number", "as": "k"}]},
-        {"calculate": f"floor((datum.k - 1) / {width * rows_})", "as": "m"},
+        {"calculate": f"floor((datum.k - 1) / {width * runs.rows})", "as": "m"},
         {"filter": maps},
         {"calculate": f"(datum.k - 1) % {width}", "as": "n"},
-        {"calculate": f"floor((datum.k - 1) / {width}) % {rows_} * {step} + 1", "as": "r"},
+        {"calculate": f"floor((datum.k - 1) / {width}) % {runs.rows} * {runs.step} + 1", "as": "r"},
     ]
 
 
-def _here(step: int) -> Spec:
-    return {"filter": f"datum.r <= revolution && revolution < datum.r + {step} && isValid(datum.data)"}
+def _chosen(runs: Compared, width: int) -> Rows:
+    """Return transforms that find the numbers of each run at the chosen revolution."""
+    here = f"datum.r <= revolution && revolution < datum.r + {runs.step} && isValid(datum.data)"
+    return [
+        *_placed(runs, width, f"datum.m < {len(runs.maps)}"),
+        {"filter": here},
+        {"calculate": f"{json.dumps(list(runs.maps))}[datum.m]", "as": "l"},
+    ]
 
 
-def _named(names: Sequence[str]) -> Spec:
-    return {"calculate": f"{json.dumps(list(names))}[datum.m]", "as": "l"}
-
-
-def _by_run(names: Sequence[str]) -> Spec:
-    scale = {"domain": list(names)}
-    return {"field": "l", "type": "nominal", "scale": scale, "legend": LEGEND if len(names) > 1 else None}
-
-
-def _dashes(names: Sequence[str]) -> Spec:
-    """Return dashes by run, which tell the lines apart without their colours."""
+def _by_run(names: Iterable[str], **tips: str) -> Spec:
+    """Return an encoding of lines by run: colour, dashes for readers who do not see it, and tooltip."""
+    domain = list(names)
     patterns = [[1, 0], [6, 3], [2, 2], [8, 2, 2, 2]]
-    scale = {"domain": list(names), "range": [patterns[k % len(patterns)] for k in range(len(names))]}
-    return {"field": "l", "type": "nominal", "scale": scale, "legend": LEGEND if len(names) > 1 else None}
+    dashes = [patterns[k % len(patterns)] for k in range(len(domain))]
+    named = {"field": "l", "type": "nominal", "legend": LEGEND if len(domain) > 1 else None}
+    return {
+        "color": {**named, "scale": {"domain": domain}},
+        "strokeDash": {**named, "scale": {"domain": domain, "range": dashes}},
+        "tooltip": [*tip(**tips), {"field": "l", "title": "run"}],
+    }
 
 
 def _rule(channel: str, signal: str, dash: Sequence[int] = ()) -> Spec:
@@ -182,7 +190,6 @@ def verdicts(runs: Compared) -> Spec:
 
 def convergence(runs: Compared) -> Spec:
     """Return the largest form error by revolution of all runs, with the chosen tolerance and revolution."""
-    names = list(runs.sizes)
     line = {"type": "line", "clip": True, "strokeWidth": 1.6}
     drawn = {
         "data": {"name": SIZES},
@@ -191,9 +198,7 @@ def convergence(runs: Compared) -> Spec:
         "encoding": {
             "x": quantity("r", "revolution", scale=axis_scale(), axis={"grid": False}),
             "y": quantity("v", "largest form error [µm]", scale=axis_scale(log=True)),
-            "color": _by_run(names),
-            "strokeDash": _dashes(names),
-            "tooltip": [*tip(r="revolution", v="largest [µm]"), {"field": "l", "title": "run"}],
+            **_by_run(runs.sizes, r="revolution", v="largest [µm]"),
         },
     }
     layer = [drawn, _rule("y", "tolerance", (6, 4)), _rule("x", "revolution")]
@@ -216,12 +221,11 @@ def maps(runs: Compared) -> list[Spec]:
 
 
 def _map(runs: Compared, place: int, name: str, largest: float, linear: float) -> Spec:
-    rows_ = len(next(iter(runs.maps.values())))
     end = runs.revolutions + 0.5
     fields = {
         "data": {"name": MAPS},
         "transform": [
-            *_placed(_ACROSS, rows_, runs.step, f"datum.m == {place} && isValid(datum.data)"),
+            *_placed(runs, _ACROSS, f"datum.m == {place} && isValid(datum.data)"),
             {"calculate": f"datum.n * {360 / _ACROSS}", "as": "u"},
             {"calculate": f"datum.u + {360 / _ACROSS}", "as": "u2"},
             {"calculate": "datum.r - 0.5", "as": "v"},
@@ -249,26 +253,17 @@ def _map(runs: Compared, place: int, name: str, largest: float, linear: float) -
 
 def profile(runs: Compared) -> Spec:
     """Return the radius deviation of all runs over the angle, at the chosen revolution."""
-    names = list(runs.maps)
-    rows_ = len(runs.maps[names[0]])
     spec = chart(
         220,
         data={"name": MAPS},
-        transform=[
-            *_placed(_ACROSS, rows_, runs.step, f"datum.m < {len(names)}"),
-            _here(runs.step),
-            _named(names),
-            {"calculate": f"datum.n * {360 / _ACROSS}", "as": "u"},
-        ],
+        transform=[*_chosen(runs, _ACROSS), {"calculate": f"datum.n * {360 / _ACROSS}", "as": "u"}],
         layer=[
             {
                 "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
                 "encoding": {
                     "x": quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis={"grid": False}),
                     "y": quantity("data", "radius deviation [µm]", axis={"format": ".3~g"}),
-                    "color": _by_run(names),
-                    "strokeDash": _dashes(names),
-                    "tooltip": [*tip(u="angle [°]", data="deviation [µm]"), {"field": "l", "title": "run"}],
+                    **_by_run(runs.maps, u="angle [°]", data="deviation [µm]"),
                 },
             },
             _rule("y", "tolerance", (6, 4)),
@@ -280,8 +275,6 @@ def profile(runs: Compared) -> Spec:
 
 def polar(runs: Compared) -> Spec:
     """Return the radius deviation of all runs around the part, at the chosen revolution and on one scale."""
-    names = list(runs.maps)
-    rows_ = len(runs.maps[names[0]])
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = rows(x=1.2 * np.cos(turn), y=1.2 * np.sin(turn), n=np.arange(turn.size))
     angle = f"datum.n * {2.0 * np.pi / _ACROSS}"
@@ -294,20 +287,14 @@ def polar(runs: Compared) -> Spec:
             {
                 "data": {"name": MAPS},
                 "transform": [
-                    *_placed(_ACROSS, rows_, runs.step, f"datum.m < {len(names)}"),
-                    _here(runs.step),
-                    _named(names),
+                    *_chosen(runs, _ACROSS),
                     {"calculate": "abs(datum.data)", "as": "size"},
                     {"joinaggregate": [{"op": "max", "field": "size", "as": "most"}]},
                     {"calculate": f"(1.2 + datum.data / max(datum.most, 1e-9)) * cos({angle})", "as": "x"},
                     {"calculate": f"(1.2 + datum.data / max(datum.most, 1e-9)) * sin({angle})", "as": "y"},
                 ],
                 "mark": {"type": "line", "interpolate": "linear-closed", "strokeWidth": 1.6},
-                "encoding": {
-                    "color": _by_run(names),
-                    "strokeDash": _dashes(names),
-                    "tooltip": [*tip(data="deviation [µm]", most="outer circle [µm]"), {"field": "l", "title": "run"}],
-                },
+                "encoding": _by_run(runs.maps, data="deviation [µm]", most="outer circle [µm]"),
             },
         ],
     )
@@ -316,15 +303,11 @@ def polar(runs: Compared) -> Spec:
 
 def spectrum(runs: Compared) -> Spec:
     """Return the amplitudes of the undulations of all runs, at the chosen revolution."""
-    names = list(runs.maps)
-    rows_ = len(runs.maps[names[0]])
     spec = chart(
         220,
         data={"name": SPECTRA},
         transform=[
-            *_placed(_ORDERS, rows_, runs.step, "true"),
-            _here(runs.step),
-            _named(names),
+            *_chosen(runs, _ORDERS),
             {"calculate": "datum.n + 1", "as": "o"},
             {"filter": "datum.data > 0"},
         ],
@@ -334,9 +317,7 @@ def spectrum(runs: Compared) -> Spec:
                 "o", "undulations per revolution", scale=axis_scale(ends=(0.5, _ORDERS + 0.5)), axis={"grid": False}
             ),
             "y": quantity("data", "amplitude [µm]", scale=axis_scale(log=True), axis={"format": ".2~g"}),
-            "color": _by_run(names),
-            "strokeDash": _dashes(names),
-            "tooltip": [*tip(o="undulations per revolution", data="amplitude [µm]"), {"field": "l", "title": "run"}],
+            **_by_run(runs.maps, o="undulations per revolution", data="amplitude [µm]"),
         },
     )
     return _steered(runs, spec)

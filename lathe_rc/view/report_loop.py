@@ -48,7 +48,6 @@ def _locus(curve: LoopCurve) -> Spec:
     where = {"scale": axis_scale(ends=(-size, size)), "axis": {"tickCount": 5}}
     place = {"x": quantity("u", "real part", **where), "y": quantity("v", "imaginary part", **where)}
     shade = colours({"factor": LAST, "worst": FIRST}, legend=False)
-    own = {"order": {"field": "k"}, "color": shade}
     shown = tip(n="waves per revolution", f="magnitude")
     return figure(
         _SQUARE,
@@ -61,11 +60,15 @@ def _locus(curve: LoopCurve) -> Spec:
                 "mark": {"type": "line", "clip": True, "color": "#888", "strokeDash": [6, 4]},
                 "encoding": {"order": {"field": "k"}},
             },
-            {"data": {"values": line}, "mark": {"type": "line", "clip": True}, "encoding": own},
+            {
+                "data": {"values": line},
+                "mark": {"type": "line", "clip": True},
+                "encoding": {"order": {"field": "k"}, "color": shade},
+            },
             {
                 "data": {"values": dots},
                 "mark": {"type": "point", "filled": True, "size": 22, "clip": True},
-                "encoding": {"color": own["color"], "tooltip": shown},
+                "encoding": {"color": shade, "tooltip": shown},
             },
             *_texts(names, align="left", dx=6, dy=-6),
             *_worst(curve, rows(u=factor[_at(curve)].real, v=np.array([factor[_at(curve)].imag])), "worst", shade),
