@@ -99,7 +99,7 @@ setup(
     install_requires=requirements("runtime"),
     extras_require={
         # `colcon test` runs pytest if the extra `test` asks for it, and else no test at all
-        **{name: requirements(name) for name in ("fmu", "formats", "notebook", "sweep", "test", "view")},
+        **{name: requirements(name) for name in ("fmu", "formats", "notebook", "panel", "sweep", "test", "view")},
         # pip builds the messages from their sdist, see msg_defs/pyproject.toml
         "ros": [*requirements("ros"), f"lathe_rc_msgs=={VERSION}"],
     },

@@ -13,6 +13,7 @@ from lathe_rc.errors import LatheError
 _MODULES = {
     "fmu": ("fmpy",),
     "formats": ("asammdf", "nptdms", "x3pio"),
+    "panel": ("starlette", "trimesh", "uvicorn"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),
@@ -27,6 +28,7 @@ _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in mo
 _CHECKOUT = {
     "fmu": "./lathe setup fmu in a checkout",
     "formats": "./lathe setup formats in a checkout",
+    "panel": "./lathe setup panel in a checkout",
     "ros": "run it by ./lathe of a checkout, source a ROS 2 installation",
     "sweep": "./lathe setup sweep in a checkout",
     "view": "./lathe setup view in a checkout",

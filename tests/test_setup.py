@@ -303,7 +303,7 @@ def test_the_viewer_stays_away_from_a_sourced_ros():
 @pytest.mark.parametrize(
     ("arguments", "groups"),
     [
-        (["test", "-k", "view"], ["docs", "fmu", "formats", "sweep", "test", "view"]),
+        (["test", "-k", "view"], ["docs", "fmu", "formats", "panel", "sweep", "test", "view"]),
         (["docs", "--build"], ["docs"]),
         (["sweep", "piston"], ["sweep"]),
         (["tune", "piston"], ["sweep"]),
@@ -318,7 +318,7 @@ def test_a_command_says_what_it_needs(arguments, groups):
 
 
 def test_setup_of_an_unknown_group_is_refused(copy):
-    allowed = "docs, fmu, formats, notebook, sweep, test, view, or nothing more"
+    allowed = "docs, fmu, formats, notebook, panel, sweep, test, view, or nothing more"
     assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
 
 

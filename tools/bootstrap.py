@@ -98,8 +98,8 @@ def needed(arguments: Sequence[str]) -> Sequence[str]:
                 raise RefusalError(f"setup {name}; allowed: {', '.join(GROUPS)}, or nothing more")
         return arguments[1:]
     sweeps = {name: ["sweep"] for name in ("bench", "sweep", "tune")}
-    test = ["docs", "fmu", "formats", "sweep", "test", "view"]
-    wanted = {**sweeps, "docs": ["docs"], "test": test, "view": ["view"]}
+    test = ["docs", "fmu", "formats", "panel", "sweep", "test", "view"]
+    wanted = {**sweeps, "docs": ["docs"], "panel": ["panel"], "test": test, "view": ["view"]}
     return wanted.get(next(iter(arguments), ""), [])
 
 

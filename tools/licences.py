@@ -14,8 +14,8 @@ from workplace import NODE, VENV
 HEAD = """\
 # Licences
 
-This page lists the packages that `./lathe setup docs fmu formats notebook sweep test view` installs, by their stated
-licence: Python packages in the versions of `requirements/python.lock` and `requirements/ros.lock`, then the npm
+This page lists the packages that `./lathe setup docs fmu formats notebook panel sweep test view` installs, by their
+stated licence: Python packages in the versions of `requirements/python.lock` and `requirements/ros.lock`, then the npm
 packages of the documentation site. The only copied source is [third_party/](../third_party/simulation_interfaces):
 message definitions of simulation_interfaces 2.1.0, Apache-2.0. "Not stated": the package contains only the text
 of its licence. `./lathe python tools/licences.py > docs/licences.md` writes this page.

@@ -52,6 +52,7 @@ GROUPS = {
     "fmu": Group("fmu.in", "5 s, 20 MB", sourced=False),
     "formats": Group("formats.in", "5 s, 60 MB", sourced=True),
     "notebook": Group("notebook.in", "10 s, 300 MB", sourced=True),
+    "panel": Group("panel.in", "5 s, 10 MB", sourced=True),
     "sweep": Group("sweep.in", "5 s, 70 MB", sourced=True),
     "test": Group("test.in", "5 s, 300 MB", sourced=True),
     "view": Group("view.in", "10 s, 400 MB", sourced=False),
