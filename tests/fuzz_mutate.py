@@ -4,9 +4,7 @@
 All take a ``random.Random`` (or what Hypothesis offers in its place) and are functions of it alone.
 """
 
-import io
 import struct
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from random import Random
@@ -164,25 +162,6 @@ def some_records(data: bytes, random: Random) -> bytes:
         return MCAP0_MAGIC + b"".join(record.whole() for record in fixed) + MCAP0_MAGIC
     except (ValueError, struct.error):
         return some_bytes(data, random)
-
-
-def some_members(data: bytes, random: Random) -> bytes:
-    """One change to the members of a zip archive, with the right sizes and checksums."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-    except Exception:  # noqa: BLE001 - damage of an earlier change: zipfile raises whatever that leads to
-        return some_bytes(data, random)
-    out = io.BytesIO()
-    chosen, kind = random.choice([*members, ""]), random.randrange(4)
-    if kind == 0:
-        members.pop(chosen, None)
-    elif chosen:
-        members[chosen] = (some_lines if kind == 1 else some_bytes)(members[chosen], random)
-    with zipfile.ZipFile(out, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    return out.getvalue()
 
 
 def damaged(data: bytes, random: Random, ways: Sequence[object], most: int = 6) -> bytes:

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import json
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html.parser import HTMLParser
@@ -24,16 +25,18 @@ from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import CompressionMode
 
 from lathe_papers.formulas import step_fit
-from lathe_rc import files, harness, messages
+from lathe_rc import data_file, files, harness, messages
 from lathe_rc.analysis import hysteresis_fit, reduced_order
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.resimulation import resim
 from lathe_rc.bag.writing.writer import BagWriter
-from lathe_rc.cell import scenario, state_file
+from lathe_rc.cell import scenario
+from lathe_rc.cell.changes import Restoring, changes
+from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.scenario import TABLES, Scenario
+from lathe_rc.cell.scenario import TABLES, Scenario, new_stage
 from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
@@ -49,6 +52,7 @@ from lathe_rc.view.report_host import DIAGNOSTICS
 CUT = b"\n-- cut --\n"  #: between the files of an input that stands for several
 CONFIG = Path(__file__).parents[1] / "config"
 _POINTS, _GRID = 64, 32
+_OWN = "learning_controller"
 _LONGEST_LINE = 20_000  # characters of a refusal
 
 
@@ -111,23 +115,33 @@ def _scenarios() -> list[bytes]:
 # ---- the state of a controller --------------------------------------------------------------------------
 
 
+def _plain(kind: str, data: bytes) -> bytes:
+    """A file of plain data whose content is damaged, not its compression or its checksum."""
+    return files.sealed(f"lathe_rc {kind} 1\n".encode() + zlib.compress(data, 0))
+
+
+def _content(kind: str, file: bytes) -> bytes:
+    return zlib.decompress(bytes(files.unsealed(file))[len(f"lathe_rc {kind} 1\n") :])
+
+
 def _state(data: bytes) -> None:
     with _folder() as folder, refusals():
-        path = folder / "state"
-        path.write_bytes(files.sealed(data))
-        path.chmod(0o600)
-        cell = _kept()
-        state_file.load(path, cell.stages["learning_controller"].shared, {"stage": cell.stages["learning_controller"]})
+        (folder / "state").write_bytes(_plain("state", data))
+        stage = new_stage(_OWN, _kept().nodes[_OWN])
+        data_file.read(folder / "state", "state", lambda told: Restoring().restore(told, stage))
 
 
 @functools.cache
-def _kept() -> Cell:
-    return Cell(scenario.load(CONFIG / "piston.yaml").nodes)
+def _kept() -> Scenario:
+    return scenario.load(CONFIG / "piston.yaml", ["spindle_encoder.revolutions=2"])
 
 
 @functools.cache
 def _states() -> list[bytes]:
-    return [state_file.dump({"stage": _kept().stages["learning_controller"]})]
+    cell = Cell(_kept().nodes)
+    Engine(cell).run([])
+    told = changes(cell.stages[_OWN], new_stage(_OWN, _kept().nodes[_OWN]))
+    return [_content("state", data_file.packed("state", told))]
 
 
 # ---- tables ---------------------------------------------------------------------------------------------
@@ -198,8 +212,8 @@ def _fits(data: bytes) -> None:
 
 def _memory(data: bytes) -> None:
     with _folder() as folder, refusals():
-        (folder / "fuzz.npz").write_bytes(data)
-        points = memory_file.load(folder / "fuzz.npz", _POINTS, _GRID)
+        (folder / "fuzz").write_bytes(_plain("memory", data))
+        points = memory_file.load(folder / "fuzz", _POINTS, _GRID)
         assert points.shape == (_POINTS,)
         assert np.isfinite(points).all()
 
@@ -207,8 +221,8 @@ def _memory(data: bytes) -> None:
 @functools.cache
 def _memories() -> list[bytes]:
     with _folder() as folder:
-        memory_file.save(folder / "memory.npz", np.linspace(-1e-5, 1e-5, _POINTS), _GRID)
-        return [(folder / "memory.npz").read_bytes()]
+        memory_file.save(folder / "memory", np.linspace(-1e-5, 1e-5, _POINTS), _GRID)
+        return [_content("memory", (folder / "memory").read_bytes())]
 
 
 # ---- bags -----------------------------------------------------------------------------------------------
@@ -358,7 +372,7 @@ def _abouts(data: bytes) -> None:
 def _about_seeds() -> list[bytes]:
     form = {"run_id": "r", "profile": "csv", "profile_file": str(CONFIG / "profiles" / "piston.csv")}
     tool = TABLES["tool"].read("tool", form)
-    memory = {"run_id": "r", "memory_file": str(CONFIG / "memory.npz")}
+    memory = {"run_id": "r", "memory_file": str(CONFIG / "memory")}
     told = Scenario("fuzz", {"tool": tool, "learning_controller": TABLES["learning_controller"].read("", memory)})
     about = provenance.tell(told, [])
     files = [part for key, text in about.items() if key.startswith(provenance.FILE) for part in (key, text)]
@@ -443,7 +457,7 @@ TARGETS: Mapping[str, Target] = {
     "parameters": Target(_parameters, _scenarios, (mutate.some_lines,)),
     "tables": Target(_tables, _csv, (mutate.some_lines,)),
     "fits": Target(_fits, lambda: _csv()[2:5], (mutate.some_lines,), slow=True),
-    "memory": Target(_memory, _memories, (mutate.some_members, mutate.some_bytes)),
+    "memory": Target(_memory, _memories, (mutate.some_bytes,)),
     "state": Target(_state, _states, (mutate.some_bytes,)),
     "mcap": Target(_mcap, _mcaps, (mutate.some_records, mutate.some_records, mutate.some_bytes)),
     "folder": Target(_folders, _folder_seeds, (_storage, _text_of_folder, mutate.some_bytes)),

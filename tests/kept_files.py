@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from lathe_rc import jit
-from lathe_rc.cell import program, scenario, state_file
+from lathe_rc.cell import checkpoint, program, scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.errors import LatheError
@@ -105,21 +105,15 @@ def _journal(folder: Path) -> Kept:
 
 
 def _memory(folder: Path) -> Kept:
-    path = folder / "memory.npz"
+    path = folder / "memory"
     memory_file.save(path, np.random.default_rng(1).standard_normal(128), 128)
     return Kept(path, lambda: memory_file.load(path, 128, 128).tobytes())
 
 
-def _state(folder: Path) -> Kept:
-    path, cell = folder / "state", load()
-    stage = Cell(cell.nodes).stages[OWN]
-    state_file.save(path, state_file.dump({"stage": stage}), state_file.dump({"events": [("reset", 3)]}))
-
-    def read() -> object:
-        found = state_file.load(path, cell.nodes[OWN], {"stage": stage, "events": []})
-        return state_file.dump({"stage": found["stage"]}), found["events"]
-
-    return Kept(path, read)
+def _checkpoint(folder: Path) -> Kept:
+    path, cell = folder / "checkpoint", Cell(load().nodes)
+    checkpoint.save(path, checkpoint.take(load(), cell.stages, 1, {}))
+    return Kept(path, lambda: repr(checkpoint.load(path, [])))
 
 
 def _table(_folder: Path) -> Kept:
@@ -151,7 +145,7 @@ KINDS: dict[str, Callable[[Path], Kept]] = {
     "scenario of a sweep": _scenario,
     "journal of a tuning": _journal,
     "memory of a controller": _memory,
-    "state of a node": _state,
+    "checkpoint": _checkpoint,
     "table of a form": _table,
     "index of compiled code": _compiled(".nbi"),
     "compiled code": _compiled(".nbc"),

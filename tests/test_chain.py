@@ -90,7 +90,7 @@ def test_chains_give_the_digests_of_the_offline_run(split, chains):
 
 def test_a_chain_that_is_given_up_goes_on_with_the_same_bits(tmp_path):
     """A node fails in its midst: until then, and what does not depend on it after that, is as in a run without."""
-    path, lost, told = resources.find(Path("supervised.yaml")), tmp_path / "nowhere" / "memory.npz", []
+    path, lost, told = resources.find(Path("supervised.yaml")), tmp_path / "nowhere" / "memory", []
     broken = [f"learning_controller.memory_file={lost}", "learning_controller.events=['revolution 5: save']"]
     with pytest.raises(LatheError, match="cannot be saved"):
         harness.run(

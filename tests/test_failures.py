@@ -138,7 +138,7 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
 )
 def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tmp_path):
     """When a member fails, the others go on, those of its own process among them, and the tool is taken out."""
-    bag, events, lost = tmp_path / "bag", [], tmp_path / "nowhere" / "memory.npz"
+    bag, events, lost = tmp_path / "bag", [], tmp_path / "nowhere" / "memory"
     sets = [f"learning_controller.memory_file={lost}", "learning_controller.events=['revolution 10: save']"]
     scenario = load(CONFIG / "supervised.yaml", [*RUN, *sets])
     if groups:

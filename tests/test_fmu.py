@@ -13,7 +13,8 @@ import fmu_builder
 from test_extending import lathe
 
 from lathe_rc import harness, hosts
-from lathe_rc.cell import batch, scenario, state_file
+from lathe_rc.cell import batch, scenario
+from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import graph
@@ -116,7 +117,7 @@ def test_three_fmus_have_the_same_bits_in_every_host(fmus, tmp_path):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-def test_a_saved_fmu_goes_on_with_the_same_bits(fmus, tmp_path, fmi):
+def test_a_saved_fmu_goes_on_with_the_same_bits(fmus, fmi):
     path, command = fmus("drive", fmi), 1e-6 * np.sin(np.arange(4000) / 50)
 
     def go(box, first, last):
@@ -126,9 +127,8 @@ def test_a_saved_fmu_goes_on_with_the_same_bits(fmus, tmp_path, fmi):
 
     whole, half = go(stage(path, DRIVE), 0, 4000), stage(path, DRIVE)
     go(half, 0, 1777)
-    state_file.save(tmp_path / "state", state_file.dump(half.__getstate__()))
     other = stage(path, DRIVE)
-    other.__setstate__(state_file.load(tmp_path / "state", other.shared, other.__getstate__()))
+    Restoring().restore(changes(half, stage(path, DRIVE)), other)
     assert (go(other, 1777, 4000) == whole[1777:]).all()
     forgetful = stage(fmus("drive", fmi, saves="false"), DRIVE)
     go(forgetful, 0, 100)

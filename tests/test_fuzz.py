@@ -6,7 +6,6 @@ import os
 import re
 import sqlite3
 import struct
-import zipfile
 
 import fuzz_targets as fuzz
 import numpy as np
@@ -61,35 +60,13 @@ def test_damage_is_refused_in_a_line(name):
 # ---- memories
 
 
-@pytest.mark.parametrize(
-    ("header", "data"),
-    [
-        (b"{'descr': '<i8', 'fortran_order': False, 'shape': (", b""),
-        (b"{'descr': '<i8', 'fortran_order': False, 'shape': (1099511627776,)}", b""),
-        (b"{'descr': '<U4000', 'fortran_order': False, 'shape': ()}", b"\n\0\0\0" * 4000),
-    ],
-)
-def test_archive_that_is_no_memory_is_refused(tmp_path, header, data):
-    array = b"\x93NUMPY\x01\0" + struct.pack("<H", 118) + header.ljust(117) + b"\n" + data
-    with zipfile.ZipFile(tmp_path / "memory.npz", "w") as out:
-        for name in ("format", "grid", "points"):
-            out.writestr(f"{name}.npy", array if name == "format" else b"")
-    with pytest.raises(InputError, match="not a saved memory"):
-        memory_file.load(tmp_path / "memory.npz", 64, 32)
-
-
-@pytest.mark.parametrize("change", [lambda d: d[:6] + b"\1" + d[7:], lambda d: d[:8] + b"\x08" + d[9:]])
-def test_archive_with_a_flag_or_method_that_it_does_not_have_is_refused(change):
-    fuzz.TARGETS["memory"].read(change(TARGETS["memory"].seeds()[0]))
-
-
 def test_memory_that_is_a_pipe_or_far_too_long_is_refused_unread(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="not a file"):
         memory_file.load(tmp_path / "pipe", 64, 32)
     with (tmp_path / "long").open("wb") as file:
         file.truncate(2**40)
-    with pytest.raises(InputError, match="allowed: up to"):
+    with pytest.raises(InputError, match="larger than any memory"):
         memory_file.load(tmp_path / "long", 64, 32)
 
 

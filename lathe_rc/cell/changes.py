@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lathe_rc.cell.parameters import Table
+from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
 from lathe_rc.extensions import is_ours
 
@@ -32,7 +33,7 @@ _COLLECTIONS: dict[str, Callable[[Iterable[Any]], Any]] = {
     "list": list, "tuple": tuple, "set": set, "frozenset": frozenset, "deque": deque,
 }  # fmt: skip
 _CODE = (type, types.FunctionType, types.BuiltinFunctionType, types.ModuleType, np.ufunc)
-_HOST = frozenset({"unheard", "_tuned"})  # attributes that a host sets, and those for pickle
+_HOST = frozenset({"unheard"})  # attributes that a host sets
 
 
 class UnkeptError(LatheError):
@@ -56,7 +57,12 @@ def changes(now: Any, start: Any) -> Change | None:
 def _is_frozen(part: Any) -> bool:
     """Return whether an object never changes, although parts of it may."""
     params = getattr(type(part), "__dataclass_params__", None)
-    return bool(params and params.frozen) or (isinstance(part, np.ndarray) and not part.flags.writeable)
+    return bool(params and params.frozen) or (isinstance(part, np.ndarray) and not part.flags.writeable) or _is_q(part)
+
+
+def _is_q(part: Any) -> bool:
+    """Return whether an object is a Q filter: without state, and shared by stages with equal parameters."""
+    return isinstance(part, QFilter)
 
 
 def _attributes(part: Any) -> dict[str, Any]:
@@ -106,6 +112,8 @@ class _Comparison:
         return None
 
     def _constant(self, now: Any, start: Any, path: str) -> Change | None:
+        if isinstance(now, np.ndarray) and (now.shape, now.dtype) != (start.shape, start.dtype):
+            return ["resized", self._whole(now, path)[1]]
         return None if _is_same(now, start) else self._whole(now, path)
 
     def _table(self, now: Any, start: Any, path: str) -> Change | None:
@@ -244,7 +252,9 @@ class Restoring:
             return way(self, *content, fresh, start, path)
         if kind == "array" and isinstance(fresh, np.ndarray):
             return self._with_elements(content[0], fresh, start, path)
-        if isinstance(fresh, (*_PLAIN, np.generic)) and not (type(fresh) is type(start) and _is_same(fresh, start)):
+        if isinstance(fresh, (*_PLAIN, np.generic, np.ndarray)) and not (
+            type(fresh) is type(start) and _is_same(fresh, start)
+        ):
             raise ClashError(path)
         return _new(change)
 
@@ -280,6 +290,7 @@ class Restoring:
         return fresh
 
     def _with_attributes(self, told: Mapping[str, Change], fresh: Any, start: Any, path: str) -> Any:
+        fresh = copy.deepcopy(fresh) if _is_q(fresh) else fresh
         target = copy.copy(fresh) if _is_frozen(fresh) else fresh
         there, before = vars(fresh), vars(start)
         for name, change in told.items():
@@ -343,6 +354,7 @@ def _object(name: str, attributes: Mapping[str, Change]) -> Any:
 _NEW: dict[str, Callable[..., Any]] = {
     "value": _plain,
     "array": np.ndarray.copy,
+    "resized": np.ndarray.copy,
     "number": lambda content: content[()],
     "dict": lambda content: {_new(key): _new(part) for key, part in content},
     "enum": lambda name, value: _class(name, enum.Enum)(value),

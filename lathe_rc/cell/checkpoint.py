@@ -5,24 +5,20 @@ The state consists of what the run has changed in each stage (`lathe_rc.cell.cha
 readers still need. A run that goes on with the same parameters gives the same bits as the uninterrupted one. Other
 parameters take effect at the checkpoint; those that the state depends on, such as the size of a memory, are rejected.
 
-The file is JSON, compressed, between a first line and a checksum. It contains no code.
+The file is one of plain data (`lathe_rc.data_file`): it contains no code.
 """
 
-import base64
-import errno
-import json
 import math
 import re
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lathe_rc import __version__
+from lathe_rc import __version__, data_file
 from lathe_rc.cell.changes import Change, ClashError, Restoring, changes
 from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import NodeParameters
@@ -32,16 +28,14 @@ from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import is_ours, source_hash
-from lathe_rc.files import DamagedError, contents, sealed, unsealed, written
+from lathe_rc.files import written
 from lathe_rc.jit import SOURCES
 from lathe_rc.messages import Signals
 
-_HEAD = b"lathe_rc checkpoint 1\n"
-_MOST = 2**28  # largest file, and largest content [B]
+_KIND = "checkpoint"
 _WHEN = re.compile(r"(revolution|second|sample):([0-9.eE+-]+)")
 _FREE = frozenset({"revolutions", "events", "faults", "block_size", "joint_state_period", "allow_faults"})
 _START_FROM = "start_from"
-_NUMBERS = "biuf"  # allowed kinds of array elements
 
 
 @dataclass(frozen=True)
@@ -216,23 +210,6 @@ def _made_with(kinds: Iterable[str]) -> dict[str, str]:
     }
 
 
-def _encoded(part: object) -> object:
-    if isinstance(part, np.ndarray):
-        return {"dtype": part.dtype.str, "shape": part.shape, "data": base64.b64encode(part.tobytes()).decode()}
-    if isinstance(part, np.generic):
-        return part.item()
-    raise TypeError(f"a {type(part).__name__} in a checkpoint")
-
-
-def _decoded(part: dict[str, Any]) -> object:
-    if part.keys() != {"dtype", "shape", "data"}:
-        return part
-    dtype = np.dtype(str(part["dtype"]))
-    if dtype.kind not in _NUMBERS:
-        raise ValueError(f"elements {part['dtype']!r:.80}")
-    return np.frombuffer(base64.b64decode(part["data"]), dtype).reshape(part["shape"]).copy()
-
-
 def save(path: Path, found: Checkpoint) -> None:
     """Write a checkpoint to a file, which it replaces atomically.
 
@@ -249,7 +226,7 @@ def save(path: Path, found: Checkpoint) -> None:
         "stages": found.stages,
     }
     with written(path) as file:
-        file.write(sealed(_HEAD + zlib.compress(json.dumps(told, default=_encoded).encode(), 1)))
+        file.write(data_file.packed(_KIND, told))
 
 
 def begun_of(nodes: Mapping[str, NodeParameters]) -> Checkpoint | None:
@@ -281,22 +258,8 @@ def load(path: Path, kinds: Iterable[str]) -> Checkpoint:
     Raises:
         InputError: the file cannot be read, is no checkpoint, is damaged, or was made by another version.
     """
-    try:
-        told = _content(path)
-        made, here = dict(told["made_with"]), _made_with(kinds)
-        nodes = {name: (kind, values) for name, (kind, values) in told["nodes"].items()}
-        found = Checkpoint(
-            told["scenario"], told["identity"], made, int(told["sample"]), nodes, told["stages"], told["past"], path
-        )
-    except InputError:
-        raise
-    except OSError as error:
-        reason = f"larger than any checkpoint, {_MOST} B" if error.errno == errno.EFBIG else error.strerror
-        raise InputError(f"{path}: the checkpoint cannot be read ({reason}); name a file that was written") from None
-    except DamagedError as error:
-        raise InputError(f"{path}: damaged ({error}); make it anew") from None
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, zlib.error) as error:
-        raise InputError(f"{path}: not a checkpoint ({shown(error)}); make it anew") from None
+    found = data_file.read(path, _KIND, partial(_made, path))
+    made, here = found.made_with, _made_with(kinds)
     if made != here:
         other = next(key for key in {**made, **here} if made.get(key) != here.get(key))
         versions = f"{shown(made.get(other, 'none'))}, this is {here.get(other, 'none')}"
@@ -304,21 +267,8 @@ def load(path: Path, kinds: Iterable[str]) -> Checkpoint:
     return found
 
 
-def _content(path: Path) -> Any:
-    """Return the content of a file; it raises as `contents`, `unsealed`, `zlib` and `json` do.
-
-    Raises:
-        InputError: it begins as no checkpoint does.
-    """
-    content = contents(path, _MOST)
-    if not content.startswith(_HEAD):
-        raise InputError(f"{path}: not a checkpoint of this format; name a file that lathe run --checkpoint wrote")
-    return json.loads(_unpacked(bytes(unsealed(content))[len(_HEAD) :]), object_hook=_decoded)
-
-
-def _unpacked(data: bytes) -> bytes:
-    unpacking = zlib.decompressobj()
-    found = unpacking.decompress(data, _MOST)
-    if not unpacking.eof:
-        raise ValueError("incomplete, or larger than any checkpoint")
-    return found
+def _made(path: Path, told: Any) -> Checkpoint:
+    """Return the checkpoint with the content of a file."""
+    nodes = {name: (kind, dict(values)) for name, (kind, values) in told["nodes"].items()}
+    made, sample = dict(told["made_with"]), int(told["sample"])
+    return Checkpoint(told["scenario"], told["identity"], made, sample, nodes, told["stages"], told["past"], path)

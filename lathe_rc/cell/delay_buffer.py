@@ -3,13 +3,13 @@
 
 from collections.abc import Iterable, Mapping
 from math import ceil
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.cell.stage import Input
-from lathe_rc.messages import Signals
+from lathe_rc.messages import Samples, Signals
 
 _MOVED = 0.25  # largest share of samples copied again to keep them contiguous
 _VIEWS = 256  # largest number of cached views
@@ -49,10 +49,6 @@ class DelayBuffer:
         self._first, self._size, self._newest = 0, 0, Signals()  # the newest samples
         self.end = 0  #: index after the newest sample
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state to be pickled, without array views, which would be pickled as copies."""
-        return {**self.__dict__, "_views": {}, "_size": 0, "_newest": {}}
-
     def _at(self, start: int, samples: int) -> Signals:
         """Return views of ``samples`` elements starting at ``start``, cached for repeated use."""
         views = self._views.get((start, samples))
@@ -85,9 +81,21 @@ class DelayBuffer:
         assert first + samples <= self.end, "samples are not there yet"
         return self._at(start, samples)
 
-    def restart(self, first: int) -> None:
-        """Restart at sample ``first``, with zeros before it; all samples are dropped."""
-        for array in self._arrays.values():
+    def past(self) -> Signals:
+        """Return copies of the samples before `end` that may still be viewed, by field."""
+        start = self.end - self._kept - self._base
+        return {name: array[start : start + self._kept].copy() for name, array in self._arrays.items()}
+
+    def restart(self, first: int, past: Mapping[str, Samples] = MappingProxyType({})) -> None:
+        """Restart at sample ``first``.
+
+        Args:
+            first: sample index.
+            past: the newest samples before it, as returned by `past`; all others are zero.
+        """
+        for name, array in self._arrays.items():
             array[:] = 0
+            if name in past and (size := min(past[name].size, self._kept)):
+                array[self._kept - size : self._kept] = past[name][-size:]
         self._base, self.end = first - self._kept, first
         self._first, self._size, self._newest = first, 0, {}

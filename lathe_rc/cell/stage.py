@@ -625,18 +625,8 @@ class Stage(ABC):
         """Forget results that depend on parameters other than those now given, after a start from a checkpoint."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the pickled state, without addresses and scratch arrays."""
-        tuned = {name: getattr(self.parameters_now, name) for name in self.tunable}
-        return {**self.__dict__, "_native": None, "_room": None, "_tuned": tuned}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled state; a state file gives all tables as they were at the start."""
-        tuned = state.pop("_tuned")
-        self.__dict__.update(state)
-        if any(getattr(self.parameters_now, name) != value for name, value in tuned.items()):
-            self.parameters_now = self.parameters_now.model_copy(update=tuned)
-            if "parameters" in state:  # not of every third-party stage
-                self.__dict__["parameters"] = self.parameters_now
+        """Return the attributes that are state, without addresses and scratch arrays."""
+        return {**self.__dict__, "_native": None, "_room": None}
 
     @property
     def streams(self) -> list[NormalStream]:

@@ -141,16 +141,10 @@ class RepetitiveController:
         whole[angle_memory.CHUNK] = angle_memory.NO_CHUNK
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the picklable state between two blocks, without scratch arrays."""
+        """Return the attributes that are state between two blocks, without scratch arrays."""
         nothing: dict[str, Any] = dict.fromkeys(_ROOM)
         table = self.table._replace(**nothing)
         return {**self.__dict__, "table": table}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a pickled state, with new scratch arrays."""
-        self.__dict__.update(state)
-        room: dict[str, Any] = {name: np.zeros(shape) for name, shape in _ROOM.items()}
-        self.table = self.table._replace(**room)
 
     @property
     def learning(self) -> bool:

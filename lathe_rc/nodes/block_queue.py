@@ -3,7 +3,8 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 
@@ -126,15 +127,17 @@ class BlockQueue(BlockOrder):
         pieces = [block.signals for block in self.until(self.blocks[0].first_index + samples)]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def state(self) -> tuple[int, int, list[Block], Block | None]:
-        """Return the state for a restart: next sample, number of blocks received, queued blocks and newest block."""
-        return self.end, self.received, list(self.blocks), self._newest
+    def state(self) -> list[Any]:
+        """Return the state for a restart: next sample, number of blocks received, newest block and queued blocks."""
+        newest = [] if self._newest is None else [self._newest]
+        return [self.end, self.received, *([astuple(block) for block in part] for part in (newest, self.blocks))]
 
-    def go_on(self, source: str, state: tuple[int, int, list[Block], Block | None]) -> None:
+    def go_on(self, source: str, state: list[Any]) -> None:
         """Resume from the `state` of another process."""
-        end, received, waiting, self._newest = state
-        self.resume(source, end, received, ended=self._newest is not None and self._newest.last)
-        self.blocks = deque(waiting)
+        end, received, *parts = state
+        newest, waiting = ([Block(*told) for told in part] for part in parts)
+        self._newest, self.blocks = newest[0] if newest else None, deque(waiting)
+        self.resume(source, end, received, ended=bool(newest) and newest[0].last)
 
     def hold_newest(self, end: int, newest: Block | None = None) -> None:
         """Hold the newest sample of a lost source up to the end of the run (see `hold`).

@@ -7,19 +7,23 @@ blocks since then again. The state is at most another window old: publishers, wh
 little more than three.
 """
 
+import os
+import stat
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from lathe_rc.cell import state_file
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.events import Trigger
+from lathe_rc import data_file
+from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.scenario import new_stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
     from lathe_rc.nodes.stage_role import StageRole
+
+_KIND = "state"
 
 
 class Restart:
@@ -43,10 +47,10 @@ class Restart:
             raise InputError(
                 f"{role.node.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''"
             )
+        self._start = new_stage(role.node.get_name(), role.node.table)
         self.keep_at = 0
         self._behind = self._window  # blocks that a reader may be behind
-        # The newest states: number of blocks, state, and events scheduled since.
-        self._states: deque[tuple[int, bytes, list[tuple[str, float]]]] = deque()
+        self._states: deque[dict[str, Any]] = deque()  # the newest ones, with the events scheduled since
 
     def begin(self, *, joins: bool) -> None:
         """Begin at block 0, or resume from the state of another process."""
@@ -63,8 +67,8 @@ class Restart:
         """Keep the current state in memory, and write one that no reader has passed to the file."""
         blocks = self._role.blocks
         self.keep_at = blocks + self._window
-        self._states.append((blocks, state_file.dump(self._kept()), []))
-        while len(self._states) > 1 and self._states[1][0] <= blocks - self._behind:
+        self._states.append(self._kept())
+        while len(self._states) > 1 and self._states[1]["blocks"] <= blocks - self._behind:
             self._states.popleft()
         self._write()
 
@@ -75,40 +79,76 @@ class Restart:
             action: the event.
             place: sample at which it takes effect, an int; or number of revolutions, a float.
         """
-        for _, _, events in self._states:
-            events.append((action, place))
+        for state in self._states:
+            state["events"].append((action, place))
         if self._states:
             self._write()
 
     def _write(self) -> None:
-        _, state, events = self._states[0]
-        state_file.save(Path(self._file), state, state_file.dump({"events": events}))
+        """Replace the file atomically: a reader sees either state, even if this process is killed.
 
-    def _kept(self) -> dict[str, object]:
-        """Return the state that the next block depends on, with the session of the cell."""
-        role, master = self._role, self._node.protocol.master
+        Raises:
+            LatheError: the file cannot be written.
+        """
+        path = Path(self._file)
+        new = path.with_name(f"{path.name}.new")
+        try:
+            new.unlink(missing_ok=True)
+            with open(new, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+                file.write(data_file.packed(_KIND, self._states[0], level=0))
+            new.replace(path)
+        except OSError as error:
+            raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
+
+    @property
+    def _of(self) -> list[Any]:
+        """Return the node and the session of the cell to which the state belongs."""
+        master = self._node.protocol.master
         assert master is not None, "it has announced all members"
+        return [self._node.full_name, self._node.table.run_id, master.host, master.pid]
+
+    def _kept(self) -> dict[str, Any]:
+        """Return the state that the next block depends on."""
+        role = self._role
         return {
-            "of": (self._node.full_name, self._node.table.run_id, master.host, master.pid),
+            "of": self._of,
             "blocks": role.blocks,
             "samples": role.samples,
             "companions": role.outputs.framer.companions,
-            "stage": role.stage,
+            "stage": changes(role.stage, self._start),
             "events": [],
-            "tracks": role.inputs.buffers,
+            "past": {topic: (buffer.end, buffer.past()) for topic, buffer in role.inputs.buffers.items()},
             "queues": {topic: queue.state() for topic, queue in role.inputs.queues.items()},
         }
 
     def _resume(self) -> None:
-        """Resume from the state of another process."""
-        role, fresh, protocol = self._role, self._kept(), self._node.protocol
-        state = state_file.load(Path(self._file), self._node.table, fresh, Block, Trigger)
-        if state["of"] != fresh["of"]:
-            raise LatheError(f"{self._file}: the state of another node or run; expected {fresh['of']}")
+        """Resume from the state of another process.
+
+        Raises:
+            LatheError: the file is no state of this node in this cell, or another user could have written it.
+        """
+        path = Path(self._file)
+        try:
+            about = path.stat()
+        except OSError as error:
+            raise LatheError(f"{path}: the state cannot be read ({error.strerror})") from None
+        if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise LatheError(f"{path}: another user owns or may write this state; allowed: your own file, mode 600")
+        data_file.read(path, _KIND, self._restore)
+        role = self._role
+        self._node.get_logger().info(f"goes on from block {role.blocks}")
+        self._node.reporter("resumed", self._node.get_name(), blocks=role.blocks, sample=role.samples)
+
+    def _restore(self, state: Any) -> None:
+        role, protocol = self._role, self._node.protocol
+        if state["of"] != self._of:
+            raise InputError(f"{self._file}: the state of another node or run; expected {self._of}")
+        Restoring().restore(state["stage"], role.stage)
         role.blocks, role.samples, role.started = state["blocks"], state["samples"], True
         protocol.resumed(role.blocks)
         role.outputs.framer.companions = state["companions"]
-        role.stage, role.inputs.buffers = state["stage"], state["tracks"]
+        for topic, (end, past) in state["past"].items():
+            role.inputs.buffers[topic].restart(end, past)
         for action, place in state["events"]:
             schedule = role.stage.schedule if isinstance(place, int) else role.stage.schedule_at_revolution
             schedule(action, place)
@@ -117,5 +157,3 @@ class Restart:
         for topic, queue in role.inputs.queues.items():
             queue.go_on(sources[topic], state["queues"][topic])
         role.inputs.wire()
-        self._node.get_logger().info(f"goes on from block {role.blocks}")
-        self._node.reporter("resumed", self._node.get_name(), blocks=role.blocks, sample=role.samples)

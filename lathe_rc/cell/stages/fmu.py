@@ -388,7 +388,7 @@ class FmuStage(Stage):
         return f"{what}: a step of {size:.9g} s failed: {why}; allowed: another fmu_step{made}"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the pickled state, with the FMU's own as bytes.
+        """Return the attributes that are state, with the FMU's own as bytes.
 
         Raises:
             LatheError: the FMU cannot save its state.

@@ -387,7 +387,7 @@ class Margins:
         self._suprema: dict[tuple[object, ...], float] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the pickled state, without the responses, which are computed on demand."""
+        """Return the attributes that are state, without the responses, which are computed on demand."""
         return {**self.__dict__, "_responses": {}}
 
     def forget_suprema(self) -> None:
