@@ -161,8 +161,8 @@ def test_a_tolerance_that_nobody_gave_cannot_be_required():
     done = lathe(*SHORT, "--require-tolerance", "--set", "tool.tolerance=0.0")
     assert done.exit_code == 2
     assert done.stderr.startswith("lathe: --require-tolerance without tool.tolerance; allowed: ")
-    done = lathe("run", "force_turning", "--require-tolerance")
-    assert done.stderr.strip().endswith("allowed: a scenario that has one (force_turning has no tool)")
+    done = lathe("run", "force_turning", "--require-tolerance", "--set", "force_controller.tolerance=0.0")
+    assert done.stderr.strip().endswith("allowed: a scenario that has one, or --set force_controller.tolerance=5.0")
 
 
 def test_terminal_json_and_report_say_alike_that_a_run_diverges_though_it_is_in_tolerance(tmp_path):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verdict on a run by its form error: whether the part is in tolerance, and whether the form error grows.
+"""Verdict on a run by an error of each revolution: whether it is in tolerance, and whether it grows.
 
-The tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t on either side of the desired form. A
+The error is that of the form, or the following error of a force or position loop; the text speaks of the form. The
+tolerance ±t is that of a line profile (ISO 1101) whose zone is 2t wide, t on either side of the desired form. A
 revolution is in tolerance if its form error nowhere exceeds t; a run is in tolerance from the first revolution of the
 final sequence of revolutions in tolerance. The margin is computed from the last revolutions, since the first one in
 tolerance has hardly any margin.
@@ -27,16 +28,41 @@ _NOTHING = 1e-12  # [m] form error below which a rise is rounding error
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Tolerance verdict on a run.
+class Quantity:
+    """Quantity that is judged.
 
     Attributes:
-        tolerance: allowed form error to each side [m].
+        error: name of its error in texts.
+        unit: unit in texts and in JSON.
+        scale: number of these units in an SI unit.
+    """
+
+    error: str
+    unit: str
+    scale: float
+
+    def told(self, value: float, digits: int = 4) -> str:
+        """Format a value in SI units as text with the unit."""
+        return f"{value * self.scale:.{digits}g} {self.unit}"
+
+
+FORM = Quantity("form error", "µm", 1e6)
+POSITION = Quantity("position error", "µm", 1e6)
+FORCE = Quantity("force error", "N", 1.0)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Tolerance verdict on a run; errors are in SI units.
+
+    Attributes:
+        tolerance: allowed error to each side [m].
         revolutions: number of complete revolutions judged.
         since: first revolution, counted from 1, of the final sequence in tolerance; 0 if the last one is not.
         over: first and last revolution used for `largest`: at most the last `LAST` in tolerance, or only the last
             revolution if it is out of tolerance; (0, 0) without a revolution.
-        largest: largest magnitude of the form error in these revolutions [m]; NaN without a revolution.
+        largest: largest magnitude of the error in these revolutions [m]; NaN without a revolution.
+        quantity: quantity that is judged.
     """
 
     tolerance: float
@@ -44,6 +70,7 @@ class Verdict:
     since: int
     over: tuple[int, int]
     largest: float
+    quantity: Quantity = FORM
 
     @property
     def in_tolerance(self) -> bool:
@@ -56,80 +83,87 @@ class Verdict:
         return self.tolerance - self.largest
 
     def told(self) -> str:
-        """Describe the result as text, lengths in µm."""
-        allowed = f"±{self.tolerance * 1e6:.4g} µm"
+        """Describe the result as text."""
+        told = self.quantity.told
+        allowed = f"±{told(self.tolerance)}"
         if not self.revolutions:
             return f"not in tolerance ({allowed}): no complete revolution"
         if not self.in_tolerance:
-            return f"not in tolerance ({allowed}): {self.largest * 1e6:.4g} µm in the last revolution"
+            return f"not in tolerance ({allowed}): {told(self.largest)} in the last revolution"
         first, last = self.over
         over = f"the last {last - first + 1}" if first < last else "the last"
-        return f"in tolerance ({allowed}) from revolution {self.since} on, {self.spare * 1e6:.3g} µm to spare in {over}"
+        return f"in tolerance ({allowed}) from revolution {self.since} on, {told(self.spare, 3)} to spare in {over}"
 
     def summary(self) -> dict[str, object]:
-        """Return the result for JSON, lengths in µm."""
+        """Return the result for JSON, in the quantity's unit."""
+        scale = self.quantity.scale
         return {
-            "allowed": self.tolerance * 1e6,
+            "allowed": self.tolerance * scale,
             "in_tolerance": self.in_tolerance,
             "from_revolution": self.since or None,
-            "largest": self.largest * 1e6 if self.revolutions else None,
-            "spare": self.spare * 1e6 if self.revolutions else None,
+            "largest": self.largest * scale if self.revolutions else None,
+            "spare": self.spare * scale if self.revolutions else None,
             "over_revolutions": list(self.over) if self.revolutions else None,
         }
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of the form error beyond its settled range.
+    """Growth of the error beyond its settled range.
 
     Attributes:
         diverges: True for an accelerating rise; False for a rise proportional to time, as caused by wear or drift.
         since: revolution, counted from 1, in which the growth begins.
         before: largest magnitude in the settled revolutions before the growth [m].
         last: largest magnitude in the last revolution [m].
+        quantity: quantity that is judged.
     """
 
     diverges: bool
     since: int
     before: float
     last: float
+    quantity: Quantity = FORM
 
     def told(self) -> str:
-        """Describe the result as text, lengths in µm."""
+        """Describe the result as text."""
         what = "diverges" if self.diverges else "grows"
-        sizes = f"{self.before * 1e6:.4g} µm before, {self.last * 1e6:.4g} µm at the end"
-        return f"form error {what} from revolution {self.since} on: {sizes}"
+        sizes = f"{self.quantity.told(self.before)} before, {self.quantity.told(self.last)} at the end"
+        return f"{self.quantity.error} {what} from revolution {self.since} on: {sizes}"
 
     def summary(self) -> dict[str, object]:
-        """Return the result for JSON, lengths in µm."""
-        lengths = {"before": self.before * 1e6, "last": self.last * 1e6}
-        return {"diverges": self.diverges, "from_revolution": self.since, **lengths}
+        """Return the result for JSON, in the quantity's unit."""
+        sizes = {"before": self.before * self.quantity.scale, "last": self.last * self.quantity.scale}
+        return {"diverges": self.diverges, "from_revolution": self.since, **sizes}
 
 
-def judge(largest: Array, tolerance: float, before: int = 0) -> Verdict:
+def judge(largest: Array, tolerance: float, before: int = 0, quantity: Quantity = FORM) -> Verdict:
     """Judge whether a run is in tolerance.
 
     Args:
-        largest: largest magnitude of the form error of each complete revolution [m], shape (revolutions,).
-        tolerance: allowed form error to each side [m].
+        largest: largest magnitude of the error of each complete revolution [m], shape (revolutions,).
+        tolerance: allowed error to each side [m].
         before: number of revolutions before the first of these, for a snapshot.
+        quantity: quantity that is judged.
     """
     count = largest.size
     if not count:
-        return Verdict(tolerance, 0, 0, (0, 0), np.nan)
+        return Verdict(tolerance, 0, 0, (0, 0), np.nan, quantity)
     outside = np.flatnonzero(~(largest <= tolerance))  # NaN counts as out of tolerance
     inside = int(outside[-1]) + 1 if outside.size else 0  # first of the final sequence in tolerance
     start = max(inside, count - LAST) if inside < count else count - 1
     since = inside + 1 + before if inside < count else 0
-    return Verdict(tolerance, count, since, (start + 1 + before, count + before), float(largest[start:].max()))
+    over = (start + 1 + before, count + before)
+    return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity)
 
 
-def growth(largest: Array, before: int = 0) -> Growth | None:
-    """Detect growth of the form error of a run; None without growth, for a step, or with too few revolutions.
+def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth | None:
+    """Detect growth of the error of a run; None without growth, for a step, or with too few revolutions.
 
     Args:
-        largest: largest magnitude of the form error of each complete revolution [m], shape (revolutions,).
+        largest: largest magnitude of the error of each complete revolution [m], shape (revolutions,).
         before: number of revolutions before the first of these, for a snapshot.
+        quantity: quantity that is judged.
     """
     finite = largest[np.isfinite(largest)]
     if finite.size <= _FEWEST:
@@ -150,4 +184,24 @@ def growth(largest: Array, before: int = 0) -> Growth | None:
         return None
     first, middle, last = (float(third.mean()) for third in np.array_split(climb, 3))
     diverges = last - middle > _BENT * (middle - first)
-    return Growth(diverges, start + 2 + before, float(settled.max()), float(largest[-1]))
+    return Growth(diverges, start + 2 + before, float(settled.max()), float(largest[-1]), quantity)
+
+
+def swing_growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth | None:
+    """Detect growth as `growth` does, also of swings that take several revolutions.
+
+    The largest errors of groups of 1, 2, 4 and more revolutions are checked. The first group length whose errors
+    diverge counts; without one, the first whose errors grow.
+    """
+    found: Growth | None = None
+    group = 1
+    while largest.size // group > _FEWEST:
+        whole = largest[: largest.size // group * group].reshape(-1, group)
+        grown = growth(whole.max(axis=1), quantity=quantity)
+        if grown and (found is None or grown.diverges):
+            since = (grown.since - 1) * group + 1 + before
+            found = Growth(grown.diverges, since, grown.before, grown.last, quantity)
+            if found.diverges:
+                return found
+        group *= 2
+    return found

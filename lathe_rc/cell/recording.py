@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_before
+from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end, turns_before
 from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html
@@ -101,6 +101,14 @@ class Recording:
     def samples(self) -> int:
         """Number of samples of each dense topic."""
         return next((array.size for signals in self.dense.values() for array in signals.values()), 0)
+
+    @property
+    def revolutions(self) -> int:
+        """Number of complete revolutions; 0 without a recorded encoder."""
+        if messages.ENCODER not in {self.types[topic] for topic in self.dense}:
+            return 0
+        turns = self.of_type(messages.ENCODER)["angle_true"][-2:] / (2.0 * np.pi)
+        return max(turns_at_end(*turns.tolist()) - self.turns_before, 0) if turns.size == 2 else 0
 
     @cached_property
     def errors(self) -> FormErrors:

@@ -13,6 +13,7 @@ from lathe_rc import harness, part
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.commands import plot, tables
+from lathe_rc.loops import LoopResult
 
 _MOST_EVENTS = 12  # rows of the event table
 _ALIKE = 4  # length of a series of similar events from which its inner events are left out
@@ -24,6 +25,16 @@ def table(result: harness.Result) -> Table:
     found = tables.table("", *columns.values(), left=1)
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
         numbers = part.numbers(result.part, revolution)
+        found.add_row(label, *(f"{numbers[name]:#.4g}" for name in columns))
+    return found
+
+
+def _loop(node: str, loop: LoopResult) -> Table:
+    """Return a table of a loop's error in its first and last revolution."""
+    columns = {"rms": "RMS", "max": "maximum", "peak_to_valley": "peak to valley", "mean": "mean"}
+    found = tables.table(f"{node} [{loop.loop.quantity.unit}]", *columns.values(), left=1)
+    for label, revolution in (("first revolution", 0), ("last revolution", -1)):
+        numbers = loop.row(revolution)
         found.add_row(label, *(f"{numbers[name]:#.4g}" for name in columns))
     return found
 
@@ -49,10 +60,15 @@ def facts(result: harness.Result) -> list[str]:
     surface, first, step = result.surface, result.recording.first, result.scenario.shared.step
     return [
         *(each.told() for each in (result.growth, result.verdict) if each),
+        *(
+            f"{node}: {text}"
+            for node, loop in result.loops.items()
+            for text in (*(text for text, _ in loop.judged()), *loop.behaviour())
+        ),
         *_margins(result),
         *([part.along_in_words(surface) if isinstance(surface, Lay) else surface] if surface else []),
         *([f"gone on from sample {first}, {first * step:.4g} s"] if first else []),
-        f"{result.blocks} blocks sent, {result.dropped} lost; {result.errors.rms.size} revolutions",
+        f"{result.blocks} blocks sent, {result.dropped} lost; {result.recording.revolutions} revolutions",
         f"{result.simulated_s:.2f} s simulated in {result.wall_s:.2f} s: {result.real_time_factor:.1f}x real time",
         *(result.lateness.lines() if result.lateness else []),
         *refused,
@@ -87,6 +103,9 @@ def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "",
     if result.errors.rms.size:
         console.print(table(result))
         plot.show(result, console)
+    for node, loop in result.loops.items():
+        if loop.found.errors.rms.size:
+            console.print(_loop(node, loop))
     if result.event_log:
         console.print(_events(result))
     for fact in [*facts(result), *filter(None, [note])]:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS domain, for others to listen; default: a free one")
 @click.option("--namespace", help="of the nodes, for two cells in one domain; default: /")
 @options.start
-@click.option("--require-tolerance", is_flag=True, help="exit with 1 unless the run ends within the tool's tolerance")
+@click.option("--require-tolerance", is_flag=True, help="exit with 1 unless the run ends within each tolerance")
 @click.option("--budget", is_flag=True, help="tell what the form error is made of as well, by some ten further runs")
 @options.allow_code
 @options.as_json

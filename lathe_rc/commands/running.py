@@ -63,12 +63,8 @@ def run(
             raise InputError(f"{option} {value} with --mode offline; allowed: --mode processes or composed")
     if strict and mode == "offline":
         raise InputError("--strict with --mode offline, which has no pace; allowed: --mode processes or composed")
-    if require_tolerance and not part.tolerances(loaded):
-        tools = loaded.of_kind("tool")
-        cure = f", or --set {tools[0]}.tolerance=2e-6" if tools else f" ({loaded.name} has no tool)"
-        raise InputError(
-            f"--require-tolerance without {(tools or ['tool'])[0]}.tolerance; allowed: a scenario that has one{cure}"
-        )
+    if require_tolerance:
+        _check_tolerance(loaded)
     if figure:
         picture.check_place(figure)
     written = [("--profile", profile)] if profile else []
@@ -97,7 +93,37 @@ def run(
         files = [(name, path) for name, path in (("profile", profile), ("figure", figure)) if path]
         files += [(f"checkpoint at {when}", path) for when, path in checkpoints]
         outcome.show(result, dict(files), note=note, budget=found)
-    if require_tolerance and result.verdict and not result.verdict.in_tolerance:
+    if require_tolerance:
         alike = " with the same --set" if overrides else ""
-        hint = "" if found else f"; lathe budget {scenario}{alike} tells why"
-        raise LatheError(f"{loaded.name} is {result.verdict.told()}; allowed: no more than the tolerance{hint}")
+        _require_tolerance(result, "" if found else f"; lathe budget {scenario}{alike} tells why")
+
+
+def _require_tolerance(result: harness.Result, hint: str) -> None:
+    """Check that a run ended within each tolerance.
+
+    Raises:
+        LatheError: it did not; ``hint`` ends the message for the part.
+    """
+    name = result.scenario.name
+    judged = [(name, result.verdict, hint)]
+    judged += [(f"{node} of {name}", loop.verdict, "") for node, loop in result.loops.items()]
+    for what, verdict, more in judged:
+        if verdict and not verdict.in_tolerance:
+            raise LatheError(f"{what} is {verdict.told()}; allowed: no more than the tolerance{more}")
+
+
+def _check_tolerance(scenario: Scenario) -> None:
+    """Check that a node of a scenario has a tolerance.
+
+    Raises:
+        InputError: none has one.
+    """
+    judged = {name: table for name, table in scenario.nodes.items() if "tolerance" in table.judging}
+    if any(getattr(table, "tolerance") for table in judged.values()):  # noqa: B009 - of a tool or a servo
+        return
+    name = next(iter(judged), "tool")
+    cure = f" ({scenario.name} has no tool and no force or position loop)"
+    if judged:
+        value = "5.0" if judged[name].rows()["tolerance"].unit == "N" else "2e-6"
+        cure = f", or --set {name}.tolerance={value}"
+    raise InputError(f"--require-tolerance without {name}.tolerance; allowed: a scenario that has one{cure}")

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from lathe_rc import part
+from lathe_rc import loops, part
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
@@ -148,6 +148,11 @@ class Result:
         return part.error_growth(self.recording)
 
     @cached_property
+    def loops(self) -> dict[str, loops.LoopResult]:
+        """Results of the force and position loops, by controller (`lathe_rc.loops`)."""
+        return loops.evaluated(loops.loops(self.scenario.nodes), self.recording)
+
+    @cached_property
     def surface(self) -> Lay | str | None:
         """Surface along the part, or why it is absent; None if no tool of the scenario has a `nose_radius`."""
         tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
@@ -183,7 +188,7 @@ class Result:
             "simulated_s": self.simulated_s,
             "wall_s": self.wall_s,
             "real_time_factor": self.real_time_factor,
-            "revolutions": int(errors.rms.size),
+            "revolutions": self.recording.revolutions,
             "blocks": self.blocks,
             "dropped": self.dropped,
             "lateness_s": asdict(self.lateness) if self.lateness else None,
@@ -209,6 +214,7 @@ class Result:
             },
             "tolerance_um": verdict.summary() if verdict else None,
             "growth_um": growth.summary() if growth else None,
+            "loops": {node: loop.summary() for node, loop in self.loops.items()},
             "along_um": part.along(self.surface) if isinstance(self.surface, Lay) else self.surface,
             "bag": str(self.bag) if self.bag else None,
             "snapshots": [str(path) for path in self.snapshots],

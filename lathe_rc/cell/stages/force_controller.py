@@ -26,6 +26,14 @@ class ForceControllerParameters(ServoParameters):
     integral: float = parameter(FORCE.integral, "integral gain I", "1/(N*s)")
     derivative: float = parameter(FORCE.derivative, "derivative gain D", "s/N")
     derivative_filter: Positive = parameter(FORCE.filter, "N, where the derivative ends", "rad/s")
+    tolerance: NonNegative = parameter(
+        0.0, "allowed following error to each side, by which a run is judged; 0: not judged", "N"
+    )
+
+    @property
+    def commanded_topic(self) -> str:
+        """Topic of the command, before remapping."""
+        return "longitudinal/command"
 
 
 class Memory(NamedTuple):
@@ -71,7 +79,7 @@ class ForceController(Servo):
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
                 *listens(parameters),
             ],
-            outputs=[Output("longitudinal/command", messages.SERVO)],
+            outputs=[Output(parameters.commanded_topic, messages.SERVO)],
         )
 
     @property

@@ -257,7 +257,9 @@ class PositionController(Servo):
                 self._path = Predistortion.load(resources.find(Path(parameters.predistortion_file)))
             inputs.append(Input("longitudinal/state", messages.STATE, ("measured_position",), delay))
         self._held, self._log, self._logged = np.zeros(2), np.zeros((_PERIODS, 8)), np.zeros(1, np.int64)
-        self.declare(inputs=[*inputs, *listens(parameters)], outputs=[Output(f"{axis}/command", messages.SERVO)])
+        self.declare(
+            inputs=[*inputs, *listens(parameters)], outputs=[Output(parameters.commanded_topic, messages.SERVO)]
+        )
         if parameters.law == "periodic_hyperstable":
             self.sparse_topics[f"{axis}/periodic"] = messages.PERIODIC
 

@@ -50,6 +50,12 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
         "speed", "what the command stands for at the drive; to stop the slide a speed goes to 0, and a position stays"
     )
 
+    tolerance: NonNegative = parameter(
+        0.0, "allowed following error to each side, by which a run is judged; 0: not judged", "m"
+    )
+
+    judging = frozenset({"tolerance"})
+
     def obeys(self, name: str) -> Obedience | None:
         """Return the obedience of a node to the supervisor; None without a supervisor input.
 
