@@ -113,7 +113,7 @@ def _memory(folder: Path) -> Kept:
 def _checkpoint(folder: Path) -> Kept:
     path, cell = folder / "checkpoint", Cell(load().nodes)
     checkpoint.save(path, checkpoint.take(load(), cell.stages, 1, {}))
-    return Kept(path, lambda: repr(checkpoint.load(path, [])))
+    return Kept(path, lambda: repr(checkpoint.load(path)))
 
 
 def _table(_folder: Path) -> Kept:

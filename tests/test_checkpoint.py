@@ -3,18 +3,23 @@
 
 import json
 import zlib
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bags import lathe, sized
+from test_restart import OWN, Killer
 
 import lathe_rc
+from lathe_rc import harness
 from lathe_rc.bag import check
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 from lathe_rc.files import sealed, unsealed
+from lathe_rc.harness.result import Mode
 from lathe_rc.sweep import row
 
 LONG = ["spindle_encoder.revolutions=5"]
@@ -37,17 +42,17 @@ def rest(whole: Recording, first: int) -> dict[str, str]:
     return Recording(whole.types, dense, sparse, whole.step_ns).digests()
 
 
-def gone_on(name: str, folder: Path, count: int, seed: int = 1) -> None:
+def gone_on(name: str, folder: Path, count: int, seed: int = 1, modes: Sequence[Mode] = ("offline",)) -> None:
     """Check that a scenario gives the same bits from each of some random samples on."""
     scenario = lathe_rc.load(name, LONG)
     samples = lathe_rc.run(scenario).samples
     places = sorted((np.random.default_rng([seed, *name.encode()]).permutation(samples - 1)[:count] + 1).tolist())
     whole = lathe_rc.run(scenario, checkpoints={f"sample:{place}": folder / f"{place}" for place in places})
     assert whole.digest == lathe_rc.run(scenario).digest, "checkpoints change nothing"
-    for place in places:
-        found = lathe_rc.run(scenario, start_from=folder / f"{place}")
+    for place, mode in product(places, modes):
+        found = lathe_rc.run(scenario, mode=mode, start_from=folder / f"{place}")
         assert (found.recording.first, found.samples) == (place, samples - place)
-        assert found.digest == rest(whole.recording, place), f"{name} from sample {place}"
+        assert found.digest == rest(whole.recording, place), f"{name} from sample {place}, {mode}"
 
 
 @pytest.mark.parametrize("name", SCENARIOS[:5])
@@ -61,6 +66,13 @@ def test_a_run_goes_on_from_any_sample_with_the_same_bits(name: str, tmp_path: P
 def test_a_run_goes_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:
     """The same from 20 random samples of each of ten scenarios."""
     gone_on(name, tmp_path, sized(20), seed=2)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_nodes_go_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:
+    """The same composed and as processes."""
+    gone_on(name, tmp_path, sized(20), seed=3, modes=("composed", "processes"))
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +128,46 @@ def test_rows_of_a_sweep_go_on_from_the_checkpoint(learned: Path) -> None:
     assert found["tool.error:max"] == alone.errors.largest[-1]
 
 
-def test_a_node_refuses_a_checkpoint(learned: Path) -> None:
-    """A cell of nodes starts at sample 0, and says so."""
+def test_nodes_go_on_from_a_checkpoint_with_the_same_bits(tmp_path: Path) -> None:
+    """A cell of nodes goes on from any sample, composed or as processes; its bag begins there and passes its check."""
+    scenario = lathe_rc.load("full_cell", ["spindle_encoder.revolutions=2"])
+    whole = lathe_rc.run(scenario, checkpoints={"sample:1903": tmp_path / "file"}).recording
+    modes: tuple[Mode, ...] = ("composed", "processes")
+    for mode in modes:
+        found = lathe_rc.run(scenario, mode=mode, start_from=tmp_path / "file", bag=tmp_path / mode)
+        checked = check.check(tmp_path / mode)
+        assert (checked.lost, checked.wrong, checked.first) == ([], [], 1903)
+        assert checked.digests == found.digest == rest(whole, 1903)
+
+
+@pytest.mark.system
+def test_a_controller_that_is_killed_after_a_checkpoint_goes_on_to_the_bit(tmp_path: Path) -> None:
+    scenario = lathe_rc.load("piston", ["spindle_encoder.revolutions=20", f"{OWN}.restart_file={tmp_path}/state"])
+    whole = lathe_rc.run(scenario, checkpoints={"sample:5003": tmp_path / "file"}).recording
+    killer = Killer(OWN, [20_000])
+    found = lathe_rc.run(scenario, mode="processes", start_from=tmp_path / "file", watch=killer)
+    assert found.digest == rest(whole, 5003)
+    assert killer.all("resumed")
+
+
+def test_a_member_refuses_a_damaged_checkpoint_in_one_line(learned: Path, tmp_path: Path) -> None:
+    """Nodes that nobody has checked before their start end with one line, which names the file."""
+    file = tmp_path / "file"
+    file.write_bytes(learned.read_bytes()[:-200])
+    scenario = lathe_rc.load("piston", [*LONG, f"spindle_encoder.start_from={file}"])
+    complete = harness.with_recorder(scenario, tmp_path / "bag", keep=False)
+    with harness.Processes(complete, [list(complete.nodes)]) as cell, pytest.raises(InputError) as caught:
+        cell.wait_for_end()
+    assert str(caught.value) == f"{file}: damaged (it has no checksum); make it anew"
+
+
+def test_nodes_write_no_checkpoint_and_keep_no_snapshots_after_one(learned: Path, tmp_path: Path) -> None:
+    """Nodes refuse to write checkpoints, and snapshots of a run from one, before any process starts."""
     with pytest.raises(InputError, match="allowed: offline"):
-        lathe_rc.run(lathe_rc.load("piston", LONG), mode="composed", start_from=learned)
+        lathe_rc.run(lathe_rc.load("piston", LONG), mode="composed", checkpoints={"sample:9": tmp_path / "file"})
+    scenario = lathe_rc.load("piston", [*LONG, "recorder.mode=both"])
+    with pytest.raises(InputError, match="snapshots of a run from a checkpoint"):
+        lathe_rc.run(scenario, mode="composed", start_from=learned, bag=tmp_path / "bag")
 
 
 def test_events_behind_the_checkpoint_are_not_repeated_and_new_ones_act(tmp_path: Path) -> None:

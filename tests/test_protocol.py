@@ -282,11 +282,11 @@ def test_an_established_member_refuses_its_namesake(tool):
     assert tool.failure is None
 
 
-def leads(window=4, **reactions) -> TimeMasterProtocol:
+def leads(window=4, first=0, **reactions) -> TimeMasterProtocol:
     """A time master whose run has begun, with a controller and a recorder."""
     own = member("/spindle", stage="spindle_encoder", members=("/spindle", "/c", "/recorder"), session=5)
     values = {"stall_reaction": "safe", "stall_time": 0.1, "restart_time": 30.0, "safe_samples": 8, "block_size": 4}
-    protocol = TimeMasterProtocol(own, window, Reactions(**values | reactions), masters=MASTERS)
+    protocol = TimeMasterProtocol(own, window, Reactions(**values | reactions), masters=MASTERS, first=first)
     protocol.activate(0.0)
     for name in own.members[1:]:
         protocol.hear_member(member(name, MemberState.READY, parameters='{"restart_file": "x"}'), 0.0)
@@ -310,6 +310,23 @@ def test_the_window_bounds_the_blocks_in_flight_and_the_slowest_member_gives_cre
     assert protocol.credit == 0
     protocol.hear_progress(Progress("", "/recorder", 1, 4, 0), 0.0)  # a third-party member need not know the session
     assert protocol.credit == 1
+
+
+def test_a_run_from_a_checkpoint_counts_its_blocks_from_there():
+    """Samples keep their numbers, in what the time master says, in its simulated time and up to the end."""
+    protocol = leads(first=1001)
+    protocol.know_end(1010)
+    assert protocol.blocks_in_run == 3
+    protocol.release(3, 0.0)
+    protocol.computed(3, 1010, 0.0, last=True)
+    for name in ("/c", "/recorder"):
+        protocol.hear_progress(Progress("", name, 2, 1009, 5), 0.0)
+        protocol.hear_progress(Progress("", name, 3, 1010, 5), 0.0)
+    said = [action.state for action in protocol.actions if isinstance(action, actions.Say)]
+    assert [(state.state, state.first_index) for state in said] == [
+        (Phase.WAITING, 1001), (Phase.RUNNING, 1001), (Phase.ENDED, 1010),
+    ]  # fmt: skip
+    assert [action.samples for action in protocol.actions if isinstance(action, actions.TellTime)] == [1009, 1010]
 
 
 @pytest.mark.parametrize("stalls", ["wait", "safe"])

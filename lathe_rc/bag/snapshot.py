@@ -10,6 +10,7 @@ from lathe_rc.errors import InputError
 
 SNAPSHOT = "lathe_rc.snapshot"  #: metadata entry with the section of the run that the bag covers, and the triggers
 GONE_ON = "lathe_rc.gone_on"  #: metadata entry with the first sample of a run that goes on from a checkpoint
+SNAPSHOTS_GONE_ON = "snapshots of a run from a checkpoint; allowed: --set recorder.mode=continuous, or no bag"
 
 _MOST_SAMPLES = 2**48
 _MOST_TRIGGERS = 1000  # triggers of a snapshot that are listed individually

@@ -21,7 +21,7 @@ import numpy as np
 from lathe_rc import __version__, data_file
 from lathe_rc.cell.changes import Change, ClashError, Restoring, changes
 from lathe_rc.cell.events import Trigger
-from lathe_rc.cell.parameters import NodeParameters
+from lathe_rc.cell.parameters import NodeParameters, remapped_by
 from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of, new_stage
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stages import MASTERS, STAGES
@@ -35,7 +35,7 @@ from lathe_rc.messages import Signals
 _KIND = "checkpoint"
 _WHEN = re.compile(r"(revolution|second|sample):([0-9.eE+-]+)")
 _FREE = frozenset({"revolutions", "events", "faults", "block_size", "joint_state_period", "allow_faults"})
-_START_FROM = "start_from"
+START_FROM = "start_from"  #: parameter of the time master that names a checkpoint
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,19 @@ class Checkpoint:
                 "allowed: a longer run (revolutions)"
             )
 
+    def check_versions(self, kinds: Iterable[str]) -> None:
+        """Check that the code on which the states of some kinds of stages depend is that of the checkpoint.
+
+        Raises:
+            InputError: it is not.
+        """
+        for module, here in _made_with(kinds).items():
+            if (made := self.made_with.get(module, "none")) != here:
+                raise InputError(
+                    f"{self.path}: made with {module} {shown(made)}, this is {here}; allowed: the same version (make "
+                    "it anew)"
+                )
+
     def stage(self, name: str, table: NodeParameters) -> Stage:
         """Return a new stage with the state of the checkpoint.
 
@@ -93,8 +106,8 @@ class Checkpoint:
         if name not in self.nodes:
             raise InputError(f"{self.path} holds no node {name}; allowed: the same nodes, {', '.join(self.nodes)}")
         before = self.nodes[name][1]
-        differing = self._differing(name, table)
         stage = new_stage(name, table)
+        differing = self._differing(name, stage)
         if tuned := differing & {*stage.tunable}:
             stage = new_stage(name, table.changed(name, {key: before[key] for key in tuned}))
         start = self._start(name, table, differing) if differing - tuned else None
@@ -116,15 +129,18 @@ class Checkpoint:
             stage.tune(stage.parameters_now)
         return stage
 
-    def _differing(self, name: str, table: NodeParameters) -> set[str]:
+    def _differing(self, name: str, stage: Stage) -> set[str]:
         """Return the parameters of a node that differ from the checkpoint's and affect its samples."""
-        kind, before = self.nodes[name]
+        (kind, before), table = self.nodes[name], stage.shared
         if kind != (now := kind_of(name, table.stage)):
             raise InputError(f"{name} is {now}, and in {self.path} {kind}; allowed: {kind}")
         values = _values(table)
         if values.keys() != before.keys():
             raise InputError(f"{self.path}: not the state of {name} (other parameters); make it anew")
         differing = {key for key, value in values.items() if value != before[key]}
+        # Nodes announce the rules that concern their topics, sorted.
+        if all(remapped_by(table.remap, topic) == remapped_by(before["remap"], topic) for topic in stage.topics):
+            differing.discard("remap")
         fixed = differing - _FREE if kind in MASTERS else set[str]()
         fixed |= {key for key in differing if type(table).rows()[key].named is not None or key == "remap"}
         if fixed:
@@ -142,7 +158,7 @@ class Checkpoint:
 
 
 def _values(table: NodeParameters) -> dict[str, Any]:
-    return table.model_dump(mode="json", exclude={*HOST_PARAMETERS, *table.judging, _START_FROM})
+    return table.model_dump(mode="json", exclude={*HOST_PARAMETERS, *table.judging, START_FROM, "stage"})
 
 
 def take(scenario: Scenario, stages: Mapping[str, Stage], sample: int, past: Mapping[str, Signals]) -> Checkpoint:
@@ -233,37 +249,32 @@ def begun_of(nodes: Mapping[str, NodeParameters]) -> Checkpoint | None:
     """Return the checkpoint that the time master of some nodes names; None without one.
 
     Raises:
-        InputError: see `load`.
+        InputError: see `load`, or the file was made by another version of the code of these nodes.
     """
-    path = next(filter(None, (getattr(table, _START_FROM, "") for table in nodes.values())), "")
-    kinds = {kind_of(name, table.stage) for name, table in nodes.items()}
+    path = next(filter(None, (getattr(table, START_FROM, "") for table in nodes.values())), "")
+    if not path:
+        return None
     try:
-        return _loaded(path, frozenset(kinds & {*STAGES}), Path(path).stat().st_mtime_ns) if path else None
+        found = _loaded(path, Path(path).stat().st_mtime_ns)
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be read ({error.strerror})") from None
+    found.check_versions({kind_of(name, table.stage) for name, table in nodes.items()} & {*STAGES})
+    return found
 
 
 @lru_cache(maxsize=4)
-def _loaded(path: str, kinds: frozenset[str], changed: int) -> Checkpoint:  # noqa: ARG001 - the time is part of the key
-    return load(Path(path), kinds)
+def _loaded(path: str, changed: int) -> Checkpoint:  # noqa: ARG001 - the time is part of the key
+    return load(Path(path))
 
 
-def load(path: Path, kinds: Iterable[str]) -> Checkpoint:
-    """Read a checkpoint.
-
-    Args:
-        path: file written by `save`.
-        kinds: kinds of the stages that are to go on.
+def load(path: Path) -> Checkpoint:
+    """Read a checkpoint written by `save`.
 
     Raises:
-        InputError: the file cannot be read, is no checkpoint, is damaged, or was made by another version.
+        InputError: the file cannot be read, is no checkpoint, is damaged, or was made by another version of lathe_rc.
     """
     found = data_file.read(path, _KIND, partial(_made, path))
-    made, here = found.made_with, _made_with(kinds)
-    if made != here:
-        other = next(key for key in {**made, **here} if made.get(key) != here.get(key))
-        versions = f"{shown(made.get(other, 'none'))}, this is {here.get(other, 'none')}"
-        raise InputError(f"{path}: made with {shown(other)} {versions}; allowed: the same version (make it anew)")
+    found.check_versions(())
     return found
 
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.cell.stage import Input
+from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
 
 _MOVED = 0.25  # largest share of samples copied again to keep them contiguous
 _VIEWS = 256  # largest number of cached views
+_NONE = np.empty(0)
 
 
 def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
@@ -22,6 +24,28 @@ def longest_delays(ports: Iterable[Input]) -> dict[str, int]:
         for name in port.fields:
             delays[name] = max(delays.get(name, 0), port.delay)
     return delays
+
+
+def past_of(past: Mapping[str, Samples], topic: str, name: str, delay: int, first: int) -> Samples:
+    """Return the samples of a field that a delayed reader needs before sample ``first``, at most ``delay``.
+
+    Args:
+        past: the newest samples before it, by field.
+        topic: name of the topic.
+        name: name of the field.
+        delay: delay of the reader [sample].
+        first: sample index.
+
+    Raises:
+        InputError: there are not as many; samples before sample 0 are zero, and need not be given.
+    """
+    kept = past.get(name, _NONE)
+    if kept.size < min(delay, first):
+        raise InputError(
+            f"{topic}.{name} is read {delay} samples late, and the checkpoint holds {kept.size} past samples; "
+            "allowed: no longer delay"
+        )
+    return kept[max(kept.size - delay, 0) :]
 
 
 class DelayBuffer:

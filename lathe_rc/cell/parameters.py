@@ -6,7 +6,7 @@ ROS descriptors, validation, help and the documentation are generated from these
 
 import copy
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -343,7 +343,12 @@ class RestartParameters(NodeParameters):
 
 def remapped(table: NodeParameters, topic: str) -> str:
     """Return the relative name of a topic after the node's ``remap`` rules."""
-    for rule in table.remap:
+    return remapped_by(table.remap, topic)
+
+
+def remapped_by(rules: Iterable[str], topic: str) -> str:
+    """Return the relative name of a topic after some ``remap`` rules."""
+    for rule in rules:
         old, _, new = rule.partition(":=")
         if old == topic:
             return new

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.cell.delay_buffer import past_of
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
 from lathe_rc.compiled.step import BROKEN, AddressTable, broken
 from lathe_rc.compiled.struct_view import Integers, address, call, floats
-from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 
@@ -120,18 +120,10 @@ class Tapes:
         self.rewind()
         self.begin = first
         for (topic, name), delay in self._delays.items():
-            kept = past.get(topic, {}).get(name, _NONE)
-            size = min(delay, kept.size)
-            if size < min(delay, first):  # samples before sample 0 are zero
-                raise InputError(
-                    f"/{topic}.{name} is read {delay} samples late, and the checkpoint holds {kept.size} past samples; "
-                    "allowed: no longer delay"
-                )
-            if size:
-                self._arrays[topic, name][self.history - size : self.history] = kept[-size:]
+            kept = past_of(past.get(topic, {}), f"/{topic.lstrip('/')}", name, delay, first)
+            self._arrays[topic, name][self.history - kept.size : self.history] = kept
 
 
-_NONE = np.empty(0)
 NOT_FINITE = -3  #: reason why a program has stopped: a number is not finite
 _NOBODY = np.empty(0, np.int64)
 

@@ -258,6 +258,11 @@ class Stage(ABC):
                 self.check_action(trigger.action)
 
     @property
+    def topics(self) -> list[str]:
+        """Return the topics of all ports, before remapping."""
+        return [*(port.topic for port in self.inputs), *(port.topic for port in self.outputs), *self.sparse_topics]
+
+    @property
     def takes_events(self) -> bool:
         """Return whether the stage can receive events."""
         return bool(self.actions or self.tunable) or self.shared.allow_faults

@@ -84,8 +84,12 @@ def run(
     if start_from:
         scenario = scenario.varied({f"{name}.start_from": os.fspath(start_from) for name in scenario.masters})
     cell = Cell(scenario.nodes)
-    if mode != "offline" and (cell.begun or checkpoints):
-        raise InputError(f"a checkpoint with mode {mode}; allowed: offline, where the state is the same")
+    if mode != "offline" and checkpoints:
+        raise InputError(f"a checkpoint written with mode {mode}; allowed: offline, where the state is the same")
+    if cell.begun and bag is not None and scenario.recorder[1].mode != "continuous":
+        from lathe_rc.bag.snapshot import SNAPSHOTS_GONE_ON
+
+        raise InputError(SNAPSHOTS_GONE_ON)
     cell.check()
     check_room(cell)
     places = {checkpoint.sample_of(when, cell.master): Path(path) for when, path in checkpoints.items()}
@@ -156,7 +160,9 @@ def _run(
         return Result(
             scenario=scenario,
             mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
-            samples=cell.master.samples or recording.of_type(messages.ENCODER)["angle"].size,
+            samples=cell.master.samples - cell.first
+            if cell.master.samples
+            else recording.of_type(messages.ENCODER)["angle"].size,
             wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
             bag=kept,
             snapshots=tuple(_bags_in(folder)),
@@ -216,8 +222,6 @@ def _offline(
     first, samples = engine.first, engine.samples - engine.first
     collector = Collector(cell, samples, first=first)
     sinks: list[Sink] = [collector, _Watcher(watch)]
-    if cell.begun and bag is not None and scenario.recorder[1].mode != "continuous":
-        raise InputError("snapshots of a run from a checkpoint; allowed: --set recorder.mode=continuous, or no bag")
     recorder = snapshots = None
     if bag is not None:
         from lathe_rc.bag.writing.record import OfflineRecorder, begin, begin_snapshots

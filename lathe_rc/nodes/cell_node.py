@@ -29,6 +29,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
 from lathe_rc import messages
+from lathe_rc.cell.checkpoint import START_FROM, Checkpoint, begun_of
 from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value, remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -659,6 +660,18 @@ class CellNode(LifecycleNode):
             self._refuse(ForeignMessage(topic, "", "", why))
 
         return SubscriptionEventCallbacks(incompatible_qos=incompatible)
+
+    def begun(self) -> Checkpoint | None:
+        """Return the checkpoint that the time master announces; None: the run begins at sample 0.
+
+        Raises:
+            InputError: the file is no checkpoint, or was made by another version of this node's code.
+        """
+        tables = {self.get_name(): self.table.model_copy(update={"stage": self.kind})}
+        master = self.protocol.master
+        if master is not None and self.protocol.parameter(master.name, START_FROM):
+            tables |= self.announced([master.name])[0]
+        return begun_of(tables)
 
     def announced(self, names: Sequence[str]) -> graph.Announced:
         """Return the parameters and topics announced by the members (see `lathe_rc.nodes.graph.announced`)."""

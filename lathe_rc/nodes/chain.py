@@ -17,7 +17,7 @@ from lathe_rc.nodes.stage_role import StageRole
 
 
 class Chain:
-    """Chain of stages that are about to compute sample 0.
+    """Chain of stages that are about to compute block 0.
 
     Args:
         roles: stages in the order of computation.
@@ -46,6 +46,9 @@ class Chain:
         self._tapes = Tapes(topics, self._most)
         self._program = Program(self._stages, self._tapes, chunk_of(size, delays_inside))
         self._busy = self._over = False
+        if begun := roles[0].begun:
+            self._tapes.restart(begun.sample, roles[0].past)
+            self._program.begin([role.stage for role in roles], begun.sample)
         for role in roles:
             role.join(self, self._inside)
         names = [role.node.get_name() for role in roles]

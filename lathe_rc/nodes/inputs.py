@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inputs of a stage: a queue of received blocks per topic, and a buffer for the samples that delayed inputs read."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
-from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
+from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays, past_of
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import LatheError
@@ -63,10 +64,21 @@ class Inputs:
         self._check_cut(places, "begin")
         return places[0]
 
-    def begin(self, first: int) -> None:
-        """Reset the buffers to begin at sample ``first``."""
-        for buffer in self.buffers.values():
-            buffer.restart(first)
+    def begin(self, first: int, past: Mapping[str, Signals] = MappingProxyType({})) -> None:
+        """Reset the buffers to begin at sample ``first``.
+
+        Args:
+            first: sample index.
+            past: the newest samples before it, by fully qualified topic and field.
+
+        Raises:
+            InputError: an input is read later than the past samples reach.
+        """
+        for topic, buffer in self.buffers.items():
+            buffer.restart(first, past.get(topic, {}))
+            for port in [port for other, port in self.ports if other == topic and port.delay and past]:
+                for name in port.fields:
+                    past_of(past.get(topic, {}), topic, name, port.delay, first)
 
     def ready(self, first: int, blocks: int, at_once: int, *, in_cell: bool) -> tuple[int, bool] | None:
         """Return the number of computable samples and whether the run ends there; None while an input is missing.

@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.snapshot import Snapshot
+from lathe_rc.bag.snapshot import GONE_ON, SNAPSHOTS_GONE_ON, Snapshot
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
@@ -84,7 +84,7 @@ class RecorderRole(Role):
         self._encoders = _Encoders()
         self._merger: Merger | None = None
         self._ended: set[str] = set()  # topics whose last block has arrived
-        self._blocks = self._samples = 0
+        self._first = self._blocks = self._samples = 0
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
 
@@ -197,6 +197,11 @@ class RecorderRole(Role):
         if len(self._queues) + len(self._sparse) == before:
             return
         self._explain()
+        if begun := self.node.begun():
+            if self._snapshots is not None:
+                raise InputError(f"{self.node.get_name()}.mode: {SNAPSHOTS_GONE_ON}")
+            self._first = self._samples = begun.sample
+            self._open.tell({GONE_ON: str(self._first)})
         dense = {topic: (queue.type, queue.source) for topic, queue in self._queues.items()}
         if self._snapshots is not None and dense:
             self._prepare(self._snapshots, dense)
@@ -210,6 +215,7 @@ class RecorderRole(Role):
                 run_id=self.table.run_id,
                 step_ns=self.table.step_ns,
                 samples=self.table.block_size,
+                first=self._first,
             )
         self.node.describe(subscribes=tuple(self.subscriptions()))
 
@@ -238,7 +244,8 @@ class RecorderRole(Role):
             )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
-        queue.expect(source, 0 if in_cell else None)
+        begun = self.node.begun()
+        queue.expect(source, (begun.sample if begun else 0) if in_cell else None)
         queue.repeats = in_cell and self.node.protocol.restarts(source)
         self.node.listen(topic, msgtype, partial(self._on_message, queue), partial(self._on_run, queue))
 
@@ -320,7 +327,7 @@ class RecorderRole(Role):
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
-        begin = self._merger.samples if self._merger else 0
+        begin = self._first + (self._merger.samples if self._merger else 0)
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
         if sample < begin and source in self._processes:
             return  # repeated by a process that resumes in place of the first
@@ -406,7 +413,8 @@ class RecorderRole(Role):
         """Write every block that is complete on all topics."""
         assert self._merger is not None
         self._merger.release()
-        self._log_ns, self._blocks, self._samples = self._merger.log_ns, self._merger.rows, self._merger.samples
+        self._log_ns, self._blocks = self._merger.log_ns, self._merger.rows
+        self._samples = self._first + self._merger.samples
         if self._merger.complete:
             self._complete()
         else:

@@ -48,6 +48,9 @@ class SpindleRole(StageRole):
         super().__init__(node)
         table = self.table = cast("TimeMasterParameters", node.table)
         self._check_pace(table)
+        if table.start_from and not table.members:
+            raise InputError(f"{node.get_name()}.start_from of a spindle that runs alone; allowed: with members")
+        self.go_on()
         block = table.block_size * table.step
         self.pace = Pace(_per_block(table), table.window, round(_JUDGED / block))
         self._reported: deque[Progress] = deque()  # of members in this process
@@ -99,7 +102,7 @@ class SpindleRole(StageRole):
             safe_samples=max(1, round(table.safe_time * table.sample_rate)),
             block_size=table.block_size,
         )
-        protocol = TimeMasterProtocol(own, table.window, reactions, masters=MASTERS)
+        protocol = TimeMasterProtocol(own, table.window, reactions, masters=MASTERS, first=self.samples)
         protocol.know_end(self.stage.samples)
         if table.simulation_services == "paused":
             protocol.held_at = 0
@@ -184,7 +187,7 @@ class SpindleRole(StageRole):
         self.pace.schedule = time.monotonic()
         self.node.exchange.form(self, self._cell)
         if self.chain is None and self.inputs.ports:
-            self.start(0)
+            self.start(self.samples)
 
     def become_safe(self, first: int) -> None:
         """Keep the spindle turning in the safe state; the newest samples of lost members are held (see `StageRole`)."""

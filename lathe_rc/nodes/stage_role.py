@@ -10,6 +10,7 @@ from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import messages
 from lathe_rc.cell import events
+from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.parameters import Value, explain_overflow
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
 from lathe_rc.cell.stages import MASTERS, STAGES
@@ -38,7 +39,8 @@ class StageRole(Role):
     Attributes:
         node: see the arguments.
         stage: stage that the role computes.
-        blocks, samples: number computed so far.
+        begun: checkpoint from which the stage goes on; None: it has not begun, or begins at sample 0.
+        blocks, samples: number computed so far, samples including those before the checkpoint.
         together: largest number of blocks computed in one step.
         started: the first sample is known.
         chain: chain of the stage; None if it computes alone.
@@ -49,13 +51,10 @@ class StageRole(Role):
 
     def __init__(self, node: CellNode) -> None:
         self.node = node
-        if getattr(node.table, "start_from", ""):
-            raise InputError(
-                f"{node.get_name()}.start_from of a node; allowed: an offline run, which has the same bits"
-            )
         with explain_overflow({node.get_name(): node.table}):
             self.stage = STAGES[node.kind](node.get_name(), node.table)
         compile_kernels(self.stage)  # so that the first block takes no longer than the next
+        self.begun: Checkpoint | None = None
         self.blocks = self.samples = 0
         self.started, self.angle = False, 0.0
         self.chain: Chain | None = None
@@ -82,8 +81,7 @@ class StageRole(Role):
 
     def relative_topics(self) -> list[str]:
         """Return the stage's signal topics before remapping (implements `Role`)."""
-        inputs, outputs = ([port.topic for port in self.stage.inputs], [port.topic for port in self.stage.outputs])
-        return [*inputs, *outputs, *self.stage.sparse_topics]
+        return self.stage.topics
 
     def activate(self) -> None:
         """Create publishers, subscriptions and the service that schedules events (implements `Role`)."""
@@ -114,21 +112,44 @@ class StageRole(Role):
             return
         if self.started:
             raise LatheError(f"{queue.topic}: {queue.source} was heard before the cell of {source}; start anew")
-        queue.expect(source)
+        begun = self.node.begun()
+        queue.expect(source, begun.sample if begun else 0)
         queue.repeats = self.node.protocol.restarts(source)
 
     def begin(self, *, joins: bool) -> None:
         """Prepare for block 0, or resume from a kept state in a running cell (implements `Role`).
 
         Raises:
-            LatheError: the cell is running, and the node has no kept state to resume from.
+            LatheError: the cell is running, and the node has no kept state to resume from; or the checkpoint is not one
+                of this node.
         """
+        if not joins:
+            self.go_on()
         if self.restart is not None:
             self.restart.begin(joins=joins)
         elif joins:
             raise LatheError(
                 f"{self.node.full_name}: the cell is running already, and this node cannot go on in mid-run"
             )
+
+    def go_on(self) -> None:
+        """Take the state of the stage from the checkpoint, if the run goes on from one.
+
+        Raises:
+            InputError: the checkpoint is not one of this node.
+        """
+        if self.begun is None and (begun := self.node.begun()) is not None:
+            table = self.node.table.model_copy(update={"stage": self.node.kind})
+            self.begun, self.samples = begun, begun.sample
+            with explain_overflow({self.node.get_name(): table}):
+                self.stage = begun.stage(self.node.get_name(), table)
+            compile_kernels(self.stage)
+
+    @property
+    def past(self) -> dict[str, Signals]:
+        """Return the samples before the checkpoint that delayed inputs need, by fully qualified topic and field."""
+        past = self.begun.past if self.begun else {}
+        return {f"{self.node.namespace}{topic}": signals for topic, signals in past.items()}
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
         """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
@@ -282,7 +303,7 @@ class StageRole(Role):
     def ready(self) -> tuple[int, bool] | None:
         """Return the number of computable samples and whether the run ends there; None while an input is missing."""
         if not self.started:
-            # Alone, a node may join a stream that is under way; in a cell it begins at 0.
+            # Alone, a node may join a stream that is under way; in a cell it begins at block 0.
             first = self.inputs.first() if self.inputs.forward else None
             if first is None:
                 return None
@@ -297,7 +318,7 @@ class StageRole(Role):
     def start(self, first: int) -> None:
         """Begin the computation at sample ``first``."""
         self.started, self.samples = True, first
-        self.inputs.begin(first)
+        self.inputs.begin(first, self.past)
 
     def compute(self, samples: int, *, last: bool) -> None:
         """Compute and publish some blocks in one step; the last block of the run may be shorter."""
@@ -343,10 +364,10 @@ class StageRole(Role):
         return master.name if master is not None else ""
 
     def join(self, chain: "Chain", inside: Collection[str]) -> None:
-        """Join a chain at sample 0; the stages of the chain publish the topics ``inside``."""
+        """Join a chain before block 0; the stages of the chain publish the topics ``inside``."""
         self.chain = chain
         self.inputs.join_chain(inside)
-        self.start(0)
+        self.start(self.samples)
 
     def lead(self) -> None:
         """As the first stage of a chain, let the chain compute as far as its inputs allow."""

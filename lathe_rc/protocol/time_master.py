@@ -32,9 +32,10 @@ class TimeMasterProtocol(MemberProtocol):
     Args:
         own, window, masters: see `MemberProtocol`.
         reactions: reactions to silence and death of members.
+        first: index of the first sample of the run.
 
     Attributes:
-        blocks, samples: number released so far.
+        blocks, samples: number released so far, samples including those before the run.
         end: end of the run [sample]; None: endless, or not known yet.
         blocks_in_run: length of the run in blocks; None: endless, or not known yet.
         running: True from block 0 to the end of the run.
@@ -44,10 +45,19 @@ class TimeMasterProtocol(MemberProtocol):
         latency: histogram of the time from the release of a block to its completion by every member.
     """
 
-    def __init__(self, own: Announcement, window: int, reactions: Reactions, *, masters: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        own: Announcement,
+        window: int,
+        reactions: Reactions,
+        *,
+        masters: Collection[str] = (),
+        first: int = 0,
+    ) -> None:
         super().__init__(own, window, masters=masters)
         self._reactions = reactions
-        self.blocks = self.samples = 0
+        self._first = self.samples = first
+        self.blocks = 0
         self.end: int | None = None
         self.blocks_in_run: int | None = None
         self.running = False
@@ -102,7 +112,7 @@ class TimeMasterProtocol(MemberProtocol):
 
     def _set_end(self, samples: int) -> None:
         self.end = samples
-        self.blocks_in_run = -(-samples // self._reactions.block_size)
+        self.blocks_in_run = -(-(samples - self._first) // self._reactions.block_size)
 
     # ---- start --------------------------------------------------------------------------------------
 
@@ -111,7 +121,7 @@ class TimeMasterProtocol(MemberProtocol):
         first = not self._started
         super().activate(now)
         if first:
-            self._say(Phase.WAITING, 0)
+            self._say(Phase.WAITING, self._first)
 
     def members_changed(self, now: float) -> None:
         """Request the check of the cell when every member is ready; update which members confirmed the safe state."""
@@ -133,7 +143,7 @@ class TimeMasterProtocol(MemberProtocol):
         """Begin the run, after the cell has passed its check."""
         self.running, self._checking = True, False
         self._log("info", f"run {self.own.run_id or '(no id)'} begins with {len(self.completed)} members")
-        self._say(Phase.RUNNING, 0)
+        self._say(Phase.RUNNING, self._first)
         self._report("block0")
         self._heard = self._looked = now
         self._members_moved = dict.fromkeys(self.completed, now)
@@ -200,7 +210,7 @@ class TimeMasterProtocol(MemberProtocol):
         if least > before:
             for _ in range(least - before):
                 self.latency.add(now - self._released.popleft())
-            samples = min(least * self._reactions.block_size, self.samples)
+            samples = min(self._first + least * self._reactions.block_size, self.samples)
             self.actions.append(do.TellTime(samples))
             if now >= self._report_due:
                 self._report_due = now + _REPORT_PERIOD

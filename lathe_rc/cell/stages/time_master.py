@@ -35,9 +35,7 @@ class TimeMasterParameters(NodeParameters):
         64, "the measured speed is the angle's difference over so many samples; not used by an ideal encoder", "sample"
     )
     revolutions: NonNegative = parameter(0.0, "length of the run; 0: until stopped", "rev")
-    start_from: str = parameter(
-        "", "checkpoint from which an offline run goes on; empty: it starts at sample 0", path=True
-    )
+    start_from: str = parameter("", "checkpoint from which the run goes on; empty: it starts at sample 0", path=True)
     speed_factor: NonNegative = parameter(
         1.0, "pace of the run against real time; 0: as fast as the members follow", "1"
     )
