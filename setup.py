@@ -90,6 +90,7 @@ setup(
             "sweep/*.j2",
             "view/*.j2",
             "view/*.css",
+            "view/*.html",
             "view/*.js",
             "templates/*/*.j2",
         ]

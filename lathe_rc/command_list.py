@@ -22,6 +22,7 @@ COMMANDS = {
     "measure": "Measure the part turned in a recorded run.",
     "new": "Create a law, drive, stage or study of your own.",
     "node": "Run one node, or list its parameters.",
+    "panel": "Show a cell at work in the browser, and command it.",
     "policy": "Write the SROS2 policy of a scenario.",
     "record": "Record any topics into a new bag.",
     "reference": "Print the reference of nodes and topics.",

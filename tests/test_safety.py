@@ -481,6 +481,28 @@ def test_a_reset_gives_the_command_back_and_learning_goes_on():
     assert result.recording.of_type(messages.SAFETY)["state"][-1] == State.NOMINAL
 
 
+def test_an_operator_takes_the_tool_out_and_lets_it_approach_again():
+    result = harness.run(supervised("supervisor.events=['revolution 12: retract', 'revolution 15: reset']"))
+    told = [one[:2] for one in status(result) if one[0] != "error"]  # that of the tool's own way out
+    assert told == [("operator", State.RETRACTING), (RETRACTED, State.SAFE), (RESET, State.NOMINAL)]
+
+
+def test_a_retraction_needs_a_drive_and_a_node_that_obeys():
+    for others, message in (
+        (
+            [
+                "supervisor.drives=[]",
+                *(f"supervisor.{each}_limit=[]" for each in ("following", "stroke", "effort", "margin")),
+            ],
+            "no drives",
+        ),
+        (["learning_controller.reaction_delay=0"], "reads safety"),
+    ):
+        quiet = [f"supervisor.{each}_limit=0.0" for each in ("speed", "index", "error", "acceleration")]
+        with pytest.raises(InputError, match=message):
+            harness.run(supervised("supervisor.events=['revolution 12: retract']", *quiet, *others))
+
+
 def test_a_stop_is_not_reset():
     stop = "spindle_encoder.faults=['revolution 10 to 10.1: encoder.speed wrong scale=1.5']"
     result = harness.run(supervised(stop, "supervisor.events=['revolution 15: reset']"))

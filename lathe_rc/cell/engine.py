@@ -44,6 +44,7 @@ class Engine:
         stages: the stages of the cell.
         first: index of the first sample of the run.
         samples: index after its last sample.
+        piece: largest number of samples that the sinks receive at a time.
 
     Raises:
         InputError: the run is endless.
@@ -52,7 +53,7 @@ class Engine:
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         # Whole chunks, and thus whole blocks: no sink receives a partial block.
-        self._piece = MAX_BLOCK // self._chunk * self._chunk
+        self.piece = MAX_BLOCK // self._chunk * self._chunk
         self._heard = _heard(cell, heard)
         self._take(cell)
         for stage in self._stages:
@@ -68,7 +69,7 @@ class Engine:
         }
         self._kept = [{topic: kept[topic] for topic in each.outputs if kept[topic]} for each in wires]
         passing = [(topic, name) for topic, names in fields.items() for name in names if name not in kept[topic]]
-        self._tapes = Tapes(topics, self._piece, passing, self._chunk)
+        self._tapes = Tapes(topics, self.piece, passing, self._chunk)
         self._program = Program(wires, self._tapes, self._chunk)
         self._restart(cell)
 
@@ -136,24 +137,37 @@ class Engine:
         self, sinks: Sequence[Sink], stops: Mapping[int, Callable[[], object]] = MappingProxyType({})
     ) -> Iterator[int]:
         """Run chunk by chunk, yielding the sample index after each chunk; raise the same errors as `run`."""
-        for first in range(self.first, self.samples, self._piece):
-            self._tapes.advance(first)
-            broken, end = False, min(first + self._piece, self.samples)
-            try:
-                for stop in sorted({end, *(sample for sample in stops if first < sample < end)}):
-                    self._begun = self._program.reached
-                    broken = self._program.run(stop, finite=bool(sinks))
-                    if broken:
-                        break
-                    if stop in stops:
-                        stops[stop]()
-            finally:
-                # A chunk with a NaN or infinite sample is useless to sinks, unlike the samples before another error.
-                if not broken:
-                    self._hand_over(first, self._program.reached, sinks)
-            if broken:
-                self._break_off()
-            yield self._program.reached
+        while self.reached < self.samples:
+            self.advance(min(self.reached + self.piece, self.samples), sinks, stops)
+            yield self.reached
+
+    def advance(
+        self, end: int, sinks: Sequence[Sink], stops: Mapping[int, Callable[[], object]] = MappingProxyType({})
+    ) -> None:
+        """Compute the samples before ``end``, at most a `piece` after those reached; raise the same errors as `run`.
+
+        Args:
+            end: index after the last sample; if it is not the end of the run, the end of a block.
+            sinks: see `run`.
+            stops: see `run`.
+        """
+        first = self._program.reached
+        self._tapes.advance(first)
+        broken = False
+        try:
+            for stop in sorted({end, *(sample for sample in stops if first < sample < end)}):
+                self._begun = self._program.reached
+                broken = self._program.run(stop, finite=bool(sinks))
+                if broken:
+                    break
+                if stop in stops:
+                    stops[stop]()
+        finally:
+            # A chunk with a NaN or infinite sample is useless to sinks, unlike the samples before another error.
+            if not broken:
+                self._hand_over(first, self._program.reached, sinks)
+        if broken:
+            self._break_off()
 
     def _break_off(self) -> NoReturn:
         """Raise the error that a node would raise: it names the first NaN or infinite sample, in the newest chunk."""

@@ -267,6 +267,14 @@ class Stage(ABC):
         """Return whether the stage can receive events."""
         return bool(self.actions or self.tunable) or self.shared.allow_faults
 
+    @property
+    def fault_targets(self) -> dict[str, list[str]]:
+        """Return what may be faulty, by kind of fault; empty unless faults are allowed."""
+        if self._injection is None:
+            return {}
+        found = {name: sorted(self._injection.targets(kind)) for name, kind in faults.KINDS.items()}
+        return {name: targets for name, targets in found.items() if targets}
+
     def check_action(self, action: str) -> None:
         """Check that an event can be carried out.
 

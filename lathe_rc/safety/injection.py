@@ -97,7 +97,7 @@ class Injection:
     def _ports(self) -> list[Port]:
         return [*self._inputs, *self._outputs]
 
-    def _targets(self, kind: Kind) -> set[str]:
+    def targets(self, kind: Kind) -> set[str]:
         """Return the possible targets of a kind of fault at this stage."""
         if kind.what in self._devices:
             return {kind.what}
@@ -109,10 +109,10 @@ class Injection:
         Raises:
             InputError: the fault is not possible; the message names the allowed targets.
         """
-        allowed = self._targets(KINDS[fault.kind])
+        allowed = self.targets(KINDS[fault.kind])
         if fault.target in allowed:
             return
-        others = [name for name, kind in KINDS.items() if fault.target in self._targets(kind)]
+        others = [name for name, kind in KINDS.items() if fault.target in self.targets(kind)]
         raise InputError(
             f"{self._node}: fault {fault.text!r}: no such target for it; allowed for {fault.kind}: "
             f"{', '.join(sorted(allowed)) or 'none of this node'}"
@@ -125,7 +125,7 @@ class Injection:
         Raises:
             InputError: no fault is possible for the target; the message names the allowed targets.
         """
-        allowed = {each for kind in KINDS.values() for each in self._targets(kind)}
+        allowed = {each for kind in KINDS.values() for each in self.targets(kind)}
         if target not in allowed:
             raise InputError(
                 f"{self._node}: repair {target!r}: there is no such target; allowed: {', '.join(sorted(allowed))}"

@@ -117,6 +117,7 @@ class SupervisorParameters(NodeParameters):
 
 
 MEMBERS_LOST = "members_lost"  #: name in place of a monitor's: the host reports that members of the cell are lost
+RETRACT, OPERATOR = "retract", "operator"  #: event that takes the tool out, and the name in place of a monitor's for it
 RESET_REFUSED = "reset refused"  #: likewise: a reset is refused during a retraction or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 _STATE, _REACTION, _TOLD = range(3)  # indices into the state of the step function
@@ -173,7 +174,7 @@ class Supervisor(Stage):
 
     kind = "supervisor"
     Parameters = SupervisorParameters
-    actions = (RESET,)
+    actions = (RESET, RETRACT)
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SupervisorParameters) -> None:
@@ -326,8 +327,18 @@ class Supervisor(Stage):
 
     # ---- samples ------------------------------------------------------------------------------------
 
+    def check_action(self, action: str) -> None:
+        """Check that an event is known, and that there is a tool to retract."""
+        super().check_action(action)
+        if action == RETRACT and not self.parameters.drives:
+            raise InputError(f"{self.name}: event {action!r}, and no drives; allowed: drives that take the tool out")
+
     def perform(self, action: str) -> None:
-        """Reset the state of the cell; a persistent fault raises its alarm again."""
+        """Reset the state of the cell, where a persistent fault raises its alarm again, or retract the tool."""
+        if action == RETRACT:
+            self._ask_for(Reaction.RETRACT)
+            self._told.append(OPERATOR)
+            return
         if self.reaction is Reaction.NONE:
             return  # no alarm since the start or the last reset
         to = state_machine.after(self.state, action)
@@ -440,14 +451,18 @@ class Supervisor(Stage):
 
     def _check_obedience(self, cell: WiredCell) -> None:
         """Check that a node that moves the first drive obeys the supervisor."""
-        asks = next((monitor for monitor in self.monitors if monitor.reaction >= Reaction.RETRACT), None)
+        asking = [
+            f"monitor {each.name} asks for {each.reaction.name.lower()}"
+            for each in self.monitors
+            if each.reaction >= Reaction.RETRACT
+        ]
+        asking += [f"an event asks for {RETRACT}"] * self._scheduled_actions(RETRACT)
         drive, safety = self.parameters.drives[0], remapped(self.shared, "safety")
         movers = [cell.node_of(remapped(self.shared, f"{drive}/{what}")) for what in ("command", "state")]
         nodes = [node for node in movers if node]
-        if asks and nodes and not cell.reader_names(safety) & set(nodes):
-            asked = f"monitor {asks.name} asks for {asks.reaction.name.lower()}"
+        if asking and nodes and not cell.reader_names(safety) & set(nodes):
             raise InputError(
-                f"{self.name}: {asked}, but no node that moves {drive} reads safety; "
+                f"{self.name}: {asking[0]}, but no node that moves {drive} reads safety; "
                 f"allowed: {nodes[0]}.reaction_delay of a block or more, or a weaker reaction"
             )
 

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command ``lathe panel``: a page in the browser that shows a cell at work and commands it."""
+
+from pathlib import Path
+
+import click
+
+from lathe_rc import allowed_code
+from lathe_rc.commands import options
+
+
+@click.command()
+@options.scenario
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="of the page; default: a free one")
+@click.option("--no-browser", is_flag=True, help="only print the address of the page")
+@click.option("--pace", type=click.FloatRange(0, 1000), default=1.0, show_default=True, help="0: as fast as possible")
+@click.option("--revolutions", type=options.POSITIVE, help="length of the run")
+@options.start_from
+@options.overrides
+@options.allow_code
+def panel(
+    scenario: str,
+    port: int,
+    pace: float,
+    revolutions: float | None,
+    start_from: Path | None,
+    overrides: tuple[str, ...],
+    *,
+    no_browser: bool,
+) -> None:
+    """Show a SCENARIO at work on one page in the browser, which also commands it, without ROS or network.
+
+    Ctrl-C ends it.
+    """
+    from lathe_rc.commands import scenario as scenarios
+    from lathe_rc.view import page_server
+    from lathe_rc.view import panel as panels
+    from lathe_rc.view.panel_run import Driver, LiveCell
+
+    allowed_code.allow_own_code()
+    loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
+    cell = LiveCell(loaded, compiling=lambda names: click.echo(f"compiling {', '.join(names)}", err=True))
+    with Driver(cell, pace) as driver:
+        page_server.serve(panels.site(driver, cell), port, click.echo, browser=not no_browser)

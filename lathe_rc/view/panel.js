@@ -1,0 +1,432 @@
+// SPDX-License-Identifier: Apache-2.0
+// The panel: takes snapshots of a run from the server and draws them; sends commands.
+const $ = id => document.getElementById(id);
+const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, history: 0, latest: 0 }; // see Have in panel_view.py
+const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], shape: null, ranges: {} };
+let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], live: true, name: "" }, version = -1;
+const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
+const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
+const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const escaped = text => String(text).replace(/[&<>"]/g, letter => `&#${letter.charCodeAt(0)};`);
+const digits = (value, count = 4) => Number.isFinite(value) ? String(Number(value.toPrecision(count))).replace("-", "−") : "–";
+const nice = value => { // the next 1, 2 or 5 times a power of ten
+  const decade = 10 ** Math.floor(Math.log10(value));
+  return [1, 2, 5, 10].map(step => step * decade).find(step => step >= value * 0.9999);
+};
+const seen = (name, value, least) => { // the largest magnitude so far, for scales that do not jump
+  return SHOWN.ranges[name] = Math.max(SHOWN.ranges[name] || least, Math.abs(value) || 0);
+};
+
+// ---- snapshots -----------------------------------------------------------------------------------------------------
+
+function merge(told) {
+  if (told.run != HAVE.run) {
+    Object.assign(SHOWN, { rows: [], history: [], latest: [], log: [], shape: null, ranges: {} });
+    HAVE.epoch = told.epoch;
+  }
+  for (; HAVE.epoch < told.epoch; HAVE.epoch++) SHOWN.rows = SHOWN.rows.filter((_, k) => k % 2 == 0);
+  SHOWN.now = told.now;
+  SHOWN.rows.push(...told.rows);
+  SHOWN.history.push(...told.history);
+  SHOWN.latest = [...SHOWN.latest, ...told.latest].slice(-WATERFALL);
+  SHOWN.log.push(...told.log);
+  SHOWN.shape = told.shape || SHOWN.shape;
+  const changed = told.run != HAVE.run || told.rows.length || told.history.length || told.latest.length;
+  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: SHOWN.log.length, history: SHOWN.history.length });
+  HAVE.latest = SHOWN.latest.length ? SHOWN.latest[SHOWN.latest.length - 1].revolution : 0;
+  return changed;
+}
+
+async function follow() {
+  for (;;) {
+    if (document.hidden) await new Promise(done => document.addEventListener("visibilitychange", done, { once: true }));
+    try {
+      const told = await ask("frame", HAVE);
+      if (told.now.version !== version) {
+        ABOUT = await ask("about");
+        version = told.now.version;
+        describe();
+      }
+      const changed = merge(told);
+      // The next snapshot is asked for once this one is drawn: a slow browser asks less often.
+      await new Promise(done => requestAnimationFrame(() => { draw(changed); done(); }));
+      trouble("");
+      if (told.more) HAVE.number = 0;
+    } catch (error) {
+      trouble(error instanceof TypeError ? "no answer: has lathe panel ended?" : error.message);
+      await new Promise(done => setTimeout(done, 1000));
+    }
+  }
+}
+
+function trouble(text) {
+  if (!text && SHOWN.now.error) text = SHOWN.now.error;
+  $("trouble").textContent = text;
+  $("trouble").hidden = !text;
+}
+
+function draw(changed) {
+  const now = SHOWN.now, revolution = (now.angle || 0) / (2 * Math.PI);
+  $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0} of ${now.samples}`
+    + (now.factor ? `, ${digits(now.factor, 2)} × real time` : "") + (now.bag ? `, recording ${now.bag}` : "");
+  $("go").textContent = now.state == "running" ? "pause" : "start";
+  $("go").disabled = $("step").disabled = ["ended", "failed"].includes(now.state) && ABOUT.live;
+  if (document.activeElement != $("pace")) $("pace").value = String(now.pace);
+  if ($("seek").max != now.samples) $("seek").max = now.samples;
+  if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
+  $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
+  $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events yet");
+  drawSafety(now.safety);
+  drawMachine(now);
+  drawDials(now);
+  if (changed) { drawMap(); drawWaterfall(); drawHistory(); }
+  drawLog();
+}
+
+function drawSafety(safety) {
+  $("lamp").style.background = safety ? COLOURS[safety.state] || "none" : "none";
+  $("safety").textContent = safety ? safety.state : "no supervisor";
+  $("alarm").textContent = safety ? safety.alarm : "";
+}
+
+let logged = 0, loggedRun = 0;
+function drawLog() {
+  if (loggedRun != HAVE.run) { $("log").replaceChildren(); logged = 0; loggedRun = HAVE.run; }
+  for (const line of SHOWN.log.slice(Math.max(logged, SHOWN.log.length - MOST_LOG))) {
+    const item = document.createElement("li"), time = document.createElement("time");
+    time.textContent = `${(line.sample * (ABOUT.step || 0)).toFixed(3)} s`;
+    item.append(time, `${line.source}: ${line.text}`);
+    $("log").prepend(item);
+  }
+  logged = SHOWN.log.length;
+  while ($("log").children.length > MOST_LOG) $("log").lastChild.remove();
+}
+
+// ---- the machine ---------------------------------------------------------------------------------------------------
+
+function drawMachine(now) {
+  const ink = style("--ink"), soft = style("--soft"), line = style("--line"), field = style("--field"), bad = style("--bad"), good = style("--good");
+  const [cx, cy, radius] = [170, 165, 50 * MM], scale = (now.exaggeration || 1) * 1e-3 * MM; // [px/µm]
+  const limited = um => Math.max(-40, Math.min(40, um * scale));
+  const at = (r, angle) => `${(cx + r * Math.cos(angle)).toFixed(1)},${(cy - r * Math.sin(angle)).toFixed(1)}`;
+  const turn = now.angle || 0, parts = [];
+  const size = 13 * Math.max(1, 560 / $("machine").clientWidth); // readable on a telephone as well
+  const text = (x, y, words, more = "") => parts.push(`<text x="${x}" y="${y}" fill="${ink}" font-size="${size}" font-family="system-ui, sans-serif" stroke="${style("--paper")}" stroke-width="3" paint-order="stroke" ${more}>${escaped(words)}</text>`);
+  parts.push(`<circle cx="${cx}" cy="${cy}" r="${radius + 42}" fill="${field}" stroke="${line}"/>`);
+  for (let jaw = 0; jaw < 3; jaw++) {
+    const angle = jaw * 2 * Math.PI / 3 - turn;
+    parts.push(`<polygon points="${at(radius - 4, angle - 0.12)} ${at(radius + 38, angle - 0.09)} ${at(radius + 38, angle + 0.09)} ${at(radius - 4, angle + 0.12)}" fill="${soft}" opacity="0.45"/>`);
+  }
+  const shape = SHOWN.shape || new Array(90).fill(0), points = [];
+  shape.forEach((um, k) => {
+    const angle = 2 * Math.PI * (k + 0.5) / shape.length;
+    const open = ABOUT.gaps.some(([start, width]) => (angle - start + 20 * Math.PI) % (2 * Math.PI) < width);
+    points.push(at(radius + limited(um) - (open ? 12 : 0), angle - turn));
+  });
+  parts.push(`<polygon points="${points.join(" ")}" fill="${style("--paper")}" stroke="${good}" stroke-width="2"/>`);
+  parts.push(`<line x1="${cx}" y1="${cy}" x2="${at(radius * 0.8, -turn).replace(",", '" y2="')}" stroke="${soft}" stroke-dasharray="5 4"/>`);
+  parts.push(`<circle cx="${cx}" cy="${cy}" r="3" fill="${soft}"/>`);
+  // The tip is where the part is cut. The coarse drive spans from the others to the slide; each of these has its own scale.
+  const tip = cx + radius + limited((now.reference || 0) - (now.error || 0));
+  parts.push(`<polygon points="${tip},${cy} ${tip + 22},${cy - 9} ${tip + 22},${cy + 9}" fill="${style("--warn")}"/>`);
+  let left = tip + 22;
+  const drives = Object.entries(now.drives || {}).reverse();
+  const base = cx + radius + 30 + 74 * drives.length;
+  drives.forEach(([name, um], k) => {
+    const coarse = k == drives.length - 1, shown = coarse ? scale : 12 / nice(seen(name, um, 0.01)); // [px/µm]
+    const width = coarse ? base - left : 70 - um * shown;
+    parts.push(`<rect x="${left}" y="${cy - 20}" width="${width}" height="40" rx="3" fill="${field}" stroke="${ink}"/>`);
+    text(left + width / 2, cy + 5, name, 'text-anchor="middle"');
+    text(left + width / 2, cy + 40 + 20 * (k % 2), `${digits(um)} µm, ×${digits(shown / MM * 1e3, 1)}`, 'text-anchor="middle"');
+    left += width;
+  });
+  parts.push(`<rect x="${left}" y="${cy - 34}" width="${Math.max(40, 560 - left)}" height="68" fill="${line}" stroke="${soft}"/>`);
+  if (now.measured_force !== undefined) {
+    const force = now.measured_force, length = 70 * force / nice(seen("force", force, Math.max(ABOUT.force, 1)));
+    parts.push(`<line x1="${tip}" y1="${cy}" x2="${tip}" y2="${cy + length}" stroke="${bad}" stroke-width="3"/>`);
+    parts.push(`<polygon points="${tip},${cy + length + 8} ${tip - 5},${cy + length} ${tip + 5},${cy + length}" fill="${bad}"/>`);
+    text(tip + 9, cy + length + 12, `${digits(force, 3)} N`);
+  }
+  const bar = nice(40 / scale / 2);
+  parts.push(`<path d="M16 334 v8 h${(bar * scale).toFixed(1)} v-8" fill="none" stroke="${ink}"/>`);
+  text(24 + bar * scale, 342, `${digits(bar)} µm of radius (×${digits(now.exaggeration || 1)})`);
+  const slides = Object.entries(now.slides || {});
+  slides.forEach(([name, mm], k) => {
+    const x = 340, y = 280 + 66 * k, half = nice(seen(name, mm, 0.001)), place = x + 130 + 120 * mm / half;
+    parts.push(`<line x1="${x + 10}" y1="${y}" x2="${x + 250}" y2="${y}" stroke="${soft}"/><rect x="${place - 9}" y="${y - 8}" width="18" height="16" rx="2" fill="${good}"/>`);
+    text(x + 10, y - 12, `${name} slide ${digits(mm)} mm`);
+    text(x + 250, y + 8 + size, `±${digits(half)} mm`, 'text-anchor="end"');
+  });
+  if (!slides.length && ABOUT.fed) text(340, 300, `height along the part ${digits(now.height || 0)} mm`);
+  $("machine-note").textContent = ABOUT.gaps.length ? `with ${ABOUT.gaps.length} keyways` : "";
+  $("machine").innerHTML = parts.join("");
+}
+
+function drawDials(now) {
+  const dials = [["speed", "1/min", now.rpm, nice((ABOUT.rpm || now.rpm || 1) * 1.25), ABOUT.rpm]];
+  if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force) * 1.2), ABOUT.force]);
+  dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), 0]);
+  const ink = style("--ink"), soft = style("--soft"), line = style("--line"), good = style("--good"), bad = style("--bad");
+  $("dials").innerHTML = dials.map(([name, unit, value, most, wanted], k) => {
+    const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
+    const at = (r, share) => `${(cx + r * Math.cos(angle(share))).toFixed(1)} ${(cy - r * Math.sin(angle(share))).toFixed(1)}`;
+    const mark = wanted ? `<path d="M${at(50, wanted / most)} L${at(66, wanted / most)}" stroke="${ink}" stroke-width="2"/>` : "";
+    const known = Number.isFinite(value);
+    const needle = known ? `<path d="M${cx} ${cy} L${at(56, value / most)}" stroke="${value < 0 ? bad : good}" stroke-width="4" stroke-linecap="round"/>` : "";
+    const words = (y, told, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(told)}</text>`;
+    return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark}${needle}`
+      + words(118, known ? `${digits(value)} ${unit}` : "unknown", 15, ink) + words(136, name, 12, soft)
+      + `<text x="${cx + 56}" y="${cy + 40}" font-size="10" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
+  }).join("");
+}
+
+// ---- canvases ------------------------------------------------------------------------------------------------------
+
+function canvas(id) { // in pixels of the page, sharp on every screen
+  const place = $(id), ratio = devicePixelRatio || 1, width = place.clientWidth, height = Number(place.getAttribute("data-height") || place.height);
+  place.setAttribute("data-height", height);
+  Object.assign(place, { width: width * ratio, height: height * ratio });
+  place.style.height = `${height}px`;
+  const pen = place.getContext("2d");
+  pen.scale(ratio, ratio);
+  pen.fillStyle = style("--paper");
+  pen.fillRect(0, 0, width, height);
+  pen.font = "11px system-ui, sans-serif";
+  return { pen, width, height, ink: style("--ink"), soft: style("--soft"), line: style("--line"), good: style("--good"), bad: style("--bad") };
+}
+function label(pen, words, x, y, colour, align = "left") {
+  Object.assign(pen, { fillStyle: colour, textAlign: align });
+  pen.fillText(words, x, y);
+}
+function diverging() { // the signed colours of all figures (page.css), as a function of -1 to 1
+  const stops = style("--below-zero-above").split(" ").map(code => [1, 3, 5].map(k => parseInt(code.slice(k, k + 2), 16)));
+  return share => {
+    const place = (Math.max(-1, Math.min(1, share)) + 1) / 2 * (stops.length - 1), k = Math.min(Math.floor(place), stops.length - 2);
+    return stops[k].map((from, channel) => Math.round(from + (stops[k + 1][channel] - from) * (place - k)));
+  };
+}
+function angles(pen, left, right, y, colour) {
+  for (let degrees = 0; degrees <= 360; degrees += 90) label(pen, `${degrees}°`, left + (right - left) * degrees / 360, y, colour, "center");
+}
+
+function drawMap() {
+  const { pen, width, height, ink, soft } = canvas("map"), [left, top, right, bottom] = [58, 8, width - 14, height - 46];
+  const rows = SHOWN.rows, columns = 180;
+  angles(pen, left, right, bottom + 14, soft);
+  if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
+  // As in the report (colour_range): linear up to the quietest quarter of the rows, logarithmic beyond.
+  const largest = rows.map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
+  const end = Math.max(largest[largest.length - 1], 1e-6), bend = Math.min(Math.max(largest[(largest.length - 1) >> 2], end * 1e-4), end) / 8;
+  const share = um => Math.sign(um) * Math.log1p(Math.abs(um) / bend) / Math.log1p(end / bend), colour = diverging();
+  const image = new ImageData(columns, rows.length);
+  rows.forEach((row, k) => row.cells.forEach((um, column) => {
+    image.data.set([...colour(share(um)), 255], 4 * (k * columns + column));
+  }));
+  const small = new OffscreenCanvas(columns, rows.length);
+  small.getContext("2d").putImageData(image, 0, 0);
+  pen.imageSmoothingEnabled = false;
+  pen.drawImage(small, left, top, right - left, bottom - top);
+  const wide = (right - left) / columns, tall = (bottom - top) / rows.length;
+  if (ABOUT.tolerance) {
+    const beyond = (k, column) => k >= 0 && k < rows.length && Math.abs(rows[k].cells[(column + columns) % columns]) > ABOUT.tolerance;
+    pen.strokeStyle = ink;
+    pen.beginPath();
+    for (let k = 0; k <= rows.length; k++) for (let column = 0; column < columns; column++) {
+      if (beyond(k, column) != beyond(k - 1, column)) { pen.moveTo(left + column * wide, top + k * tall); pen.lineTo(left + (column + 1) * wide, top + k * tall); }
+      if (beyond(k, column) != beyond(k, column - 1)) { pen.moveTo(left + column * wide, top + k * tall); pen.lineTo(left + column * wide, top + (k + 1) * tall); }
+    }
+    pen.stroke();
+  }
+  const told = row => ABOUT.fed ? `${digits(row.height, 3)} mm` : String(row.revolution);
+  for (const k of new Set([0, rows.length >> 1, rows.length - 1])) label(pen, told(rows[k]), left - 5, Math.min(top + (k + 0.7) * tall, bottom), soft, "right");
+  label(pen, ABOUT.fed ? "height" : "revolution", 2, bottom + 14, soft);
+  for (let x = 0; x < 160; x++) { pen.fillStyle = `rgb(${colour(x / 80 - 1)})`; pen.fillRect(left + x, bottom + 22, 1, 8); }
+  const ticks = [[0, -end], [80, 0], [160, end]];
+  for (const [x, um] of ticks) label(pen, digits(um, 3), left + x, bottom + 42, soft, "center");
+  label(pen, ABOUT.tolerance ? `tolerance ±${digits(ABOUT.tolerance)} µm` : "no tolerance given", left + 185, bottom + 32, soft);
+}
+
+function drawWaterfall() {
+  const { pen, width, height, ink, soft, line, good, bad } = canvas("waterfall"), [left, top, right, bottom] = [40, 16, width - 70, height - 24];
+  const rows = SHOWN.latest, tall = (bottom - top) / WATERFALL, tolerance = ABOUT.tolerance;
+  angles(pen, left, right, height - 6, soft);
+  if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
+  const newest = rows.slice(-3).map(row => Math.max(...row.cells.map(Math.abs))), most = nice(Math.max(...newest, tolerance, 1e-6)), scale = 0.5 * tall / most;
+  rows.forEach((row, k) => {
+    const y = top + (k + 0.5 + WATERFALL - rows.length) * tall, x = column => left + (right - left) * (column + 0.5) / row.cells.length;
+    if (tolerance) { pen.globalAlpha = 0.5; pen.fillStyle = line; pen.fillRect(left, y - tolerance * scale, right - left, 2 * tolerance * scale); pen.globalAlpha = 1; }
+    const place = um => y - Math.max(-tall, Math.min(tall, um * scale));
+    for (const [colour, wide, wanted] of [[good, 1.2, () => true], [bad, 2.2, um => tolerance && Math.abs(um) > tolerance]]) {
+      Object.assign(pen, { strokeStyle: colour, lineWidth: wide });
+      pen.beginPath();
+      row.cells.forEach((um, column) => { if (column && wanted(um)) { pen.moveTo(x(column - 1), place(row.cells[column - 1])); pen.lineTo(x(column), place(um)); } });
+      pen.stroke();
+    }
+    label(pen, String(row.revolution), left - 5, y + 4, soft, "right");
+  });
+  Object.assign(pen, { strokeStyle: ink, lineWidth: 1 });
+  pen.strokeRect(right + 8, bottom - tall, 0, most * scale * 2);
+  label(pen, `${digits(2 * most)} µm`, right + 14, bottom - tall + most * scale + 4, ink);
+}
+
+function drawHistory() {
+  const { pen, width, height, ink, soft, line, good, bad } = canvas("history"), [left, top, right, bottom] = [46, 8, width - 60, height - 24];
+  const found = SHOWN.history;
+  if (!found.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
+  const values = found.flatMap(([, rms, largest]) => [rms, largest]).filter(value => value > 0);
+  if (ABOUT.tolerance) values.push(ABOUT.tolerance);
+  const low = Math.floor(Math.log10(Math.min(...values)) - 0.05), high = Math.max(Math.ceil(Math.log10(Math.max(...values)) + 0.05), low + 1);
+  const y = um => bottom - (Math.log10(Math.max(um, 10 ** low)) - low) / (high - low) * (bottom - top);
+  const first = found[0][0], last = found[found.length - 1][0], x = n => left + (right - left) * (last > first ? (n - first) / (last - first) : 0.5);
+  Object.assign(pen, { lineWidth: 1, strokeStyle: line });
+  for (let decade = low; decade <= high; decade++) {
+    pen.beginPath(); pen.moveTo(left, y(10 ** decade)); pen.lineTo(right, y(10 ** decade)); pen.stroke();
+    label(pen, digits(10 ** decade), left - 5, y(10 ** decade) + 4, soft, "right");
+  }
+  if (ABOUT.tolerance) {
+    Object.assign(pen, { strokeStyle: bad });
+    pen.setLineDash([6, 4]);
+    pen.beginPath(); pen.moveTo(left, y(ABOUT.tolerance)); pen.lineTo(right, y(ABOUT.tolerance)); pen.stroke();
+    pen.setLineDash([]);
+    label(pen, "tolerance", left + 6, y(ABOUT.tolerance) - 4, bad);
+  }
+  const every = Math.max(1, Math.floor(found.length / 2000)), ends = {};
+  for (const [name, which, colour] of [["largest", 2, soft], ["RMS", 1, good]]) {
+    Object.assign(pen, { strokeStyle: colour, lineWidth: 1.6 });
+    pen.beginPath();
+    for (let k = 0; k < found.length; k += every) pen[k ? "lineTo" : "moveTo"](x(found[k][0]), y(found[k][which]));
+    pen.stroke();
+    ends[name] = y(found[found.length - 1][which]);
+    label(pen, name, right + 5, ends[name] + 4 + (name == "RMS" && Math.abs(ends.RMS - ends.largest) < 11 ? 11 : 0), colour);
+  }
+  for (const n of new Set([first, Math.round((first + last) / 2), last])) label(pen, String(n), x(n), height - 6, soft, "center");
+}
+
+// ---- commands ------------------------------------------------------------------------------------------------------
+
+async function tell(name, question) {
+  try {
+    return await ask(name, question);
+  } catch (error) {
+    refuse(error.message);
+    return null;
+  }
+}
+let refused;
+function refuse(text) {
+  clearTimeout(refused);
+  const place = $("refusal") || $("bar").insertAdjacentElement("afterend", Object.assign(document.createElement("p"), { id: "refusal", className: "trouble" }));
+  place.setAttribute("role", "alert");
+  place.textContent = text;
+  refused = setTimeout(() => place.remove(), 15000);
+}
+
+function options(select, names) {
+  const before = select.value;
+  select.replaceChildren(...names.map(name => new Option(name)));
+  if (names.includes(before)) select.value = before;
+}
+
+function describe() { // fills the commands from what the cell tells of itself
+  document.title = `${ABOUT.name}: panel`;
+  $("name").textContent = ABOUT.name;
+  $("commands").hidden = !ABOUT.live;
+  $("seeking").hidden = ABOUT.live;
+  if (!ABOUT.live) return;
+  $("actions").replaceChildren(...ABOUT.nodes.filter(node => node.actions.length || node.knobs.length).map(node => {
+    const row = document.createElement("div"), name = document.createElement("b");
+    row.className = "actions";
+    name.textContent = node.name;
+    row.append(name);
+    for (const action of node.actions) {
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: action });
+      button.addEventListener("click", () => tell("act", { node: node.name, action }));
+      row.append(button);
+    }
+    for (const knob of node.knobs) {
+      const label = document.createElement("label"), input = Object.assign(document.createElement("input"), { size: 8, value: knob.value, title: knob.doc });
+      input.addEventListener("change", async () => {
+        if (!await tell("act", { node: node.name, action: `set ${knob.name} ${input.value}` })) input.value = knob.value; else knob.value = input.value;
+      });
+      label.append(`${knob.name} `, input, ` ${knob.unit}`);
+      row.append(label);
+    }
+    return row;
+  }));
+  const form = $("fault").elements, breakable = ABOUT.nodes.filter(node => Object.keys(node.targets).length);
+  $("fault").hidden = !breakable.length;
+  $("fault-note").textContent = breakable.length ? "" : "Nothing may break in this cell: go on with allow_faults = true.";
+  options(form.node, breakable.map(node => node.name));
+  offerFaults();
+  $("parameters").replaceChildren(...ABOUT.parameters.map(name => new Option(name)));
+}
+
+function offerFaults() {
+  const form = $("fault").elements, node = ABOUT.nodes.find(each => each.name == form.node.value);
+  if (!node) return;
+  options(form.target, [...new Set(Object.values(node.targets).flat())].sort());
+  options(form.kind, Object.keys(node.targets).filter(kind => node.targets[kind].includes(form.target.value)));
+  const kind = ABOUT.faults[form.kind.value];
+  if (!kind || form.values.dataset.of == form.kind.value) return;
+  form.values.dataset.of = form.kind.value;
+  form.values.value = Object.entries(kind.values).map(([name, value]) => `${name}=${value ?? ""}`).join(" ");
+  $("fault-note").textContent = kind.doc;
+}
+for (const name of ["node", "target", "kind"]) $("fault").elements[name].addEventListener("change", offerFaults);
+$("fault").addEventListener("submit", event => {
+  event.preventDefault();
+  const { node, target, kind, values } = event.target.elements;
+  tell("act", { node: node.value, action: `fault ${target.value} ${kind.value} ${values.value}`.trim() });
+});
+$("repair").addEventListener("click", () => {
+  const { node, target } = $("fault").elements;
+  tell("act", { node: node.value, action: `repair ${target.value}` });
+});
+$("change").addEventListener("submit", event => {
+  event.preventDefault();
+  const { name, value } = event.target.elements;
+  tell("change", { values: name.value ? { [name.value.trim()]: value.value } : {}, here: event.submitter.value == "here" });
+});
+$("record").addEventListener("submit", event => {
+  event.preventDefault();
+  tell("record", { bag: SHOWN.now.bag ? "" : event.target.elements.bag.value });
+});
+$("go").addEventListener("click", () => tell(SHOWN.now.state == "running" ? "pause" : "start"));
+$("step").addEventListener("click", () => tell("step"));
+$("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pace").value) }); $("pace").blur(); });
+$("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
+for (const format of ["stl", "glb"]) $(format).addEventListener("click", () => tell("part", { format, enlarged: Number($("enlarged").value) }));
+$("picture").addEventListener("click", async () => {
+  const picture = await drawn();
+  picture.toBlob(blob => save(`${ABOUT.name}.png`, blob));
+});
+
+async function drawn() { // the drawings of the page beside each other, as one picture
+  const boxes = ["machine", "dials", "history", "map", "waterfall"].map(id => [$(id), $(id).getBoundingClientRect()]);
+  const left = Math.min(...boxes.map(([, box]) => box.left)), top = Math.min(...boxes.map(([, box]) => box.top));
+  const right = Math.max(...boxes.map(([, box]) => box.right)), bottom = Math.max(...boxes.map(([, box]) => box.bottom));
+  const picture = Object.assign(document.createElement("canvas"), { width: 2 * (right - left + 20), height: 2 * (bottom - top + 50) }), pen = picture.getContext("2d");
+  pen.scale(2, 2);
+  pen.fillStyle = style("--paper");
+  pen.fillRect(0, 0, picture.width, picture.height);
+  pen.font = "14px system-ui, sans-serif";
+  label(pen, `${ABOUT.name}: ${$("state").textContent}; ${$("safety").textContent} ${$("alarm").textContent}`, 10, 22, style("--ink"));
+  for (const [place, box] of boxes) {
+    let source = place;
+    if (place.tagName == "svg") {
+      const copy = place.cloneNode(true);
+      copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+      copy.setAttribute("width", box.width); copy.setAttribute("height", box.height);
+      source = new Image();
+      source.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
+      await source.decode();
+    }
+    pen.drawImage(source, box.left - left + 10, box.top - top + 40, box.width, box.height);
+  }
+  return picture;
+}
+
+const redraw = () => requestAnimationFrame(() => draw(true));
+addEventListener("resize", redraw);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+follow();

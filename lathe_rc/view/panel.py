@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Panel of a cell: a page that shows it at work and carries out commands."""
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from lathe_rc.cell import ros_yaml
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
+from lathe_rc.cell.stages.force_controller import ForceControllerParameters
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.errors import InputError
+from lathe_rc.safety import faults
+from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
+from lathe_rc.view.panel_run import Driver, LiveCell
+from lathe_rc.view.panel_view import Have, news
+
+_PATIENCE = 1.0  # [s] until a page without news gets an answer
+_FILES = ("save", "load")  # events that need a file, which the page does not name
+
+
+def page() -> Page:
+    """Return the page of the panel."""
+    return Page("panel", own_file("panel.html"), [own_file("panel.css")], [own_file("panel.js")])
+
+
+def site(driver: Driver, cell: LiveCell) -> Site:
+    """Return the panel of an offline cell."""
+    return Site({"": page()}, {**playing(driver, lambda: outlook(cell.scenario)), **_commands(driver, cell)})
+
+
+def playing(driver: Driver, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str, Answer]:
+    """Return the answers that every run has: news, start, pause, step, pace, and the part as a file.
+
+    Args:
+        driver: thread of the run.
+        outlooks: returns the `outlook` of its scenario.
+    """
+
+    def frame(question: Mapping[str, Any]) -> object:
+        have = Have.of(question)
+        return news(driver.run.view.wait(have.number, _PATIENCE), have)
+
+    def part(question: Mapping[str, Any]) -> object:
+        from lathe_rc.view import panel_part
+
+        ending, enlarged = _text(question, "format"), _number(question, "enlarged")
+        if not 0.0 < enlarged <= 1000.0:
+            raise InputError(f"enlarged = {enlarged:g}; allowed: above 0, up to 1000")
+        outlook = outlooks()
+        limit = outlook["tolerance"] * 2e-6 or 10e-6
+        mesh = panel_part.body(driver.run.view.revolutions, outlook["radius"] * 1e-3, enlarged, limit)
+        name = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in outlook["name"])
+        return Download(f"{name}.{ending}", panel_part.TYPES.get(ending, ""), panel_part.file(mesh, ending))
+
+    def done(command: Any) -> object:
+        driver.call(command)
+        return {}
+
+    return {
+        "frame": frame,
+        "start": lambda _: done(driver.start),
+        "pause": lambda _: done(driver.pause),
+        "step": lambda _: done(driver.step),
+        "pace": lambda question: done(lambda: driver.pace(_number(question, "factor"))),
+        "part": part,
+    }
+
+
+def _commands(driver: Driver, cell: LiveCell) -> dict[str, Answer]:
+    """Return the answers that change the cell."""
+
+    def act(question: Mapping[str, Any]) -> object:
+        node, action = _text(question, "node"), _text(question, "action")
+        return {"text": driver.call(lambda: cell.act(node, action))}
+
+    def change(question: Mapping[str, Any]) -> object:
+        given = question.get("values")
+        if not isinstance(given, dict):
+            raise InputError("values of parameters are missing; allowed: an object of texts")
+        values = {str(name): ros_yaml.parse_value(str(text), str(name)) for name, text in given.items()}
+
+        def carried_out() -> None:
+            cell.change(values, here=question.get("here") is True)
+            driver.again()
+
+        driver.call(carried_out)
+        return {}
+
+    def record(question: Mapping[str, Any]) -> object:
+        driver.call(lambda: cell.record(_text(question, "bag")))
+        return {}
+
+    return {
+        "about": lambda _: driver.call(lambda: about(cell)),
+        "act": act,
+        "change": change,
+        "record": record,
+    }
+
+
+def _text(question: Mapping[str, Any], name: str) -> str:
+    value = question.get(name)
+    if not isinstance(value, str):
+        raise InputError(f"{name} = {json.dumps(value):.80}; allowed: a text")
+    return value
+
+
+def _number(question: Mapping[str, Any], name: str) -> float:
+    value = question.get(name)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise InputError(f"{name} = {json.dumps(value):.80}; allowed: a number")
+    return float(value)
+
+
+def about(cell: LiveCell) -> dict[str, Any]:
+    """Return what does not change while a cell runs: its nodes, their events, knobs and faults, its parameters."""
+    scenario = cell.scenario
+    return {
+        **outlook(scenario),
+        "live": True,
+        "nodes": [_node(scenario, stage) for stage in cell.cell.stages.values()],
+        "faults": {
+            name: {"doc": kind.doc, "values": {key: value.default for key, value in kind.values.items()}}
+            for name, kind in faults.KINDS.items()
+        },
+        "parameters": [f"{node}.{name}" for node, table in scenario.nodes.items() for name in table.rows()],
+    }
+
+
+def outlook(scenario: Scenario) -> dict[str, Any]:
+    """Return the name, tolerance and shape of a scenario, for the drawings of the page; lengths in µm and mm."""
+    tables = list(scenario.nodes.values())
+    tool = next((table for table in tables if isinstance(table, ToolParameters)), None)
+    cut = next((table for table in tables if isinstance(table, CuttingProcessParameters)), None)
+    force = next((table for table in tables if isinstance(table, ForceControllerParameters)), None)
+    return {
+        "name": scenario.name,
+        "step": scenario.shared.step,
+        "tolerance": tool.tolerance * 1e6 if tool else 0.0,
+        "fed": bool(tool and (tool.feed or tool.height_from == "slide")),
+        "gaps": list(zip(cut.gap_start, cut.gap_width, strict=True)) if cut else [],
+        "radius": 1e3 * (cut.radius if cut else tool.part_radius if tool else 0.05),
+        "rpm": scenario.shared.nominal_rpm,
+        "force": max(force.set_point, default=0.0) if force else 0.0,
+    }
+
+
+def _node(scenario: Scenario, stage: Stage) -> dict[str, Any]:
+    rows = type(stage.shared).rows()
+    return {
+        "name": stage.name,
+        "kind": scenario.kind(stage.name),
+        "actions": [action for action in stage.actions if action not in _FILES],
+        "knobs": [
+            {"name": name, "value": getattr(stage.parameters_now, name), "unit": rows[name].unit, "doc": rows[name].doc}
+            for name in stage.tunable
+        ],
+        "targets": stage.fault_targets,
+    }

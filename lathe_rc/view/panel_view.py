@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""View of a run in the panel: the newest values, the form by revolution, the supervisor and the log.
+
+The cell's thread feeds the view with chunks of samples and publishes a snapshot a few times a second; it never waits
+for a reader. Readers take the newest snapshot, and from lists that only grow what they do not have yet, so that a slow
+browser misses snapshots and delays nothing.
+"""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lathe_rc import event_log, messages
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals, full
+from lathe_rc.safety.state_machine import State
+from lathe_rc.view import machine_state
+from lathe_rc.view.rerun_part import Outlook, Scale
+from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
+
+Array = npt.NDArray[np.float64]
+
+CELLS = 180  #: cells of a row of the map
+PERIOD = 0.1  #: least time between two snapshots [s]
+MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
+WATERFALL = 12  #: newest revolutions whose error is shown as curves
+_AT_ONCE = 16  # rows in an answer
+_SHAPE = 90  # points of the part's outline
+_MOST_LINES = 2000  # of the log in an answer
+_UM = 1e6
+_RPM = 60.0 / (2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topics of a cell that the panel shows, by fully qualified name; empty if there is none.
+
+    Attributes:
+        encoder, tool, cut: first topics of these kinds.
+        drives: states of the drives that move the tool.
+        slides: states of the slides, by axis.
+    """
+
+    encoder: str
+    tool: str
+    cut: str
+    drives: Sequence[str]
+    slides: Mapping[str, str]
+
+    @classmethod
+    def of(cls, types: Mapping[str, str]) -> "Topics":
+        """Return the topics of a cell, given the message type of each topic."""
+        named = {full(topic): kind for topic, kind in types.items()}
+        first = {kind: topic for topic, kind in reversed(named.items())}
+        slides = {
+            axis: topic
+            for topic, kind in named.items()
+            if kind == messages.STATE and (axis := machine_state.source(topic, kind))
+        }
+        drives = [t for t, kind in named.items() if kind == messages.STATE and t not in slides.values()]
+        return cls(
+            first.get(messages.ENCODER, ""), first.get(messages.TOOL, ""), first.get(messages.CUT, ""), drives, slides
+        )
+
+
+@dataclass(frozen=True)
+class Row:
+    """Revolution in the map.
+
+    Attributes:
+        revolution: its form.
+        cells: form error of largest magnitude in each cell [µm].
+    """
+
+    revolution: Revolution
+    cells: list[float]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of a run at a sample; the lists belong to the view, and only grow.
+
+    Attributes:
+        number: number of the snapshot, counted from 1.
+        run: number of the run; lists of another run start anew.
+        now: newest values, by name, in the units of the page.
+        epoch: number of times that every second row of the map was dropped.
+        rows, log: rows of the map, lines of the log.
+        history: number, RMS and largest error of each revolution [µm].
+        latest: newest revolutions.
+    """
+
+    number: int
+    run: int
+    now: Mapping[str, Any]
+    epoch: int
+    rows: list[Row]
+    log: list[dict[str, Any]]
+    history: list[tuple[int, float, float]]
+    latest: Sequence[Row] = ()
+
+
+def _short(values: Array) -> list[float]:
+    """Return numbers with four digits."""
+    return [float(f"{value:.4g}") for value in values.tolist()]
+
+
+def _row(revolution: Revolution) -> Row:
+    parts = revolution.error.reshape(CELLS, ANGLES // CELLS)
+    largest = np.abs(parts).argmax(axis=1)
+    return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)))
+
+
+class View:
+    """View of one run after the other; a sink of the engine.
+
+    Args:
+        types: message type by topic.
+        step_ns: sampling step [ns].
+        margin: stability margin before the first cycle; None: unknown.
+    """
+
+    def __init__(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
+        self.topics = Topics.of(types)
+        self._types, self._step_ns = {full(topic): kind for topic, kind in types.items()}, step_ns
+        self._supervised = messages.SAFETY_STATUS in self._types.values()
+        self._news = threading.Condition()
+        self._due = 0.0
+        self.run = 0
+        self.latest: Snapshot | None = None
+        self._margin = margin
+        self.clear(margin)
+
+    def clear(self, margin: float | None = None) -> None:
+        """Begin with another run."""
+        self.run += 1
+        self._revolutions = Revolutions()
+        self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
+        if self._supervised:
+            self._now["safety"] = {"state": State.NOMINAL.name.lower(), "alarm": ""}
+        self._scale: Scale | None = None
+        self._epoch, self._every = 0, 1
+        self._rows: list[Row] = []
+        self._newest: list[Row] = []
+        self._log: list[dict[str, Any]] = []
+        self._history: list[tuple[int, float, float]] = []
+
+    @property
+    def revolutions(self) -> Sequence[Revolution]:
+        """Revolutions in the map."""
+        return [row.revolution for row in self._rows]
+
+    @property
+    def turns(self) -> float:
+        """Spindle angle of the newest sample [revolution]."""
+        return float(self._now.get("angle", 0.0)) / (2.0 * np.pi)
+
+    # ---- the cell's thread --------------------------------------------------------------------------
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Take consecutive samples, as a sink of the engine."""
+        named = {full(topic): signals for topic, signals in dense.items()}
+        for topic, found in sparse.items():
+            for message in found:
+                self._message(full(topic), message)
+        self._now["sample"] = first + samples
+        self._now["time"] = (first + samples) * self._step_ns * 1e-9
+        encoder, tool, cut = (named.get(topic) for topic in (self.topics.encoder, self.topics.tool, self.topics.cut))
+        if encoder:
+            self._now |= {"angle": float(encoder["angle_true"][-1]), "rpm": float(encoder["speed"][-1]) * _RPM}
+        if cut:
+            self._now |= {name: float(cut[name][-1]) for name in ("force", "measured_force")}
+            self._now["deflection"] = float(cut["deflection"][-1]) * _UM
+        self._now["drives"] = {
+            topic.strip("/").removesuffix("/state"): float(named[topic]["position"][-1]) * _UM
+            for topic in self.topics.drives
+            if topic in named
+        }
+        self._now["slides"] = {
+            axis: float(named[topic]["position"][-1]) * 1e3
+            for axis, topic in self.topics.slides.items()
+            if topic in named
+        }
+        if encoder and tool:
+            self._part(first, encoder["angle_true"], tool)
+
+    def _part(self, first: int, angle: Samples, tool: Signals) -> None:
+        if self._scale is None:
+            self._scale = Scale.of(Outlook(), tool["reference"])
+        self._now |= {
+            name: float(tool[name][-1]) * _UM for name in ("reference", "displacement", "error", "measured_error")
+        }
+        self._now["height"] = float(tool["height"][-1]) * 1e3
+        for revolution in self._revolutions.add(first, angle, tool["error"], tool["reference"], tool["height"]):
+            row = _row(revolution)
+            rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
+            self._history.append((revolution.number, rms, largest))
+            self._newest = [*self._newest[1 - WATERFALL :], row]
+            if (revolution.number - 1) % self._every == 0:
+                self._rows.append(row)
+            if len(self._rows) == MOST_ROWS:
+                # A new list: readers of older snapshots keep the old one.
+                self._rows, self._epoch, self._every = self._rows[::2], self._epoch + 1, 2 * self._every
+
+    def _message(self, topic: str, message: Sparse) -> None:
+        if message.type == messages.LEARNING and np.isfinite(message.values["stability_margin"]):
+            self._now["margin"] = float(message.values["stability_margin"])
+        if message.type in event_log.LOGGED:
+            self.say(message.index, topic.strip("/"), event_log.text(message))
+        if message.type == messages.SAFETY_STATUS:
+            state = message.values["state"]
+            name = State(state).name.lower() if state in set(State) else "?"
+            self._now["safety"] = {"state": name, "alarm": event_log.text(message)}
+
+    def say(self, sample: int, source: str, text: str) -> None:
+        """Add a line to the log."""
+        self._log.append({"sample": sample, "source": source, "text": text[:300]})
+
+    def publish(self, told: Mapping[str, Any], *, at_once: bool = False) -> None:
+        """Publish a snapshot, unless the last one was a moment ago.
+
+        Args:
+            told: status of the run.
+            at_once: whether to publish in any case.
+        """
+        now = time.monotonic()
+        if not at_once and now < self._due:
+            return
+        self._due = now + PERIOD
+        number = self.latest.number + 1 if self.latest else 1
+        current = {**self._now, **told, "exaggeration": self._scale.deviation / 1e3 if self._scale else 1.0}
+        latest = Snapshot(
+            number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
+        )
+        with self._news:
+            self.latest = latest
+            self._news.notify_all()
+
+    # ---- readers ------------------------------------------------------------------------------------
+
+    def wait(self, after: int, seconds: float) -> Snapshot:
+        """Return the newest snapshot, as soon as its number is not ``after``, or after some seconds.
+
+        Raises:
+            LatheError: there is none yet.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self.latest is not None and self.latest.number != after, seconds)
+            if self.latest is None:
+                raise LatheError("the run has not begun yet")
+            return self.latest
+
+
+@dataclass(frozen=True)
+class Have:
+    """Contents of a page so far.
+
+    Attributes:
+        number: number of its newest snapshot.
+        run: number of its run.
+        epoch, rows: state of its map, see `Snapshot`.
+        log, history: number of lines and of revolutions.
+        latest: newest revolution in its waterfall.
+    """
+
+    number: int = 0
+    run: int = 0
+    epoch: int = 0
+    rows: int = 0
+    log: int = 0
+    history: int = 0
+    latest: int = 0
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> "Have":
+        """Read the state of a page from its question.
+
+        Raises:
+            InputError: a number is missing or negative.
+        """
+        found: dict[str, int] = {}
+        for name in (each.name for each in fields(cls)):
+            value = told.get(name)
+            if not isinstance(value, int) or not 0 <= value < 2**53:
+                raise InputError(f"{name} = {str(value)[:80]}; allowed: a whole number from 0 on")
+            found[name] = value
+        return cls(**found)
+
+
+def news(snapshot: Snapshot, have: Have) -> dict[str, Any]:
+    """Return what a page lacks, as JSON data.
+
+    Rows of the map come a few at a time. A page with an older epoch first drops every second row for each later one,
+    which leaves ⌈n/2⌉ of n rows.
+    """
+    if have.run != snapshot.run or have.epoch > snapshot.epoch:
+        have = Have(have.number)
+    had = -(-have.rows // 2 ** (snapshot.epoch - have.epoch))
+    rows = snapshot.rows[had : had + _AT_ONCE]
+    latest = [row for row in snapshot.latest if row.revolution.number > have.latest]
+    return {
+        "number": snapshot.number,
+        "run": snapshot.run,
+        "epoch": snapshot.epoch,
+        "now": dict(snapshot.now),
+        "rows": [
+            {"revolution": row.revolution.number, "height": round(row.revolution.height * 1e3, 6), "cells": row.cells}
+            for row in rows
+        ],
+        "more": had + len(rows) < len(snapshot.rows),
+        "log": snapshot.log[have.log : have.log + _MOST_LINES],
+        "history": snapshot.history[have.history : have.history + _MOST_LINES],
+        "latest": [{"revolution": row.revolution.number, "cells": row.cells} for row in latest],
+        "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
+    }

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A headless Chromium that a test drives while a page is at work, by the DevTools protocol over pipes."""
+
+import base64
+import json
+import os
+import subprocess
+import time
+
+
+class Chromium:
+    """One page.
+
+    Args:
+        folder: of the browser's profile and of what it saves.
+
+    Attributes:
+        told: what the page wrote to the console, and its uncaught errors.
+        asked: addresses that it asked for.
+    """
+
+    def __init__(self, folder):
+        self._folder, self._number = folder, 0
+        self.told, self.asked = [], []
+        commands, self._commands = os.pipe()
+        self._answers, answers = os.pipe()
+        words = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]
+        words += ["--disable-background-networking", "--hide-scrollbars", f"--user-data-dir={folder / 'browser'}"]
+        shell = f'exec "$@" 3<&{commands} 4>&{answers}'
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "bash", *words], pass_fds=(commands, answers), stderr=subprocess.DEVNULL
+        )
+        os.close(commands)
+        os.close(answers)
+        self._rest, self._session = b"", ""
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._process.kill()
+        self._process.wait()
+        os.close(self._commands)
+        os.close(self._answers)
+
+    def _read(self):
+        while b"\0" not in self._rest:
+            self._rest += os.read(self._answers, 2**16) or self._ended()
+        message, _, self._rest = self._rest.partition(b"\0")
+        return json.loads(message)
+
+    def _ended(self):
+        raise AssertionError(f"chromium has ended with {self._process.wait()}")
+
+    def call(self, method, **params):
+        self._number += 1
+        question = {"id": self._number, "method": method, "params": params}
+        if self._session:
+            question["sessionId"] = self._session
+        os.write(self._commands, json.dumps(question).encode() + b"\0")
+        while True:
+            message = self._read()
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                return message["result"]
+            told = message.get("params", {})
+            if message["method"] == "Runtime.consoleAPICalled":
+                self.told.append(str([each.get("value", each.get("description")) for each in told["args"]]))
+            elif message["method"] == "Runtime.exceptionThrown":
+                self.told.append(json.dumps(told["exceptionDetails"])[:2000])
+            elif message["method"] == "Log.entryAdded":
+                self.told.append(told["entry"]["text"])
+            elif message["method"] == "Network.requestWillBeSent":
+                self.asked.append(told["request"]["url"])
+
+    def look(self, width, height, *, dark=False):
+        """Size of the window, and the user's colours."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
+        wanted = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[wanted])
+
+    def open(self, address):
+        self.call("Page.navigate", url=address)
+
+    def run(self, script):
+        """The value of an expression, or what it promises."""
+        found = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def until(self, script, seconds=60.0):
+        """The first true value of an expression."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if found := self.run(f"(() => {{ try {{ return {script}; }} catch (error) {{ return null; }} }})()"):
+                return found
+            self.run("new Promise(done => setTimeout(done, 50))")
+        raise AssertionError((script, self.run("document.body?.innerText")))
+
+    def click(self, selector):
+        self.run(f"document.querySelector({json.dumps(selector)}).click()")
+
+    def shot(self, file, *, whole=True):
+        found = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        file.write_bytes(base64.b64decode(found["data"]))

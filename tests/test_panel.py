@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The panel: commands, snapshots, and a run that is that of `lathe run`."""
+
+import io
+import json
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import lathe_rc
+from lathe_rc import harness
+from lathe_rc.cell.scenario import load
+from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.view import panel, panel_part, panel_view
+from lathe_rc.view.panel_run import Driver, LiveCell
+from lathe_rc.view.panel_view import Have, news
+from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
+
+ROOT = Path(__file__).parents[1]
+
+
+def scenario(name="supervised", revolutions=20, *overrides):
+    return load(ROOT / "config" / f"{name}.yaml", [f"spindle_encoder.revolutions={revolutions}", *overrides])
+
+
+class Panel:
+    """A page without a browser: the answers of the server, and all that they told."""
+
+    def __init__(self, driver, cell):
+        self.cell, self.answers = cell, panel.site(driver, cell).answers
+        self.have, self.rows, self.log, self.history, self.now = Have(), [], [], [], {}
+
+    def ask(self, name, **question):
+        return json.loads(json.dumps(self.answers[name](question)))
+
+    def take(self):
+        """Take what the page lacks, as panel.js does."""
+        told = self.ask("frame", **vars(self.have))
+        if told["run"] != self.have.run:
+            self.rows, self.log, self.history, epoch = [], [], [], told["epoch"]
+        else:
+            epoch = self.have.epoch
+        for _ in range(told["epoch"] - epoch):
+            self.rows = self.rows[::2]
+        self.rows += told["rows"]
+        self.log += told["log"]
+        self.history += told["history"]
+        self.now = told["now"]
+        lengths = (len(self.rows), len(self.log), len(self.history))
+        latest = max([row["revolution"] for row in told["latest"]], default=self.have.latest)
+        self.have = Have(told["number"], told["run"], told["epoch"], *lengths, latest)
+        return told
+
+    def until(self, condition):
+        deadline = time.monotonic() + 60.0
+        while time.monotonic() < deadline:
+            told = self.take()
+            if condition(self.now) and not told["more"]:
+                return self.now
+        raise AssertionError(self.now)
+
+
+@pytest.fixture
+def opened():
+    """Opens the panel of a scenario, as fast as possible."""
+    threads = []
+
+    def opening(loaded, pace=0.0):
+        cell = LiveCell(loaded)
+        driver = Driver(cell, pace)
+        driver.__enter__()
+        threads.append(driver)
+        return Panel(driver, cell)
+
+    yield opening
+    for driver in threads:
+        driver.__exit__()
+
+
+def test_a_run_with_the_panel_has_the_digests_of_one_without(opened, tmp_path):
+    """Also with steps, pauses, another pace and a page that asks all the time."""
+    shown = opened(scenario("two_channel", 12))
+    shown.ask("record", bag=str(tmp_path / "bag"))
+    shown.ask("step")
+    assert shown.until(lambda now: now["state"] == "paused" and now["sample"])["sample"] in range(3700, 4000)
+    shown.ask("pace", factor=1.0)
+    shown.ask("start")
+    shown.until(lambda now: now["sample"] > 10_000)
+    shown.ask("pause")
+    shown.ask("pace", factor=0.0)
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "ended")
+    result = harness.run(scenario("two_channel", 12))
+    assert lathe_rc.read_bag(tmp_path / "bag").digests() == result.digest
+    assert [number for number, _, _ in shown.history] == list(range(1, len(shown.history) + 1))
+    told = [rms for _, rms, _ in shown.history]
+    assert told == pytest.approx((result.errors.rms[: len(told)] * 1e6).tolist(), rel=1e-3)
+    assert len(told) >= 11
+
+
+def test_events_of_the_panel_repeat_its_run(opened, tmp_path):
+    """Fault, alarm, retraction, reset, another gain: each at a sample that the panel names."""
+    shown = opened(scenario())
+    shown.ask("record", bag=str(tmp_path / "bag"))
+    for _ in range(6):
+        shown.ask("step")
+        shown.until(lambda now: now["state"] == "paused")
+    shown.ask("act", node="learning_controller", action="set learning_gain 0.5")
+    shown.ask("act", node="learning_controller", action="freeze")
+    told = shown.ask("act", node="spindle_encoder", action="fault encoder missed_index")["text"]
+    assert told == f"sample {shown.now['sample']}: fault encoder missed_index"
+    shown.ask("start")
+    shown.until(lambda now: now["safety"]["state"] == "safe" or now["state"] == "ended")
+    assert any("index_pulses" in line["text"] and "rad" in line["text"] for line in shown.log)
+    shown.ask("start") if shown.now["state"] == "paused" else None
+    shown.until(lambda now: now["state"] == "ended")
+    again = scenario("supervised", 20, *[f"{n}.events={json.dumps(e)}" for n, e in shown.cell.events.items()])
+    assert set(shown.cell.events) == {"learning_controller", "spindle_encoder"}
+    assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(again).digest
+
+
+def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_path):
+    shown = opened(scenario("piston", 12))
+    for _ in range(4):
+        shown.ask("step")
+        shown.until(lambda now: now["state"] == "paused")
+    at, learned = shown.now["sample"], shown.history[-1][1]
+    shown.ask("change", values={"learning_controller.learning_gain": "0.5"}, here=True)
+    shown.ask("step")
+    shown.until(lambda now: now["state"] == "paused" and now["sample"] > at)
+    assert shown.now["begun"] == at
+    assert shown.history[-1][1] < 2 * learned  # goes on with what it has learned
+    assert shown.cell.scenario.value("learning_controller.learning_gain") == 0.5
+    with pytest.raises(InputError, match="goes on only with the parameters of the checkpoint"):
+        shown.ask("change", values={"seed": "7"}, here=True)
+    assert shown.take()["now"]["sample"] == shown.cell.reached  # as before
+    run = shown.have.run
+    shown.ask("change", values={"seed": "7"}, here=False)
+    shown.take()
+    assert (shown.have.run, shown.history, shown.cell.reached) == (run + 1, [], 0)
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "ended")
+    assert len(shown.history) >= 11
+
+
+def test_mistakes_are_refused_and_the_run_goes_on(opened, tmp_path):
+    shown = opened(scenario("piston", 8))
+    for name, question, message in (
+        ("act", {"node": "tol", "action": "freeze"}, "did you mean tool"),
+        ("act", {"node": "learning_controller", "action": "frieze"}, "freeze"),
+        ("act", {"node": "tool", "action": "fault tool.error off"}, "allow_faults"),
+        ("act", {"node": "learning_controller", "action": "set learning_gain 99"}, "learning_gain"),
+        ("act", {"node": "learning_controller"}, "action = null; allowed: a text"),
+        ("change", {"values": {"learning_controller.lead": "1"}, "here": True}, "lead_time"),
+        ("change", {"values": [], "here": True}, "allowed: an object"),
+        ("pace", {"factor": -1}, "pace = -1"),
+        ("record", {"bag": str(tmp_path)}, "exists"),
+        ("frame", {"number": -1}, "number = -1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            shown.ask(name, **question)
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "ended")
+    with pytest.raises(InputError, match="ended; allowed: restart"):
+        shown.ask("step")
+
+
+def test_a_run_that_fails_says_so_and_can_be_restarted(opened, monkeypatch):
+    shown = opened(scenario("piston", 4))
+
+    def diverge(*_):
+        raise DivergedError("/tool: error is nan at sample 7")
+
+    monkeypatch.setattr(shown.cell._engine, "advance", diverge)
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "failed")
+    assert shown.now["error"] == "/tool: error is nan at sample 7"
+    shown.ask("change", values={}, here=False)
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "ended")
+
+
+def test_a_page_that_does_not_ask_delays_no_sample(opened, monkeypatch):
+    """It then gets the newest snapshot, and the rows that it lacks, a few at a time."""
+    monkeypatch.setattr(panel_view, "MOST_ROWS", 16)
+    shown = opened(scenario("piston", 24))
+    shown.ask("step")
+    shown.until(lambda now: now["state"] == "paused")
+    shown.ask("start")
+    deadline = time.monotonic() + 60
+    while shown.cell.reached < shown.cell.samples and time.monotonic() < deadline:
+        threading.Event().wait(0.02)
+    shown.until(lambda now: now["state"] == "ended")
+    assert shown.have.epoch == 1
+    assert [row["revolution"] for row in shown.rows] == list(range(1, len(shown.history) + 1, 2))
+    assert all(len(row["cells"]) == 180 for row in shown.rows)
+
+
+def test_a_snapshot_before_the_first_is_an_error():
+    with pytest.raises(LatheError, match="not begun"):
+        LiveCell(scenario("piston", 3)).view.wait(0, 0.0)
+
+
+def test_what_a_page_can_ask_for_is_told(opened):
+    about = opened(scenario()).ask("about")
+    nodes = {node["name"]: node for node in about["nodes"]}
+    assert nodes["learning_controller"]["actions"] == ["freeze", "learn", "clear"]
+    assert [knob["name"] for knob in nodes["learning_controller"]["knobs"]][:1] == ["learning_gain"]
+    assert "coarse/state.measured_position" in nodes["electrodynamic_actuator"]["targets"]["stuck"]
+    assert about["faults"]["wrong"]["values"] == {"scale": 1.0, "offset": 0.0}
+    assert "electrodynamic_actuator.delay" in about["parameters"]
+
+
+def test_only_news_are_told():
+    cell = LiveCell(scenario("piston", 3))
+    cell.view.publish({"state": "paused"})
+    told = news(cell.view.wait(0, 1.0), Have(epoch=9, run=1))
+    assert (told["rows"], told["history"], told["shape"], told["more"]) == ([], [], None, False)
+
+
+def revolution(number, height, deviation=0.0, error=0.0):
+    angle = 2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
+    radius = deviation * np.cos(2 * angle)
+    return Revolution(number, 0, np.full(ANGLES, error), radius, height, 0.0, 0.0)
+
+
+def test_the_part_is_a_closed_body_of_its_size_with_the_colours_of_its_error():
+    """STL in mm, GLB in m; a revolution that does not lie further along the part is left out."""
+    turned = [revolution(k + 1, 1e-3 * height, 2e-4, 5e-6 * k) for k, height in enumerate([0, 10, 5, 40])]
+    mesh = panel_part.body(turned, 0.05, 1.0, 15e-6)
+    for ending, unit in (("stl", 1.0), ("glb", 1e-3)):
+        read = trimesh.load(io.BytesIO(panel_part.file(mesh, ending)), file_type=ending, force="mesh")
+        read.merge_vertices()
+        assert read.is_watertight
+        assert read.volume > 0.0
+        assert read.extents == pytest.approx(np.array([100.4, 99.6, 40.0]) * unit, abs=0.01 * unit)
+    rings = mesh.visual.vertex_colors[:-2].reshape(3, ANGLES, 4)
+    assert [tuple(ring[0]) for ring in rings][::2] == [(0xF4, 0xF4, 0xF4, 255), (0x67, 0, 0x1F, 255)]
+
+
+def test_a_part_without_feed_has_its_revolutions_beside_each_other():
+    mesh = panel_part.body([revolution(k, 0.0) for k in range(1, 5)], 0.05, 1.0, 1e-6)
+    assert mesh.extents[2] == pytest.approx(3 * panel_part.PITCH * 1e3)
+    with pytest.raises(InputError, match="after the second"):
+        panel_part.body([revolution(1, 0.0)], 0.05, 1.0, 1e-6)
+    with pytest.raises(InputError, match="reach the axis"):
+        panel_part.body([revolution(k, 0.0, 2e-4) for k in (1, 2)], 0.05, 1000.0, 1e-6)
+    with pytest.raises(InputError, match="allowed: stl, glb"):
+        panel_part.file(mesh, "ply")
+
+
+def test_the_part_is_saved_from_the_page(opened):
+    shown = opened(scenario("piston", 8))
+    shown.ask("start")
+    shown.until(lambda now: now["state"] == "ended")
+    found = shown.answers["part"]({"format": "stl", "enlarged": 1})
+    assert (found.name, found.type) == ("piston.stl", "model/stl")
+    assert trimesh.load(io.BytesIO(found.content), file_type="stl").is_watertight
+    with pytest.raises(InputError, match="enlarged = 0"):
+        shown.ask("part", format="stl", enlarged=0)
