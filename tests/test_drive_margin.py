@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from cells import assert_resimulated, config, scenario
+from cells import assert_resimulated, config, form_error, scenario
 
 from lathe_rc import Plant, PlantParameters, allowed_code, harness, kernel, parameter
 from lathe_rc.analysis.frequency_response import FrequencyResponse, write_points
@@ -28,6 +28,21 @@ LAWS = {
     "AFC": {"stage": "resonant_controller", "highest_order": 12, "rate": 18.0},
     "ADRC": {"stage": "lathe_papers.adrc:Adrc", "observer_bandwidth": 2000.0, "control_bandwidth": 1750.0},
 }
+
+
+CYCLES = {
+    "lead": {"learning_gain": 0.7},
+    "flat Q": {"q_filter": "fir", "q_pass": 1000.0, "q_stop": 2500.0, "learning_gain": 0.5},
+    "inverse": {"correction": "second_order_inverse", "lead_time": TAU, "model_damping": 0.5},
+    "disturbance": {
+        "stage": "disturbance_controller",
+        "identify": False,
+        "follows_speed": False,
+        "observer_bandwidth": 0.0,
+        "learned_waves": 20.0,
+        "model_natural_frequency": 800.0,
+    },
+}  #: repetitive laws that lose the margin at some wave
 
 
 class WrongParameters(PlantParameters):
@@ -101,7 +116,7 @@ class Wrong(Plant):
         return self._plant().response(frequency) * (1.0 + error)
 
 
-def cell(law, revolutions=40.0, **error):
+def cell(law, revolutions=40.0, order=2, **error):
     allowed_code.allow_named("test_drive_margin:Wrong")
     allowed_code.allow_named("lathe_papers.adrc:Adrc")
     free = {"stroke": 1e6, "max_velocity": 1e9, "max_acceleration": 1e12}
@@ -110,7 +125,7 @@ def cell(law, revolutions=40.0, **error):
         spindle_encoder={"revolutions": revolutions},
         learning_controller={"allow_unstable": True, "stop_ratio": 0.0, "feedback_delay": 16, **law},
         electrodynamic_actuator={"stage": "test_drive_margin:Wrong", **free, **error},
-        tool={"profile": "harmonics", "harmonic_order": [2], "harmonic_amplitude": [1e-6]},
+        tool={"profile": "harmonics", "harmonic_order": [order], "harmonic_amplitude": [1e-6]},
     )
 
 
@@ -125,6 +140,34 @@ def worst_error(law):
     delta = (-(own + fed) / fed)[0]
     assert abs(delta) == pytest.approx(margin.error, rel=1e-4)
     return margin.error, {"frequency": frequency, "phase": float(np.angle(delta))}
+
+
+@pytest.mark.parametrize("law", CYCLES)
+def test_an_error_above_the_margin_of_a_repetitive_law_diverges_in_a_run_and_a_smaller_one_does_not(law):
+    """Each repetitive law, at the wave with the least margin that goes on from revolution to revolution."""
+    checked = Cell(cell(CYCLES[law]).nodes)
+    speed, stage = 1000 * np.pi / 30, checked.stages["learning_controller"]
+    response, waves = checked.stages["electrodynamic_actuator"].response, np.linspace(1.0, 13.0, 12001)
+    margins, factors = stage.smallest_errors(response, waves, speed), stage.factors(response, waves, speed)[-1]
+    # A wave w is one of the loop where its factor has the phase 2πw.
+    beyond = np.angle(factors * np.exp(-2j * np.pi * waves))
+    own = np.flatnonzero((np.diff(np.sign(beyond)) != 0) & (np.abs(beyond[1:]) < 1.0))
+    place = own[np.argmin(margins[own])]
+    margin, wave = margins[place], waves[place]
+    assert 0.05 < margin < 0.95
+
+    def largest(phase):
+        error = margin * np.exp(1j * phase)
+        return np.abs(stage.factors(lambda w: (1.0 + error) * response(w), np.array([wave]), speed)).max()
+
+    error = {"frequency": wave * speed, "phase": max(np.linspace(-np.pi, np.pi, 1441).tolist(), key=largest)}
+    growth = []
+    for part in (1.03, 0.97):
+        found = harness.run(cell(CYCLES[law], 60.0, order=round(wave), size=part * margin, **error))
+        changes = np.std(np.diff(form_error(found)[: 60 * 3840].reshape(60, -1), axis=0), axis=1)
+        growth.append((changes[58] / changes[38]) ** (1 / 20))
+    assert 1.03 > growth[0] > 1.002
+    assert 0.97 < growth[1] < 0.998
 
 
 @pytest.mark.parametrize("law", LAWS)

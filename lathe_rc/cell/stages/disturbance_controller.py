@@ -180,6 +180,9 @@ class DisturbanceController(FormLaw):
         smooth = _passed(parameters.learned_waves, parameters.points_per_revolution, waves.tobytes())
         stages = 1.0 + p / parameters.learning_bandwidth
         learned = parameters.learning_gain * smooth * np.exp(3.0 * p / parameters.learning_bandwidth) / stages**3
+        learned *= np.exp(
+            1j * np.pi * waves / parameters.points_per_revolution
+        )  # from cell centres, read at their edges
         factor = 1.0 - LEAK * (1.0 - smooth) - learned * (1.0 + error) / (1.0 + inside)
         return np.stack((inside, factor))
 
