@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_papers.formulas.regeneration import Regeneration, lobes
+from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, SpecificForce
 from lathe_rc.plants.workpiece import HardSpot, Part

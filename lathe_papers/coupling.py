@@ -3,7 +3,7 @@
 
 An electrodynamic drive follows an oval and cuts a part with two keyways. In one stage, drive and cut are computed
 sample by sample; in two stages, the force would reach the drive some samples late. The stability limit is that of
-`lathe_papers.formulas.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
+`lathe_rc.analysis.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
 cut and loaded spindle contains such a delay; longer delays are compared with a delay of one sample.
 """
 

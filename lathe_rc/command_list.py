@@ -19,6 +19,7 @@ COMMANDS = {
     "design": "Find the learning law of a scenario for a measured drive.",
     "export": "Export a recording as tables, or stages as C libraries or FMUs.",
     "fit": "Fit models to measurements.",
+    "loop": "Show block diagram and learning loops, with settings to drag.",
     "measure": "Measure the part turned in a recorded run.",
     "new": "Create a law, drive, stage or study of your own.",
     "node": "Run one node, or list its parameters.",

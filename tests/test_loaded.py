@@ -11,8 +11,8 @@ from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
 from lathe_papers.formulas.loaded import compliance, compliance_in_series
-from lathe_papers.formulas.regeneration import Regeneration
 from lathe_rc import harness
+from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError
 from lathe_rc.plants.coil import Coil

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_array_equal
 
-from lathe_papers.formulas.regeneration import Regeneration, lobes
+from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.plants.cutting import GIVEN, MADE, CuttingProcess
 from lathe_rc.plants.cutting_force import PAPER, REALISTIC, Elasticity, Flank, SpecificForce, flank_damping
 from lathe_rc.transfer import TransferFunction

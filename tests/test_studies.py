@@ -19,9 +19,9 @@ from lathe_papers import angle_domain, drive_models, invariance
 from lathe_papers.angle_domain import AngleDomainParameters
 from lathe_papers.formulas.invariance import FirstOrderInvariance
 from lathe_papers.formulas.loaded import compliance
-from lathe_papers.formulas.regeneration import Regeneration
 from lathe_papers.formulas.step_fit import SecondOrder
 from lathe_papers.invariance import InvarianceParameters
+from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.cli import main
 from lathe_rc.commands import study as commands_study
 from lathe_rc.commands.study import read

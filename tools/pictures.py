@@ -76,6 +76,7 @@ TABLE = {
     "demo_interrupted.png": Picture("demo interrupted", "robust.md", "bags/demo-1.png", 60),
     "feed_drive.png": _script("feed_drive", 30, "feed"),
     "lay.png": _script("lay", 5, "metrology"),
+    "loop.png": _photograph("loop_screenshot", "view.md"),
     "machine.svg": _script("machine", 1, "index"),
     "metrology.png": _script("metrology", 5),
     "piezo.png": _script("piezo", 30, "drives"),

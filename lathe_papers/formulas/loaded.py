@@ -2,7 +2,7 @@
 """Compliance of the tool drives: x/F of `lathe_rc.plants.tool_drive` in continuous time.
 
 Its inverse is the dynamic stiffness, and at p = 0 the static stiffness. The compliance, multiplied by the radial part
-of the cutting force, is the deflection for `lathe_papers.formulas.regeneration`.
+of the cutting force, is the deflection for `lathe_rc.analysis.regeneration`.
 """
 
 import numpy as np

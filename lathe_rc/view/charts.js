@@ -40,7 +40,7 @@ async function draw(name) {
     const encoding = spec.encoding[channel];
     encoding.scale = { ...encoding.scale, domain: ends, nice: false, ...(encoding.scale?.type == "log" ? {} : { zero: false }) };
   }
-  const options = { actions: false, ast: true, config: config(place.clientWidth), renderer: own.renderer || (name == "parallel-coordinates" ? "canvas" : "svg") };
+  const options = { actions: false, ast: true, defaultStyle: false, tooltip: { disableDefaultStyle: true }, config: config(place.clientWidth), renderer: own.renderer || (name == "parallel-coordinates" ? "canvas" : "svg") };
   const { view } = await vegaEmbed(place, spec, options);
   if (own.box) boxed(name, place, view, own.square);
   if (own.signals) await steer(STEERED[name] = [view, own.signals]);

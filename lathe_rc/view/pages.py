@@ -52,15 +52,15 @@ def grid(
     return Grid(columns, cells, texts) if cells else None
 
 
-def check_page(page: Path) -> None:
-    """Refuse a file that cannot become a page.
+def check_page(page: Path, option: str = "-o") -> None:
+    """Refuse a file that cannot become a page; ``option`` named it.
 
     Raises:
         InputError: it does not end in .html, or has no place in its folder.
     """
     if page.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"-o {page}; allowed: a file name that ends in .html")
-    check_place("-o", page)
+        raise InputError(f"{option} {page}; allowed: a file name that ends in .html")
+    check_place(option, page)
 
 
 def write_page(page: Path, text: str) -> None:

@@ -14,6 +14,7 @@ _AXES = 50  # [px] width of its labels beside it
 _LABELLED = (1, 2, 5, 10, 20, 50, 100)  # harmonics with a label in the locus
 _APART = 0.12  # least distance of two labels
 _TOP, _EDGE = 2.0, 1.25  # ends of the axes
+_INNER = 0.3  # half of the inner share of a figure, in which a centred label has room
 _RPM = 60.0 / (2.0 * np.pi)
 _ERROR = "error that diverges (dashed)"
 
@@ -23,7 +24,7 @@ def loop(curve: LoopCurve) -> list[Spec]:
     return [*([_locus(curve)] if curve.factor is not None else []), _over_waves(curve)]
 
 
-def _texts(data: Rows, **mark: Any) -> Rows:
+def texts(data: Rows, **mark: Any) -> Rows:
     """Return layers of labels that a curve below does not make illegible."""
     text = {"type": "text", "clip": True, "fontSize": 11, **mark}
     encoding = {"text": {"field": "t"}}
@@ -34,7 +35,7 @@ def _texts(data: Rows, **mark: Any) -> Rows:
 def _locus(curve: LoopCurve) -> Spec:
     factor, waves = curve.factor, curve.waves
     assert factor is not None, "asked by the caller"
-    size = max(_EDGE, 1.08 * float(np.abs(factor).max()))
+    size, worst = max(_EDGE, 1.08 * float(np.abs(factor).max())), factor[_at(curve)]
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = rows(u=np.cos(turn), v=np.sin(turn), k=np.arange(turn.size))
     line = rows(u=factor.real, v=factor.imag, k=np.arange(waves.size), n=waves, f=np.abs(factor), l="factor")
@@ -70,8 +71,8 @@ def _locus(curve: LoopCurve) -> Spec:
                 "mark": {"type": "point", "filled": True, "size": 22, "clip": True},
                 "encoding": {"color": shade, "tooltip": shown},
             },
-            *_texts(names, align="left", dx=6, dy=-6),
-            *_worst(curve, rows(u=factor[_at(curve)].real, v=np.array([factor[_at(curve)].imag])), "worst", shade),
+            *texts(names, align="left", dx=6, dy=-6),
+            *_worst(curve, rows(u=worst.real, v=np.array([worst.imag])), "worst", shade, side=worst.real / size),
         ],
         usermeta={"square": _SQUARE, "axes": _AXES},
     )
@@ -81,11 +82,23 @@ def _at(curve: LoopCurve) -> int:
     return int(np.argmin(np.abs(curve.waves - max(curve.margin.waves, LEAST))))
 
 
-def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec) -> Rows:
-    """Return the mark of the least margin with its label, in the colour of another label."""
+def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec, side: float = 0.0) -> Rows:
+    """Return the mark of the least margin with its label, in the colour of another label.
+
+    Args:
+        curve: loop with the margin.
+        place: row with the place of the mark.
+        label: label whose colour the mark has.
+        shade: encoding of the colours.
+        side: place between the left (-1) and the right end (1) of the figure, near which the label points inwards.
+    """
+    align, dx = ("center", 0) if abs(side) < _INNER else ("left", -8) if side < 0.0 else ("right", 8)
     data = [{**row, "t": f"margin {curve.margin}", "l": label} for row in place]
     mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
-    return [{"data": {"values": data}, "mark": mark, "encoding": {"color": shade}}, *_texts(data, dy=16)]
+    return [
+        {"data": {"values": data}, "mark": mark, "encoding": {"color": shade}},
+        *texts(data, dy=16, align=align, dx=dx),
+    ]
 
 
 def _over_waves(curve: LoopCurve) -> Spec:
@@ -98,7 +111,9 @@ def _over_waves(curve: LoopCurve) -> Spec:
     dash = {"domain": list(drawn), "range": [[1, 0], [7, 3]][-len(drawn) :]}
     shade = colours(dict(zip(drawn, (LAST, FIRST)[-len(drawn) :], strict=True)), legend=True)
     limit = rows(v=np.ones(1))
-    worst = rows(n=float(curve.waves[_at(curve)]), v=np.array([min(curve.margin.error, _TOP)]))
+    at = float(curve.waves[_at(curve)])
+    worst = rows(n=at, v=np.array([min(curve.margin.error, _TOP)]))
+    low, high = np.log(waves[[0, -1]])
     return figure(
         280,
         title=f"{curve.node} at {curve.margin.speed * _RPM:.5g}/min",
@@ -127,6 +142,6 @@ def _over_waves(curve: LoopCurve) -> Spec:
                     "color": {"value": "#888"},
                 },
             },
-            *_worst(curve, worst, _ERROR, shade),
+            *_worst(curve, worst, _ERROR, shade, side=2.0 * (np.log(at) - low) / (high - low) - 1.0),
         ],
     )

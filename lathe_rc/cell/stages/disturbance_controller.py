@@ -116,6 +116,7 @@ class DisturbanceController(FormLaw):
     Parameters = DisturbanceControllerParameters
     parameters: DisturbanceControllerParameters
     tunable = ("learning_gain",)
+    adjustable = ("learning_gain", "learned_waves", "learning_bandwidth", "observer_bandwidth")
     law: Memory
     sample: ClassVar[Callable[[Any, Now], float]] = staticmethod(sample)
     factor = "sup|factor of a revolution|"

@@ -25,6 +25,7 @@ from lathe_rc.cell.parameters import (
 )
 from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.cell.stages.drive import BoundedParameters, Drive
+from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.cell.stages.obedience import Obedience, Obedient
 from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
@@ -67,6 +68,13 @@ class Learner(Obedient):
     learns = True
     factor: ClassVar[str] = "sup|factor of a cycle|"  #: what `worst` tells, in words
     remedy: ClassVar[str] = "change the law"  #: for a loop that diverges where none of its `cures` helps, in words
+
+    @property
+    def adjustable(self) -> Sequence[str]:
+        """Return the parameters that decide whether learning converges, all float, without models of the drive."""
+        common = LawParameters.model_fields.keys() | FormParameters.model_fields.keys()
+        own = [row for name, row in type(self.parameters).rows().items() if name not in common]
+        return [row.name for row in own if row.type is float and not row.is_list and not row.drive]
 
     @abstractmethod
     def factors(self, drive: Response, waves: Array, speed: float) -> Complex | None:

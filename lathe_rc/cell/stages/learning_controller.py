@@ -117,6 +117,11 @@ class LearningController(Learner):
     # ---- the loop, for checks and margins -----------------------------------------------------------
 
     @property
+    def adjustable(self) -> Sequence[str]:
+        """Return gain, lead and Q."""
+        return self.tunable
+
+    @property
     def correction(self) -> Correction:
         """Current correction 1/W0."""
         return self._controller.correction

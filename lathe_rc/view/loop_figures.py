@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of drives and cuts beside their loops: Bode diagrams, stability charts, and margins along a setting."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+
+from lathe_rc.cell.varied_loop import Along, Chart, DriveCurve
+from lathe_rc.messages import Samples
+from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
+from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
+from lathe_rc.view.report_loop import texts
+
+_MOST = 5  # responses of a controller
+_LOWEST, _HIGHEST = -60.0, 20.0  # [dB] ends of the axis
+_RPM = 60.0 / (2.0 * np.pi)
+_WIDER = 1.8  # fastest speed of a chart over the worst one of the first lobe
+_ABOVE = 4.0  # largest stiffness of a chart over its least limit
+
+
+def bode(drives: Sequence[DriveCurve]) -> list[Spec]:
+    """Return magnitude and phase over the frequency, of all responses of one controller."""
+    shown = list(drives)[:_MOST]
+    magnitude, phase = [], []
+    for each in shown:
+        with np.errstate(divide="ignore"):
+            size = 20.0 * np.log10(np.abs(each.value))
+        hertz, angle = each.frequency / (2.0 * np.pi), np.rad2deg(np.unwrap(np.angle(each.value)))
+        kept = size > _LOWEST
+        magnitude += rows(f=hertz[kept], v=size[kept], l=each.label, dot=each.measured)
+        phase += rows(f=hertz[kept], v=angle[kept], l=each.label, dot=each.measured)
+    labels = [each.label for each in shown]
+    high = min(_HIGHEST, max((row["v"] for row in magnitude), default=_HIGHEST))
+    low = min((row["v"] for row in magnitude), default=_LOWEST)
+    back = min((row["v"] for row in phase), default=-180.0)
+    return [
+        _over_frequency("magnitude [dB]", magnitude, labels, (low - 3.0, high + 3.0)),
+        _over_frequency("phase [°]", phase, labels, (max(back, -720.0), max((row["v"] for row in phase), default=0.0))),
+    ]
+
+
+def _over_frequency(title: str, data: Rows, labels: list[str], ends: tuple[float, float]) -> Spec:
+    encoding = {
+        "x": quantity("f", "frequency [Hz]", scale=axis_scale(log=True), axis={"grid": False, "format": "~g"}),
+        "y": quantity("v", title, scale=axis_scale(ends=ends), axis={"tickCount": 6}),
+        "color": colours({label: place for place, label in enumerate(labels)}, legend=True),
+        "tooltip": tip(f="frequency [Hz]", v=title),
+    }
+    first = f"datum.l == {json.dumps(labels[0])}"
+    layer: Rows = [
+        {
+            "params": [BOX],
+            "transform": [{"filter": f"!datum.dot && {first}"}],
+            "mark": {"type": "line", "clip": True, "strokeWidth": 4, "opacity": 0.6},
+        },
+        {  # a model that equals the drive is seen on top of it
+            "transform": [{"filter": f"!datum.dot && !({first})"}],
+            "mark": {"type": "line", "clip": True, "strokeWidth": 1.6, "strokeDash": [6, 4]},
+        },
+    ]
+    if any(row["dot"] for row in data):
+        mark = {"type": "point", "filled": True, "size": 18, "clip": True}
+        layer.append({"transform": [{"filter": "datum.dot"}], "mark": mark})
+    return figure(260, data={"values": data}, encoding=encoding, layer=layer)
+
+
+def chatter(chart: Chart) -> Spec:
+    """Return the stability chart: stiffness of the cut over the speed, lobe by lobe."""
+    data: Rows = []
+    fastest = max([2.0 * chart.speed, *(_WIDER * speed[np.argmin(k)] for speed, k in chart.lobes[:1] if k.size)])
+    for number, (speed, stiffness) in enumerate(chart.lobes):
+        kept = (stiffness < _ABOVE * chart.limit) & (speed < fastest)
+        order = np.arange(kept.sum())
+        data += rows(n=speed[kept] * _RPM, v=stiffness[kept] * 1e-3, k=order, l="lobe", d=number)
+    top = 1.05 * max(_ABOVE * chart.limit, 0.0 if np.isnan(chart.stiffness) else chart.stiffness) * 1e-3
+    limit = rows(v=np.array([chart.limit * 1e-3]), t=f"no chatter at any speed below {chart.limit * 1e-3:.4g} N/mm")
+    shade = colours({"lobe": LAST, "cut": FIRST}, legend=False)
+    layer: Rows = [
+        {
+            "params": [BOX],
+            "data": {"values": data},
+            "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
+            "encoding": {
+                "order": {"field": "k"},
+                "detail": {"field": "d"},
+                "color": shade,
+                "tooltip": tip(n="speed [1/min]", v="stiffness [N/mm]"),
+            },
+        },
+        {
+            "data": {"values": limit},
+            "mark": {"type": "rule", "strokeDash": [6, 4], "clip": True},
+            "encoding": {"x": {"value": 0}, "x2": {"value": "width"}},
+        },
+        {
+            "data": {"values": limit},
+            "mark": {"type": "text", "align": "right", "dy": 12, "clip": True, "fontSize": 11},
+            "encoding": {"x": {"value": "width"}, "text": {"field": "t"}},
+        },
+    ]
+    if not np.isnan(chart.stiffness):
+        own = rows(n=chart.speed * _RPM, v=np.array([chart.stiffness * 1e-3]), l="cut", t="cut of the scenario")
+        mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
+        layer.append({"data": {"values": own}, "mark": mark, "encoding": {"color": shade}})
+        layer += texts(own, align="left", dx=10)
+    return figure(
+        300,
+        encoding={
+            "x": quantity("n", "spindle speed [1/min]", scale=axis_scale(ends=(0.0, fastest * _RPM))),
+            "y": quantity("v", "cutting stiffness K [N/mm]", scale=axis_scale(ends=(0.0, top)), axis={"tickCount": 5}),
+        },
+        layer=layer,
+    )
+
+
+def strip(along: Along, value: float) -> str:
+    """Return an SVG of the least drive margin along a setting, with refused values shaded, and a mark at a value."""
+    wide = 1000.0
+
+    def at(number: Samples | float) -> Samples:
+        return np.asarray((number - along.setting.low) / (along.setting.high - along.setting.low) * wide)
+
+    places = at(along.values)
+    middle = np.concatenate(([places[0]], (places[1:] + places[:-1]) / 2.0, [places[-1]]))
+    drawn = [f'<svg viewBox="0 0 {wide:g} 30" preserveAspectRatio="none" role="img" aria-label="{_in_words(along)}">']
+    drawn += [
+        f'<rect class="refused" x="{middle[k]:.1f}" y="0" width="{middle[k + 1] - middle[k]:.1f}" height="30"/>'
+        for k in np.flatnonzero(along.refused)
+    ]
+    points = [
+        f"{x:.1f} {28.0 - 26.0 * min(y, 1.0):.1f}" for x, y in zip(places, along.margins, strict=True) if y >= 0.0
+    ]
+    drawn += [f'<path class="margin" d="M {" L ".join(points)}"/>'] if len(points) > 1 else []
+    drawn += [f'<path class="here" d="M {float(at(value)):.1f} 0 V 30"/>', "</svg>"]
+    return "".join(drawn)
+
+
+def _in_words(along: Along) -> str:
+    accepted = along.values[~along.refused]
+    if not accepted.size:
+        return "all values are refused"
+    return f"accepted from {accepted[0]:.4g} to {accepted[-1]:.4g} {along.setting.unit}"
