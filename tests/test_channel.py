@@ -34,6 +34,7 @@ def test_loaded_memory_goes_on_where_it_was_saved(tmp_path):
     assert first.recording.sparse[EVENTS].values["action"] == ["save"]
 
 
+@settings(max_examples=15)
 @given(st.floats(1.2, 3.4), cuts)
 def test_frozen_memory_survives_saving_and_loading_at_any_place(turns, lengths):
     """Every point of the newest cycle has its place, whatever the ring's length and wherever the spindle is."""

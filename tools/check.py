@@ -102,7 +102,7 @@ def main(arguments: list[str]) -> int:
         if against := system.provide():
             print(f"lathe: {against}", file=sys.stderr)
             return 1
-        return int(pytest.main(["-m", "system", "tests", *arguments]))
+        return int(pytest.main(["-m", "system", "--numprocesses=2", "--dist=loadfile", "tests", *arguments]))
     if "--table" in arguments:
         return slow_tests.main()
     if "--promises" in arguments:
