@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of the force and position loops of a run: figures and verdict from the messages of their controllers."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from lathe_rc import messages
 from lathe_rc.analysis.form_errors import turns_before
-from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop
+from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, Step
 from lathe_rc.analysis.tolerance import FORCE, LAST, POSITION, Growth, Quantity, Verdict, judge, swing_growth
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.recording import Recording
@@ -196,6 +196,26 @@ class LoopResult:
             "limits": found.limits and {**asdict(found.limits), "state": found.limits.state},
             "diverges": self.diverges,
         }
+
+
+def _step(of: Callable[[Step, float], float | None]) -> Callable[[LoopResult], float | None]:
+    return lambda result: of(result.found.step, result.loop.step) if result.found.step else None
+
+
+#: figures of a loop for tables, in SI units, None where there is none; and their units, empty for that of the error
+FIGURES: Mapping[str, tuple[Callable[[LoopResult], float | None], str]] = {
+    "max_error": (lambda result: float(result.found.errors.largest[-1]), ""),
+    "rms_error": (lambda result: float(result.found.errors.rms[-1]), ""),
+    "in_tolerance_from": (lambda result: (result.verdict and result.verdict.since) or None, "revolutions"),
+    "steady_error": (lambda result: result.found.steady.error if result.found.steady else None, ""),
+    "steady_deviation": (lambda result: result.found.steady.deviation if result.found.steady else None, ""),
+    "overshoot": (_step(lambda step, _: step.overshoot), ""),
+    "settling": (_step(lambda step, period: None if step.settling is None else step.settling * period), "s"),
+    "reversal_error": (lambda result: result.found.glitch if result.found.reversals else None, ""),
+    "saturated": (lambda result: float(result.found.saturated.mean()), "1"),
+    "anti_windup": (lambda result: float(result.found.held.mean()), "1"),
+    "diverges": (lambda result: float(result.diverges), "1"),
+}
 
 
 class LoopWatch:

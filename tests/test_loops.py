@@ -16,6 +16,10 @@ from lathe_rc.analysis.loop_errors import RunningLoop
 from lathe_rc.analysis.tolerance import FORCE, growth, swing_growth
 from lathe_rc.cli import main
 from lathe_rc.control.pid import Pid, PidGains
+from lathe_rc.errors import InputError
+from lathe_rc.loops import FIGURES
+from lathe_rc.sweep import LOOP_FIGURES, row
+from lathe_rc.sweep.objectives import objectives
 
 TURN = 400  # samples of a revolution in the made-up runs
 WITHOUT_A_PART = [path.stem for path in SCENARIOS if "\n/tool:" not in path.read_text(encoding="utf-8")]
@@ -193,3 +197,34 @@ def test_a_tolerance_of_a_loop_can_be_required():
     done = CliRunner().invoke(main, [*run, "position_controller.tolerance=1e-18"])
     assert done.exit_code == 1
     assert done.stderr.startswith("lathe: position_controller of approach is not in tolerance (±1e-12 µm): ")
+
+
+# --- sweeps and tunings
+
+
+@pytest.mark.parametrize(
+    ("name", "node"), [("force_turning", "force_controller"), ("full_cell", "position_controller")]
+)
+def test_a_row_of_a_sweep_has_the_figures_of_the_run(name, node):
+    cell = config(name, "spindle_encoder.revolutions=20")
+    measures = [row.measure(f"{node}.{figure}", cell) for figure in FIGURES]
+    found = row.compute(cell, {}, [], measures)
+    result = harness.run(cell)
+    assert {each.statistic: found[each.name] for each in measures} == {
+        figure: of(result.loops[node]) for figure, (of, _) in FIGURES.items()
+    }
+    assert found["digest"] == row.digest(result.recording, measures)
+    assert found[f"{node}.max_error"] == result.loops[node].found.errors.largest[-1]
+    assert row.unit(f"{node}.overshoot", cell) == ((1.0, "N") if node == "force_controller" else (1e6, "µm"))
+
+
+def test_a_tuning_takes_figures_of_loops_as_goals_and_subjects():
+    cell = config("force_turning")
+    asked = objectives(cell, ["force_controller.rms_error"], ["force_controller.diverges<=0"])
+    stable = {"status": row.DONE, "margin": None, "force_controller.rms_error": 1.0, "force_controller.diverges": 0.0}
+    assert asked.score([stable]).feasible
+    assert not asked.score([stable | {"force_controller.diverges": 1.0}]).feasible
+    assert [each.name for each in asked.measures] == ["force_controller.rms_error", "force_controller.diverges"]
+    with pytest.raises(InputError, match=r"no such column; did you mean force_controller.settling"):
+        objectives(cell, ["force_controller.setling"])
+    assert tuple(FIGURES) == LOOP_FIGURES

@@ -17,7 +17,7 @@ from lathe_rc import harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import NUMBERS, row, space, workers
+from lathe_rc.sweep import LOOP_FIGURES, NUMBERS, row, space, workers
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.sweep import Sweep
@@ -277,7 +277,10 @@ def test_the_command_of_a_finished_sweep(piston, client, tmp_path):
     assert (refused.exit_code, "learning diverges" in refused.stderr) == (2, True)
 
 
-@pytest.mark.parametrize(("words", "listed"), [("sweep run", row.STATISTICS), ("tune", (*NUMBERS, *row.STATISTICS))])
+@pytest.mark.parametrize(
+    ("words", "listed"),
+    [("sweep run", (*LOOP_FIGURES, *row.STATISTICS)), ("tune", (*NUMBERS, *LOOP_FIGURES, *row.STATISTICS))],
+)
 def test_help_lists_what_a_row_has(words, listed):
     shown = CliRunner(env={"COLUMNS": "400"}).invoke(main, [*words.split(), "--help"]).stdout
     assert [name for name in listed if name not in shown] == []

@@ -35,7 +35,7 @@ FIGURES = {"heat-map", "lines", "sensitivity", "parallel-coordinates", "yield"}
 GRID = Space(grid={LEAD: "1e-3:3e-3:9", Q: "1e-5:1e-3:7:log", LAW: ["constant_angle", "variable"]})
 
 
-def shown_page(folder, goal=page.GOAL):
+def shown_page(folder, goal=""):
     page.write(folder, goal)
     return ShownPage((folder.path / "page.html").read_text(encoding="utf-8"))
 

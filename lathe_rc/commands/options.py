@@ -8,6 +8,7 @@ import click
 
 from lathe_rc import allowed_code
 from lathe_rc.commands import completers
+from lathe_rc.sweep import LOOP_FIGURES
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 PATH = click.Path(path_type=Path)
@@ -81,7 +82,8 @@ measures = click.option(
     "measures",
     multiple=True,
     metavar="TOPIC.FIELD:STATISTIC",
-    help="more columns: max, rms, mean, peak_to_valley",
+    help="more columns: max, rms, mean, peak_to_valley; or NODE.FIGURE of a force or position controller: "
+    + ", ".join(LOOP_FIGURES),
 )
 
 scheduler = click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")

@@ -153,13 +153,18 @@ def run(
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
     """Return the cells with the smallest maximum error, and their varied parameters, errors and margins."""
-    columns = ["cell", *found.folder.targets, "tool.max_error", "tool.rms_error", "margin"]
-    table = found.table().select(columns).sort_by("tool.max_error")
-    return [each for each in table.slice(0, _BEST).to_pylist() if each["tool.max_error"] is not None]
+    from lathe_rc.sweep.page_data import default_goal
+
+    goal = default_goal(found.folder)
+    columns = ["cell", *found.folder.targets, goal, goal.replace("max_error", "rms_error")]
+    columns.append("margin" if goal.startswith("tool.") else goal.replace("max_error", "settling"))
+    table = found.table().select(columns).sort_by(goal)
+    return [each for each in table.slice(0, _BEST).to_pylist() if each[goal] is not None]
 
 
 def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) -> None:
     from lathe_rc.commands.tables import console, table
+    from lathe_rc.sweep import row
 
     statuses, top, folder = found.statuses(), best(found), found.folder
     if as_json:
@@ -172,7 +177,7 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
     if top:
         lines = table(*top[0], title="smallest errors", overflow="fold")
         for each in top:
-            lines.add_row(*(_formatted(name, value) for name, value in each.items()))
+            lines.add_row(*(_formatted(value, *row.unit(name, folder.scenario)) for name, value in each.items()))
         out.print(lines, soft_wrap=False)
     out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
     out.print(f"rows:    {folder.path}/rows")
@@ -181,9 +186,9 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
         out.print(f"figures: {written.figures[0].parent} ({len(written.figures)} PNG)")
 
 
-def _formatted(name: str, value: object) -> str:
+def _formatted(value: object, factor: float, unit: str) -> str:
     if isinstance(value, float):
-        return f"{value * 1e6:.4g} µm" if name.endswith("_error") else f"{value:.6g}"
+        return f"{value * factor:.4g} {unit}" if unit else f"{value:.6g}"
     return "" if value is None else str(value)
 
 
@@ -191,7 +196,11 @@ def _formatted(name: str, value: object) -> str:
 @click.argument("folder", type=options.PATH)
 @click.option("--cell", type=click.IntRange(0), help="run this cell again, and compare it with its row")
 @click.option("--bag", type=options.PATH, help="with --cell: folder to record it to")
-@click.option("--goal", metavar="COLUMN", help="what the page judges cells by  [default: tool.max_error]")
+@click.option(
+    "--goal",
+    metavar="COLUMN",
+    help="what the page judges cells by  [default: tool.max_error, or NODE.max_error of a loop]",
+)
 @options.allow_code
 @options.as_json
 def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, as_json: bool) -> None:
@@ -204,9 +213,9 @@ def show(folder: Path, cell: int | None, bag: Path | None, goal: str | None, *, 
     if cell is None:
         if bag:
             raise InputError(f"--bag {bag} without --cell; allowed: --cell N --bag FOLDER")
-        from lathe_rc.sweep import page, page_data
+        from lathe_rc.sweep import page
 
-        _show(found, page.write(found.folder, goal or page_data.GOAL), as_json=as_json)
+        _show(found, page.write(found.folder, goal or ""), as_json=as_json)
         return
     if goal is not None:
         raise InputError(f"--goal {goal} with --cell {cell}; allowed: one of them")

@@ -38,7 +38,8 @@ _STEPS = 5  # number of displayed steps of the history
     "goals",
     multiple=True,
     metavar="COLUMN",
-    help=f"as small as it can be, -COLUMN: as large: {', '.join(NUMBERS)} or TOPIC.FIELD:STATISTIC; repeatable",
+    help=f"as small as it can be, -COLUMN: as large: {', '.join(NUMBERS)}, NODE.FIGURE or TOPIC.FIELD:STATISTIC "
+    "as of --measure; repeatable",
 )
 @click.option("--subject", "subjects", multiple=True, metavar="COLUMN>=NUMBER", help="also <=; has to be met")
 @click.option(

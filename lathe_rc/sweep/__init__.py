@@ -18,6 +18,19 @@ NUMBERS = (
     "drive_margin",
 )  #: columns of a row that can be a goal of a tuning or a page
 OF_LEARNING = ("margin", "drive_margin")  #: those of a cell that learns; the others need a tool
+LOOP_FIGURES = (
+    "max_error",
+    "rms_error",
+    "in_tolerance_from",
+    "steady_error",
+    "steady_deviation",
+    "overshoot",
+    "settling",
+    "reversal_error",
+    "saturated",
+    "anti_windup",
+    "diverges",
+)  #: of a force or position controller
 STATISTICS = ("max", "rms", "mean", "peak_to_valley")  #: of a signal in the last revolution
 SAMPLERS = ("tpe", "cmaes", "nsga2")  #: of a tuning
 BATCH = 8  #: trials that are asked for at a time

@@ -8,7 +8,8 @@ from typing import Any, cast
 import altair as alt
 
 from lathe_rc.sweep.folder import writing
-from lathe_rc.sweep.tuning import Tuning, unit
+from lathe_rc.sweep.row import unit
+from lathe_rc.sweep.tuning import Tuning
 
 _WIDTH, _HEIGHT = 560, 300
 _START, _FEASIBLE, _OTHER, _BEST = "#e08e0b", "#1f6f8b", "#c8cdd0", "#c0392b"
@@ -16,7 +17,7 @@ _KINDS = ("start", "meets all subjects", "does not")
 
 
 def _title(tuning: Tuning, column: str) -> str:
-    percentile, name = tuning.objectives.percentile, unit(column)[1]
+    percentile, name = tuning.objectives.percentile, unit(column, tuning.folder.scenario)[1]
     over = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g}th percentile"
     return f"{column}{over}{f' [{name}]' if name else ''}"
 
@@ -28,12 +29,13 @@ def chart(tuning: Tuning) -> alt.LayerChart:
     against the first.
     """
     columns = [goal.column for goal in tuning.objectives.goals]
+    factors = {column: unit(column, tuning.folder.scenario)[0] for column in columns}
     front = {trial.number for trial in tuning.front}
     improvements = {trial.number for trial in tuning.improvements}
     rows: list[dict[str, Any]] = []
     best: float | None = None
     for trial in tuning.trials:
-        goals = [value * unit(column)[0] for column, value in tuning.goals(trial).items()]
+        goals = [value * factors[column] for column, value in tuning.goals(trial).items()]
         first, second = (value if math.isfinite(value) else None for value in (goals[0], goals[-1]))
         best = first if trial.number in improvements else best
         kind = _KINDS[0] if trial.number == 0 else _KINDS[1] if trial.score.feasible else _KINDS[2]

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc import messages
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
@@ -152,7 +151,7 @@ def objectives(
 
     Args:
         scenario: scenario to be tuned.
-        goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC``.
+        goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE``.
         constraints: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
         measures: further columns.
         percentile: see `Objectives`.
@@ -169,19 +168,19 @@ def objectives(
     measured = dict.fromkeys(row.measure(text, scenario) for text in measures)
     cell = Cell(scenario.nodes)
     learns = any(isinstance(stage, Learner) for stage in cell.stages.values())
-    has_tool = any(source.type == messages.TOOL for source in cell.dense.values())
+    has_tool, of_loops = row.has_tool(scenario), row.figures(scenario)
     for what, column in [("goal", goal.column) for goal in wanted] + [("subject", limit.column) for limit in limits]:
-        if ":" in column:
+        if ":" in column or column in of_loops:
             measured[row.measure(column, scenario)] = None
         elif column not in NUMBERS:
-            told = instead(column, NUMBERS)
+            told = instead(column, [*NUMBERS, *of_loops])
             told = told if told.startswith("allowed") else f"{told} (or TOPIC.FIELD:STATISTIC)"
             raise InputError(f"{what} {shown(column)!r}: no such column; {told}")
         elif not (learns if column in OF_LEARNING else has_tool):
             missing = "learning controller" if column in OF_LEARNING else "tool"
             raise InputError(
                 f"{what} {column}: there is no {missing} in {scenario.name}; "
-                f"allowed: TOPIC.FIELD:STATISTIC, such as {next(iter(cell.dense))}.FIELD:rms"
+                f"allowed: {next(iter(of_loops), f'TOPIC.FIELD:STATISTIC, such as {next(iter(cell.dense))}.FIELD:rms')}"
             )
     if len({goal.column for goal in wanted}) < len(wanted):
         raise InputError("a goal is given twice; allowed: each once")

@@ -22,7 +22,7 @@ from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.page_data import GOAL, PageData, text_of
+from lathe_rc.sweep.page_data import PageData, default_goal, text_of
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.view.charts import Charts, page_template
 
@@ -54,12 +54,12 @@ class Written:
     figures: Sequence[Path]
 
 
-def write(folder: Folder, goal: str = GOAL) -> Written:
+def write(folder: Folder, goal: str = "") -> Written:
     """Write the page of a sweep, and its figures as PNGs, into the sweep's folder; existing files are replaced.
 
     Args:
         folder: folder of the sweep; the page shows the cells computed so far.
-        goal: column by which the cells are ranked.
+        goal: column by which the cells are ranked, see `PageData`.
 
     Raises:
         InputError: there is no such goal.
@@ -93,6 +93,7 @@ def _text(seen: PageData, drawn: Charts) -> str:
     return page_template(Path(__file__).with_name("page.html.j2")).render(
         title=f"Sweep of {seen.folder.scenario.name}",
         goal=seen.goal,
+        default_goal=default_goal(seen.folder),
         cells=len(seen.cells),
         facts=_facts(seen, done),
         asked=seen.asked(),
@@ -255,7 +256,11 @@ def _parallel(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:
 def _best(seen: PageData) -> dict[str, Any]:
     """Return the table of the best cells, with their parameters and goals."""
     places = seen.goal.order[:_BEST].tolist()
-    others = [goal for goal in seen.goals if goal is not seen.goal and goal.name in ("tool.rms_error", "margin")]
+    others = [
+        goal
+        for goal in seen.goals
+        if goal is not seen.goal and goal.name.endswith((".rms_error", ".settling", "margin"))
+    ]
     goals = [seen.goal, *others]
     some = seen.table.take(places)
     columns = [

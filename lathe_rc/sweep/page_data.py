@@ -11,16 +11,22 @@ from numpy.typing import NDArray
 
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
+from lathe_rc.loops import loops
 from lathe_rc.names import instead
-from lathe_rc.sweep import NUMBERS, OF_LEARNING
+from lathe_rc.sweep import NUMBERS, OF_LEARNING, row
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
 
-GOAL = "tool.max_error"
+GOAL = "tool.max_error"  #: default goal; without a tool the largest error of the first loop
 _LARGE = OF_LEARNING  # goals that are better the larger they are
-_UNITS = {"tool.in_tolerance_from": "revolutions"}
 _MOST_TEXTS = 24  # strings of an axis with separate colours; the others share one
+
+
+def default_goal(folder: Folder) -> str:
+    """Return the column by which cells are ranked if none is asked for."""
+    loops = (each.name for each in folder.measures if each.node and each.statistic == "max_error")
+    return GOAL if row.has_tool(folder.scenario) else next(loops, GOAL)
 
 
 class PageData:
@@ -28,7 +34,7 @@ class PageData:
 
     Args:
         folder: folder of the sweep.
-        goal: column by which the cells are ranked.
+        goal: column by which the cells are ranked; empty: the largest error of the part, or of the first loop.
 
     Attributes:
         folder: see above.
@@ -42,8 +48,9 @@ class PageData:
         InputError: there is no such goal.
     """
 
-    def __init__(self, folder: Folder, goal: str = GOAL) -> None:
+    def __init__(self, folder: Folder, goal: str = "") -> None:
         known = [*NUMBERS, *(each.name for each in folder.measures)]
+        goal = goal or default_goal(folder)
         if goal not in known:
             raise InputError(
                 f"--goal {shown(goal)!r}: no such number in a row of {folder.path}; {instead(goal, known)}"
@@ -59,9 +66,8 @@ class PageData:
 
     def _goal(self, name: str) -> Goal:
         values = self.table.column(name).to_numpy().astype(np.float64)
-        length = name.startswith("tool.") and name.endswith("_error")
-        values = np.where(np.isfinite(values), values * (1e6 if length else 1.0), np.nan)
-        unit = "µm" if length else _UNITS.get(name, "")
+        factor, unit = row.unit(name, self.folder.scenario)
+        values = np.where(np.isfinite(values), values * factor, np.nan)
         return Goal(name, f"{name} [{unit}]" if unit else name, unit, values, name in _LARGE)
 
     def _axis(self, target: str) -> Axis:
@@ -130,12 +136,14 @@ class PageData:
 
     @property
     def tolerance(self) -> float | None:
-        """Tolerance of the form error, in the unit of the goal; None: not set, varied, or of another goal."""
-        scenario = self.folder.scenario
-        if self.goal.name != GOAL or any(target.endswith(".tolerance") for target in self.folder.targets):
+        """Tolerance of the goal's error, in the unit of the goal; None: not set, varied, or of another goal."""
+        scenario, name = self.folder.scenario, self.goal.name
+        if any(target.endswith(".tolerance") for target in self.folder.targets):
             return None
         tools = [cast("ToolParameters", scenario.nodes[node]) for node in scenario.of_kind("tool")]
-        return tools[0].tolerance * 1e6 if tools and tools[0].tolerance else None
+        allowed = {GOAL: tools[0].tolerance} if tools else {}
+        allowed |= {f"{loop.node}.max_error": loop.tolerance for loop in loops(scenario.nodes)}
+        return allowed[name] * row.unit(name, scenario)[0] if allowed.get(name) else None
 
 
 def text_of(value: object) -> str:

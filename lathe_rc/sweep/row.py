@@ -15,6 +15,7 @@
 | drive_margin | smallest relative error of the drive's response, at one frequency, with which learning diverges |
 | limits | nodes that reached a limit of a command or a stroke |
 | TOPIC.FIELD:STATISTIC | a measure of the last revolution |
+| NODE.FIGURE | a figure of a force or position loop: always without a tool, otherwise if it is asked for |
 | revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
 | seed, version, digest | seed of the random parts; version of lathe_rc; see `digest` |
 """
@@ -46,6 +47,7 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.loops import FIGURES, loops, watches
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
@@ -78,28 +80,62 @@ _TAIL = {
 
 
 class Measure(NamedTuple):
-    """Measure of a run: a statistic of a topic's field over the last revolution."""
+    """Measure of a run: a statistic of a topic's field over the last revolution, or a figure of a loop.
+
+    Attributes:
+        topic, field: signal; for a loop the error that its controller sees, which is part of the digest.
+        statistic: one of `STATISTICS`, or of `lathe_rc.loops.FIGURES`.
+        node: controller of the loop; empty for a signal.
+    """
 
     topic: str
     field: str
     statistic: str
+    node: str = ""
 
     @property
     def name(self) -> str:
         """Name of the measure's column."""
-        return f"{self.topic}.{self.field}:{self.statistic}"
+        return f"{self.node}.{self.statistic}" if self.node else f"{self.topic}.{self.field}:{self.statistic}"
+
+
+def figures(scenario: Scenario) -> dict[str, Measure]:
+    """Return the figures of a scenario's force and position loops, by column."""
+    measures = [Measure(loop.topic, "error", figure, loop.node) for loop in loops(scenario.nodes) for figure in FIGURES]
+    return {each.name: each for each in measures}
+
+
+def has_tool(scenario: Scenario) -> bool:
+    """Return whether cells of a scenario have a form error."""
+    return any(source.type == messages.TOOL for source in Cell(scenario.nodes).dense.values())
+
+
+def unit(column: str, scenario: Scenario) -> tuple[float, str]:
+    """Return the display unit of a column: the factor from SI units, and the unit's name."""
+    node, _, name = column.rpartition(".")
+    loop = next((loop for loop in loops(scenario.nodes) if loop.node == node), None)
+    if loop and name in FIGURES:
+        told = FIGURES[name][1]
+        return (1.0, told.removeprefix("1")) if told else (loop.quantity.scale, loop.quantity.unit)
+    if name == "in_tolerance_from":
+        return 1.0, "revolutions"
+    return (1e6, "µm") if name.endswith("_error") else (1.0, "")
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """Parse a measure ``TOPIC.FIELD:STATISTIC``.
+    """Parse a measure ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE``.
 
     Raises:
-        InputError: the topic, the field or the statistic is unknown.
+        InputError: the topic, the field, the statistic or the figure is unknown.
     """
+    of_loops = figures(scenario)
+    if text in of_loops:
+        return of_loops[text]
     place, colon, statistic = text.partition(":")
     topic, dot, field = place.removeprefix("/").rpartition(".")
     if not colon or not dot:
-        raise InputError(f"measure {text!r}; allowed: TOPIC.FIELD:STATISTIC, such as coarse/state.effort:max")
+        loop = f", or {instead(text, of_loops).removeprefix('allowed: ')}" if of_loops else ""
+        raise InputError(f"measure {text!r}; allowed: TOPIC.FIELD:STATISTIC, such as coarse/state.effort:max{loop}")
     dense = Cell(scenario.nodes).dense
     if topic not in dense:
         raise InputError(f"measure {text!r}: no topic {topic!r} in the cell; {instead(topic, dense)}")
@@ -128,10 +164,18 @@ class _Keeper(Errors):
         super().__init__(cell, samples)
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self.heard = [*self.heard, *self._events, *(f"{asked.topic}.{asked.field}" for asked in measures)]
+        asked_of = {asked.node for asked in measures}
+        tables = {name: stage.shared for name, stage in cell.stages.items() if name in asked_of}
+        self._loops = watches(loops(tables), {topic: source.type for topic, source in cell.dense.items()})
+        self.heard += [f"{watch.topics[1]}.{field}" for watch in self._loops for field in ("set_point", "command")]
         self._limited: set[str] = set()
         tools = [stage for stage in cell.stages.values() if isinstance(stage, Tool)]
         self._tolerance = tools[0].parameters.tolerance if tools else 0.0
-        self._measures = [(each, np.empty(samples)) for each in measures]
+        self._measures = measures
+        # The digest of a cell without a tool is that of what is measured.
+        self._signals = {
+            (each.topic, each.field): np.empty(samples) for each in measures if not (each.node and self._tool)
+        }
         self._turns = RunningErrors()  # a cell without a tool has no form error, but revolutions all the same
         self._hash = xxhash.xxh3_128()
 
@@ -148,8 +192,10 @@ class _Keeper(Errors):
             if first == self._first > 0:
                 self._turns = RunningErrors(turns_before(angle))
             self._turns.add(angle, angle)
-        for asked, kept in self._measures:
-            kept[first - self._first :][:samples] = dense[asked.topic][asked.field]
+        for (topic, field), kept in self._signals.items():
+            kept[first - self._first :][:samples] = dense[topic][field]
+        for watch in self._loops:
+            watch.chunk(first, samples, dense, sparse)
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
         """Return the result columns of a completed run."""
@@ -158,9 +204,14 @@ class _Keeper(Errors):
         found: dict[str, Any] = {
             "limits": ", ".join(sorted(self._limited)),
             "revolutions": errors.rms.size,
-            "digest": _told(self._hash) if self._tool else _digest([kept for _, kept in self._measures]),
-            **{asked.name: STATISTICS[asked.statistic](kept[last]) for asked, kept in self._measures},
+            "digest": _told(self._hash) if self._tool else _digest(list(self._signals.values())),
         }
+        results = {watch.loop.node: watch.result() for watch in self._loops}
+        for each in self._measures:
+            if not each.node:
+                found[each.name] = STATISTICS[each.statistic](self._signals[each.topic, each.field][last])
+            elif (result := results[each.node]).found.errors.rms.size:
+                found[each.name] = FIGURES[each.statistic][0](result)
         if errors.rms.size:
             for name, values in (("max", errors.largest), ("rms", errors.rms)):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
@@ -178,7 +229,8 @@ def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
     """
     if messages.TOOL in (recording.types[topic] for topic in recording.dense):
         return _digest([recording.of_type(messages.TOOL)["error"]])
-    return _digest([recording.dense[messages.full(each.topic)][each.field] for each in measures])
+    signals = dict.fromkeys((messages.full(each.topic), each.field) for each in measures)
+    return _digest([recording.dense[topic][field] for topic, field in signals])
 
 
 def _digest(kept: Sequence[Samples]) -> str | None:

@@ -95,7 +95,8 @@ def run_sweep(
         scenario: the cell to vary; it must specify a number of revolutions.
         space: variations of the cell.
         folder: folder of the results; an interrupted sweep is continued, and further spaces are added.
-        measures: further columns, ``TOPIC.FIELD:STATISTIC``.
+        measures: further columns, ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE`` of a loop; a cell without a tool has
+            all figures of its loops.
         models: drive models of controllers, if the scenario does not set them: ``follow`` the varied drives, or
             stay ``nominal``, as for one controller design for many drives.
         scheduler: address of a Dask scheduler; None: workers on this machine.
@@ -116,7 +117,8 @@ def run_sweep(
         >>> lathe_rc.run_sweep(piston, space, "leads")
         <Sweep of piston in leads: 2 done, 1 refused>
     """
-    asked = [row.measure(text, scenario) for text in measures]
+    standard = [] if row.has_tool(scenario) else row.figures(scenario)
+    asked = [row.measure(text, scenario) for text in dict.fromkeys([*standard, *measures])]
     space = Space(**space.to_json())
     scenario = scenario.with_models_given() if models == "nominal" else scenario
     space.check(scenario)

@@ -69,7 +69,7 @@ def tune(
         seed: random seed of the search.
         batch: number of trials that are drawn together, before any of them has a score.
         ask_formulas: whether trial 1 uses the values given by `lathe_rc.sweep.formulas`, if they are within the ranges.
-        measures: further columns, ``TOPIC.FIELD:STATISTIC``.
+        measures: further columns, ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE`` of a loop.
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.

@@ -13,6 +13,7 @@ from lathe_rc import files
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
+from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder, writing
 from lathe_rc.sweep.formulas import Found
 from lathe_rc.sweep.objectives import Objectives, Score
@@ -32,11 +33,6 @@ class Trial(NamedTuple):
     number: int
     values: Mapping[str, Value]
     score: Score
-
-
-def unit(column: str) -> tuple[float, str]:
-    """Return the display unit of a column: the factor from SI units, and the unit's name."""
-    return (1e6, "µm") if column.endswith("_error") else (1.0, "")
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,7 +132,7 @@ class Tuning:
         """Format the goal values of a trial with their units, by column."""
         found = {}
         for column, value in self.goals(trial).items():
-            factor, name = unit(column)
+            factor, name = row.unit(column, self.folder.scenario)
             found[column] = f"{value * factor:.4g} {name}".rstrip() if math.isfinite(value) else "none"
         return found
 
