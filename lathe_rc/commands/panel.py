@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 
 from lathe_rc import allowed_code
-from lathe_rc.commands import options
+from lathe_rc.commands import measured, options
+from lathe_rc.errors import InputError
 
 
 @click.command()
@@ -30,13 +31,22 @@ def panel(
 ) -> None:
     """Show a SCENARIO at work on one page in the browser, which also commands it, without ROS or network.
 
-    Ctrl-C ends it.
+    Instead of a scenario, a bag is played. Ctrl-C ends it.
     """
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.view import page_server
     from lathe_rc.view import panel as panels
+    from lathe_rc.view.panel_player import Player
     from lathe_rc.view.panel_run import Driver, LiveCell
 
+    if measured.is_bag(Path(scenario)):
+        given = {"--revolutions": revolutions, "--from": start_from, "--set": overrides}
+        if wrong := [name for name, value in given.items() if value]:
+            raise InputError(f"{wrong[0]} with the bag {scenario}; allowed: with a scenario")
+        player = Player(Path(scenario))
+        with Driver(player, pace) as driver:
+            page_server.serve(panels.player_site(driver, player), port, click.echo, browser=not no_browser)
+        return
     allowed_code.allow_own_code()
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
     cell = LiveCell(loaded, compiling=lambda names: click.echo(f"compiling {', '.join(names)}", err=True))

@@ -65,7 +65,9 @@ function trouble(text) {
   $("trouble").hidden = !text;
 }
 
-function draw(changed) {
+let changedSince = false, drawnAt = 0;
+const CALM = 400; // [ms] between drawings of revolutions, which take the browser longest
+function draw(changed, moving = true) {
   const now = SHOWN.now, revolution = (now.angle || 0) / (2 * Math.PI);
   $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0} of ${now.samples}`
     + (now.factor ? `, ${digits(now.factor, 2)} × real time` : "") + (now.bag ? `, recording ${now.bag}` : "");
@@ -79,7 +81,11 @@ function draw(changed) {
   drawSafety(now.safety);
   drawMachine(now);
   drawDials(now);
-  if (changed) { drawMap(); drawWaterfall(); drawHistory(); }
+  changedSince ||= changed;
+  if (changedSince && (!moving || performance.now() - drawnAt > CALM)) {
+    drawMap(); drawWaterfall(); drawHistory();
+    [changedSince, drawnAt] = [false, performance.now()];
+  }
   drawLog();
 }
 
@@ -137,7 +143,7 @@ function drawMachine(now) {
     const width = coarse ? base - left : 70 - um * shown;
     parts.push(`<rect x="${left}" y="${cy - 20}" width="${width}" height="40" rx="3" fill="${field}" stroke="${ink}"/>`);
     text(left + width / 2, cy + 5, name, 'text-anchor="middle"');
-    text(left + width / 2, cy + 40 + 20 * (k % 2), `${digits(um)} µm, ×${digits(shown / MM * 1e3, 1)}`, 'text-anchor="middle"');
+    text(left + width / 2, cy - 28 - 20 * (k % 2), `${digits(Math.abs(um) < 1e-4 ? 0 : um)} µm, ×${digits(shown / MM * 1e3, 1)}`, 'text-anchor="middle"');
     left += width;
   });
   parts.push(`<rect x="${left}" y="${cy - 34}" width="${Math.max(40, 560 - left)}" height="68" fill="${line}" stroke="${soft}"/>`);
@@ -237,7 +243,7 @@ function drawMap() {
     }
     pen.stroke();
   }
-  const told = row => ABOUT.fed ? `${digits(row.height, 3)} mm` : String(row.revolution);
+  const told = row => ABOUT.fed ? `${row.height.toFixed(2)} mm` : String(row.revolution);
   for (const k of new Set([0, rows.length >> 1, rows.length - 1])) label(pen, told(rows[k]), left - 5, Math.min(top + (k + 0.7) * tall, bottom), soft, "right");
   label(pen, ABOUT.fed ? "height" : "revolution", 2, bottom + 14, soft);
   for (let x = 0; x < 160; x++) { pen.fillStyle = `rgb(${colour(x / 80 - 1)})`; pen.fillRect(left + x, bottom + 22, 1, 8); }
@@ -251,7 +257,8 @@ function drawWaterfall() {
   const rows = SHOWN.latest, tall = (bottom - top) / WATERFALL, tolerance = ABOUT.tolerance;
   angles(pen, left, right, height - 6, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
-  const newest = rows.slice(-3).map(row => Math.max(...row.cells.map(Math.abs))), most = nice(Math.max(...newest, tolerance, 1e-6)), scale = 0.5 * tall / most;
+  const largest = rows.map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
+  const most = nice(Math.max(largest[rows.length >> 1], tolerance, 1e-6)), scale = 0.5 * tall / most;
   rows.forEach((row, k) => {
     const y = top + (k + 0.5 + WATERFALL - rows.length) * tall, x = column => left + (right - left) * (column + 0.5) / row.cells.length;
     if (tolerance) { pen.globalAlpha = 0.5; pen.fillStyle = line; pen.fillRect(left, y - tolerance * scale, right - left, 2 * tolerance * scale); pen.globalAlpha = 1; }
@@ -288,7 +295,7 @@ function drawHistory() {
     pen.setLineDash([6, 4]);
     pen.beginPath(); pen.moveTo(left, y(ABOUT.tolerance)); pen.lineTo(right, y(ABOUT.tolerance)); pen.stroke();
     pen.setLineDash([]);
-    label(pen, "tolerance", left + 6, y(ABOUT.tolerance) - 4, bad);
+    label(pen, "tolerance", right - 4, y(ABOUT.tolerance) - 4, bad, "right");
   }
   const every = Math.max(1, Math.floor(found.length / 2000)), ends = {};
   for (const [name, which, colour] of [["largest", 2, soft], ["RMS", 1, good]]) {
@@ -348,7 +355,7 @@ function describe() { // fills the commands from what the cell tells of itself
       input.addEventListener("change", async () => {
         if (!await tell("act", { node: node.name, action: `set ${knob.name} ${input.value}` })) input.value = knob.value; else knob.value = input.value;
       });
-      label.append(`${knob.name} `, input, ` ${knob.unit}`);
+      label.append(`${knob.name} `, input, knob.unit == "1" ? "" : ` ${knob.unit}`);
       row.append(label);
     }
     return row;
@@ -397,6 +404,7 @@ $("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pa
 $("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
 for (const format of ["stl", "glb"]) $(format).addEventListener("click", () => tell("part", { format, enlarged: Number($("enlarged").value) }));
 $("picture").addEventListener("click", async () => {
+  draw(true, false);
   const picture = await drawn();
   picture.toBlob(blob => save(`${ABOUT.name}.png`, blob));
 });
@@ -426,7 +434,7 @@ async function drawn() { // the drawings of the page beside each other, as one p
   return picture;
 }
 
-const redraw = () => requestAnimationFrame(() => draw(true));
+const redraw = () => requestAnimationFrame(() => draw(true, false));
 addEventListener("resize", redraw);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 follow();

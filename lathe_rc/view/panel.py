@@ -8,12 +8,11 @@ from typing import Any
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
-from lathe_rc.cell.stages.force_controller import ForceControllerParameters
-from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
 from lathe_rc.safety import faults
 from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
+from lathe_rc.view.panel_outlook import outlook
+from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, news
 
@@ -29,6 +28,31 @@ def page() -> Page:
 def site(driver: Driver, cell: LiveCell) -> Site:
     """Return the panel of an offline cell."""
     return Site({"": page()}, {**playing(driver, lambda: outlook(cell.scenario)), **_commands(driver, cell)})
+
+
+def player_site(driver: Driver, player: Player) -> Site:
+    """Return the panel of a bag."""
+
+    def start(_: Mapping[str, Any]) -> object:
+        def again() -> None:
+            if player.reached >= player.samples:
+                player.seek(player.first)
+            driver.start()
+
+        driver.call(again)
+        return {}
+
+    def seek(question: Mapping[str, Any]) -> object:
+        def moved() -> None:
+            player.seek(int(_number(question, "sample")))
+            driver.again()
+
+        driver.call(moved)
+        return {}
+
+    about = {**player.outlook, "live": False, "nodes": [], "faults": {}, "parameters": []}
+    answers = {"about": lambda _: about, "seek": seek, "start": start}
+    return Site({"": page()}, {**playing(driver, lambda: player.outlook), **answers})
 
 
 def playing(driver: Driver, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str, Answer]:
@@ -127,24 +151,6 @@ def about(cell: LiveCell) -> dict[str, Any]:
             for name, kind in faults.KINDS.items()
         },
         "parameters": [f"{node}.{name}" for node, table in scenario.nodes.items() for name in table.rows()],
-    }
-
-
-def outlook(scenario: Scenario) -> dict[str, Any]:
-    """Return the name, tolerance and shape of a scenario, for the drawings of the page; lengths in µm and mm."""
-    tables = list(scenario.nodes.values())
-    tool = next((table for table in tables if isinstance(table, ToolParameters)), None)
-    cut = next((table for table in tables if isinstance(table, CuttingProcessParameters)), None)
-    force = next((table for table in tables if isinstance(table, ForceControllerParameters)), None)
-    return {
-        "name": scenario.name,
-        "step": scenario.shared.step,
-        "tolerance": tool.tolerance * 1e6 if tool else 0.0,
-        "fed": bool(tool and (tool.feed or tool.height_from == "slide")),
-        "gaps": list(zip(cut.gap_start, cut.gap_width, strict=True)) if cut else [],
-        "radius": 1e3 * (cut.radius if cut else tool.part_radius if tool else 0.05),
-        "rpm": scenario.shared.nominal_rpm,
-        "force": max(force.set_point, default=0.0) if force else 0.0,
     }
 
 

@@ -293,6 +293,7 @@ class LiveCell:
         sinks: list[Sink] = [self.view, self._recorder] if self._recorder else [self.view]
         self._engine.advance(min(end, self.reached + self._engine.piece), sinks)
         if self.reached >= self.samples:
+            self.view.finish()
             self.record("")
 
     def turn_end(self) -> int:

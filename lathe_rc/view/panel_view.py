@@ -8,7 +8,7 @@ browser misses snapshots and delays nothing.
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -197,7 +197,14 @@ class View:
             name: float(tool[name][-1]) * _UM for name in ("reference", "displacement", "error", "measured_error")
         }
         self._now["height"] = float(tool["height"][-1]) * 1e3
-        for revolution in self._revolutions.add(first, angle, tool["error"], tool["reference"], tool["height"]):
+        self._add(self._revolutions.add(first, angle, tool["error"], tool["reference"], tool["height"]))
+
+    def finish(self) -> None:
+        """Show the last revolution as well, at the end of a run."""
+        self._add(self._revolutions.finish())
+
+    def _add(self, complete: Iterable[Revolution]) -> None:
+        for revolution in complete:
             row = _row(revolution)
             rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
             self._history.append((revolution.number, rms, largest))

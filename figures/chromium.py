@@ -1,27 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium that a test drives while a page is at work, by the DevTools protocol over pipes."""
+"""Headless Chromium with one page, driven by the DevTools protocol over pipes; also used by the tests of the panel."""
 
 import base64
 import json
 import os
 import subprocess
 import time
+from pathlib import Path
+from typing import Any, NoReturn
 
 
 class Chromium:
-    """One page.
+    """Browser with one page.
 
     Args:
-        folder: of the browser's profile and of what it saves.
+        folder: folder of its profile and of saved files.
 
     Attributes:
-        told: what the page wrote to the console, and its uncaught errors.
-        asked: addresses that it asked for.
+        told: console messages and uncaught errors of the page.
+        asked: addresses that it has requested.
     """
 
-    def __init__(self, folder):
-        self._folder, self._number = folder, 0
-        self.told, self.asked = [], []
+    def __init__(self, folder: Path) -> None:
+        self._number = 0
+        self.told: list[str] = []
+        self.asked: list[str] = []
         commands, self._commands = os.pipe()
         self._answers, answers = os.pipe()
         words = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]
@@ -39,25 +42,26 @@ class Chromium:
             self.call(f"{domain}.enable")
         self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
 
-    def __enter__(self):
+    def __enter__(self) -> "Chromium":
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait()
         os.close(self._commands)
         os.close(self._answers)
 
-    def _read(self):
+    def _read(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
             self._rest += os.read(self._answers, 2**16) or self._ended()
         message, _, self._rest = self._rest.partition(b"\0")
         return json.loads(message)
 
-    def _ended(self):
-        raise AssertionError(f"chromium has ended with {self._process.wait()}")
+    def _ended(self) -> NoReturn:
+        raise RuntimeError(f"chromium has ended with {self._process.wait()}")
 
-    def call(self, method, **params):
+    def call(self, method: str, **params: object) -> Any:
+        """Call a method of the protocol and return its result."""
         self._number += 1
         question = {"id": self._number, "method": method, "params": params}
         if self._session:
@@ -78,35 +82,38 @@ class Chromium:
             elif message["method"] == "Network.requestWillBeSent":
                 self.asked.append(told["request"]["url"])
 
-    def look(self, width, height, *, dark=False):
-        """Size of the window, and the user's colours."""
+    def look(self, width: int, height: int, *, dark: bool = False) -> None:
+        """Set the size of the window and the user's colours."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
         wanted = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[wanted])
 
-    def open(self, address):
+    def open(self, address: str) -> None:
+        """Go to an address."""
         self.call("Page.navigate", url=address)
 
-    def run(self, script):
-        """The value of an expression, or what it promises."""
+    def run(self, script: str) -> Any:
+        """Return the value of an expression, after waiting for a promise."""
         found = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def until(self, script, seconds=60.0):
-        """The first true value of an expression."""
+    def until(self, script: str, seconds: float = 60.0) -> Any:
+        """Return the first true value of an expression."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             if found := self.run(f"(() => {{ try {{ return {script}; }} catch (error) {{ return null; }} }})()"):
                 return found
             self.run("new Promise(done => setTimeout(done, 50))")
-        raise AssertionError((script, self.run("document.body?.innerText")))
+        raise TimeoutError((script, self.run("document.body?.innerText")))
 
-    def click(self, selector):
+    def click(self, selector: str) -> None:
+        """Click the first element that a selector finds."""
         self.run(f"document.querySelector({json.dumps(selector)}).click()")
 
-    def shot(self, file, *, whole=True):
-        found = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+    def shot(self, file: Path) -> None:
+        """Write a picture of the whole page."""
+        found = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
         file.write_bytes(base64.b64decode(found["data"]))

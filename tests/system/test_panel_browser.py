@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The panel in a real browser, wide and narrow, light and dark."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from matplotlib.image import imread
+
+import lathe_rc
+from chromium import Chromium
+from lathe_rc import harness
+from lathe_rc.cell.scenario import load
+from lathe_rc.view import page_server, panel
+from lathe_rc.view.panel_run import Driver, LiveCell
+
+pytestmark = pytest.mark.system
+
+ROOT = Path(__file__).parents[2]
+STATE = "SHOWN.now.safety.state"
+
+
+@pytest.fixture
+def page(tmp_path):
+    """The panel of the full cell under a supervisor, and the address that it has in the browser."""
+    cell = LiveCell(load(ROOT / "config" / "supervised_full_cell.yaml", ["spindle_encoder.revolutions=60"]))
+    with (
+        Driver(cell, 0.0) as driver,
+        page_server.serving(panel.site(driver, cell)) as address,
+        Chromium(tmp_path) as browser,
+    ):
+        browser.look(1440, 1000)
+        browser.open(address)
+        browser.until("SHOWN.now.state == 'paused'")
+        yield browser, cell
+        own = address.partition("?")[0]
+        # The browser counts refused commands as errors, and has advice on the way in which a test reads pixels.
+        assert [line for line in browser.told if "400 (" not in line and "readback" not in line] == []
+        assert [each for each in browser.asked if not each.startswith((own, "data:", "blob:", "about:"))] == []
+
+
+def submit(browser, form, button, **values):
+    for name, value in values.items():
+        script = f"(field => {{ field.value = {value!r}; field.dispatchEvent(new Event('change')); }})"
+        browser.run(f"{script}(document.getElementById('{form}').elements['{name}'])")
+    browser.click(f"#{form} {button}")
+
+
+def saved(folder, name):
+    """The file of a name, once the browser has written it."""
+    for _ in range(200):
+        if (folder / name).exists() and not list(folder.glob("*.crdownload")):
+            return folder / name
+        threading.Event().wait(0.05)
+    raise AssertionError(sorted(folder.iterdir()))
+
+
+def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tmp_path):
+    """Revolutions, a fault and the supervisor's reaction, reset and retraction; the part as STL and GLB, a picture."""
+    browser, cell = page
+    submit(browser, "record", "button", bag=str(tmp_path / "bag"))
+    browser.until("SHOWN.now.bag")
+    browser.click("#step")
+    assert browser.until("SHOWN.now.state == 'paused' && SHOWN.history.length") == 1
+    browser.click("#go")
+    browser.until("SHOWN.history.length > 12")
+    browser.click("#go")
+    browser.until("SHOWN.now.state == 'paused'")
+    # The part so far
+    for name in ("stl", "glb"):
+        browser.click(f"#{name}")
+    part = trimesh.load(saved(tmp_path, "supervised_full_cell.stl"))
+    assert part.is_watertight
+    across, deep, along = part.extents
+    assert (across, deep) == (pytest.approx(100.4, abs=0.5), pytest.approx(99.7, abs=0.5))
+    assert along == pytest.approx(browser.run("SHOWN.rows.at(-1).height - SHOWN.rows[0].height"), rel=0.02)
+    beside = trimesh.load(saved(tmp_path, "supervised_full_cell.glb"), force="mesh")
+    assert beside.extents * 1e3 == pytest.approx(part.extents, abs=0.01)
+    assert len(np.unique(beside.visual.vertex_colors, axis=0)) > 20
+    browser.click("#picture")
+    picture = imread(saved(tmp_path, "supervised_full_cell.png"))
+    assert picture.shape[1] > 2000
+    assert len(np.unique((picture[::7, ::7, :3] * 255).astype(int).reshape(-1, 3), axis=0)) > 100
+    # A fault, and what the supervisor makes of it
+    target = "coarse/state.measured_position"
+    submit(browser, "fault", "button", node="electrodynamic_actuator", target=target, kind="stuck")
+    browser.click("#go")
+    browser.until(f"{STATE} != 'nominal'")
+    assert "limit" in browser.until("document.getElementById('alarm').textContent")
+    browser.click("#repair")
+    browser.until(f"{STATE} == 'safe'")
+    log = browser.run("document.getElementById('log').textContent")
+    assert f"electrodynamic_actuator/events: fault {target} stuck" in log
+    assert "error tool" in log
+    assert "µm, limit 30 µm: retracting, retract" in log
+    for action, told in (("reset", "reset"), ("retract", "operator")):
+        buttons = "[...document.querySelectorAll('#actions button')]"
+        browser.run(f"{buttons}.find(each => each.textContent == '{action}').click()")
+        browser.until(f"SHOWN.log.some(line => line.source == 'safety/status' && line.text.startsWith('{told}'))")
+    browser.until("SHOWN.now.state == 'ended'")
+    # The same events without the panel give the same run
+    given = [f"{node}.events={events!r}" for node, events in cell.events.items()]
+    again = load(ROOT / "config" / "supervised_full_cell.yaml", ["spindle_encoder.revolutions=60", *given])
+    assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(again).digest
+
+
+def test_the_page_fits_its_window_in_light_and_dark(page):
+    browser, _ = page
+    browser.click("#go")
+    browser.until("SHOWN.history.length > 5")
+    browser.click("#go")
+    for width in (1440, 420):
+        for dark in (False, True):
+            browser.look(width, 900, dark=dark)
+            paper = "rgb(22, 24, 26)" if dark else "rgb(255, 255, 255)"
+            browser.until(f"getComputedStyle(document.body).backgroundColor == '{paper}'")
+            assert browser.run("document.documentElement.scrollWidth") <= width
+            # Each canvas is drawn anew in the colours of the page.
+            corner = "[...document.getElementById('map').getContext('2d').getImageData(0, 0, 1, 1).data].slice(0, 3)"
+            browser.until(f"'rgb(' + {corner}.join(', ') + ')' == '{paper}'")
+            drawn = "document.querySelectorAll('#machine polygon, #machine rect').length"
+            assert browser.run(drawn) >= 8
+
+
+def test_a_refused_command_is_shown_and_the_cell_goes_on(page):
+    browser, cell = page
+    submit(browser, "change", "button[value=start]", name="seed", value="none")
+    assert "seed" in browser.until("document.getElementById('refusal').textContent")
+    submit(browser, "change", "button[value=start]", name="spindle_encoder.revolutions", value="4.0")
+    browser.until("SHOWN.now.samples < 20000")
+    browser.click("#go")
+    browser.until("SHOWN.now.state == 'ended'")
+    assert cell.scenario.value("spindle_encoder.revolutions") == 4.0
