@@ -137,11 +137,15 @@ class ErrorsByRevolution:
 
     Args:
         types: message type by fully qualified topic.
+
+    Attributes:
+        turns_before: number of revolutions before the first one.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
         self._topics = _encoder_and_tool(types)
         self._errors: RunningErrors | None = None
+        self.turns_before = 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
@@ -151,7 +155,8 @@ class ErrorsByRevolution:
         named = {full(topic): signals for topic, signals in dense.items()}
         angle, error = named[encoder]["angle_true"], named[tool]["error"]
         if self._errors is None:
-            self._errors = RunningErrors(turns_before(angle))
+            self.turns_before = turns_before(angle)
+            self._errors = RunningErrors(self.turns_before)
         self._errors.add(angle, error)
 
     def rms(self) -> np.ndarray:

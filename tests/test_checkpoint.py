@@ -15,6 +15,7 @@ from test_restart import OWN, Killer
 import lathe_rc
 from lathe_rc import harness
 from lathe_rc.bag import check
+from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
@@ -235,6 +236,46 @@ def test_the_bag_of_a_run_from_a_checkpoint_is_sound(learned: Path, tmp_path: Pa
     checked = check.check(tmp_path / "bag")
     assert (checked.lost, checked.wrong, checked.first) == ([], [], found.recording.first)
     assert checked.digests == found.digest == lathe_rc.read_bag(tmp_path / "bag").digests()
+
+
+EVENTS = "learning_controller.events=['revolution 1: freeze', 'revolution 2: learn', 'revolution 4: freeze']"
+AROUND = ["pre=0.1", "post=0.02", "triggers=['*: freeze']", "mode=both"]
+
+
+def test_a_bag_is_resimulated_from_a_checkpoint(tmp_path: Path) -> None:
+    """A re-simulation goes on from a checkpoint in a bag or a snapshot with its bits, or with other parameters."""
+    file, bag = tmp_path / "file", tmp_path / "bag"
+    scenario = lathe_rc.load("piston", [*LONG, EVENTS, *(f"recorder.{told}" for told in AROUND)])
+    whole = lathe_rc.run(scenario, checkpoints={"revolution:3": file}, bag=bag)
+    first, end = lathe_rc.run(scenario, start_from=file).recording.first, whole.samples
+    for path, last in ((bag, end), (whole.snapshots[-1], None)):
+        found = resimulate(path, start_from=file)
+        assert (found.changed, found.different, found.missing, found.first) == (False, [], [], first)
+        assert last is None or found.first + found.samples == last
+        assert len(found.recorded) == len(whole.digest)
+    changed = resimulate(bag, ["learning_controller.learning_gain=0.3"], start_from=file)
+    assert "/coarse/command" in changed.different
+    assert (changed.turns_before, changed.recorded_rms.tolist()) == (3, whole.errors.rms[3:].tolist())
+
+
+def test_a_bag_of_a_run_from_a_checkpoint_carries_it(learned: Path, tmp_path: Path) -> None:
+    """The re-simulation of a bag that begins at a checkpoint needs no other file."""
+    file = tmp_path / "file"
+    file.write_bytes(learned.read_bytes())
+    bag = lathe_rc.run(lathe_rc.load("piston", LONG), start_from=file, bag=tmp_path / "bag").bag
+    file.unlink()
+    assert bag is not None
+    found = resimulate(bag)
+    assert (found.changed, found.different, found.missing) == (False, [], [])
+    assert found.recorded
+
+
+def test_a_checkpoint_outside_of_a_bag_is_refused(learned: Path, tmp_path: Path) -> None:
+    lathe_rc.run(lathe_rc.load("piston", ["spindle_encoder.revolutions=2"]), bag=tmp_path / "bag")
+    with pytest.raises(InputError, match="the run ends at"):
+        resimulate(tmp_path / "bag", start_from=learned)
+    with pytest.raises(InputError, match="allowed: with the scenario of the bag"):
+        resimulate(tmp_path / "bag", scenario=Path("piston"), start_from=learned)
 
 
 def test_the_command_writes_checkpoints_and_goes_on_from_them(learned: Path, tmp_path: Path) -> None:

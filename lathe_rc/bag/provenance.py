@@ -17,6 +17,7 @@ from pathlib import Path
 from lathe_rc import __version__, allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.checkpoint import START_FROM
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
@@ -171,7 +172,7 @@ def named_files(about: Mapping[str, str]) -> dict[str, str]:
         f"{node}.{key}": str(value)
         for node, values in values_of(about).items()
         for key, value in values.items()
-        if key.endswith("_file") and value and f"{FILE}{node}.{key}" not in about
+        if (key.endswith("_file") or key == START_FROM) and value and f"{FILE}{node}.{key}" not in about
     }
 
 

@@ -34,7 +34,9 @@ def _table(found: Resimulation) -> Table:
     for k in tables.spread(whole):
         old, new = found.recorded_rms[k] * 1e6, found.rms[k] * 1e6
         between = [f"{found.between_rms[k] * 1e6:#.4g}"] if positions else []
-        table.add_row(str(k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "", *between)
+        table.add_row(
+            str(found.turns_before + k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "", *between
+        )
     return table
 
 
@@ -124,6 +126,7 @@ def _has_scenario(bag: Path) -> bool:
 @click.option("--write-parameters", type=options.PATH, help="file for the scenario, or the drive, found")
 @click.option("--write-form", type=options.PATH, help="CSV file for the tool's position by angle")
 @click.option("-o", "--output", type=options.PATH, help="folder of a bag for the result; must not exist")
+@options.start_from
 @options.allow_code
 @options.as_json
 @click.pass_context
@@ -137,6 +140,7 @@ def resim(
     write_parameters: Path | None,
     write_form: Path | None,
     output: Path | None,
+    start_from: Path | None,
     *,
     identified: bool,
     as_json: bool,
@@ -150,9 +154,9 @@ def resim(
     if write_form:
         _write_form(bag, topics, write_form, console, quiet=as_json)
     if identified and scenario is None and not _has_scenario(bag):
-        if overrides or controller or output:
+        if overrides or controller or output or start_from:
             raise InputError(
-                "--set, --controller and -o need a cell, and the bag holds no scenario; give --scenario FILE"
+                "--set, --controller, --from and -o need a cell, and the bag holds no scenario; give --scenario FILE"
             )
         drives, rest = _identified_alone(bag, topics, write_parameters)
         if as_json:
@@ -172,6 +176,7 @@ def resim(
         identified=identified,
         parameters=write_parameters,
         output=output,
+        start_from=start_from,
     )
     for warning in found.warnings:
         click.echo(f"lathe: warning: {warning}", err=True)
@@ -192,6 +197,7 @@ def _summary(found: Resimulation, bag: Path, output: Path | None) -> dict[str, A
         "different": found.different,
         "not_recorded": found.missing,
         "drives": [_drive_summary(drive) for drive in found.drives],
+        "first_sample": found.first,
         "simulated_s": found.simulated_s,
         "wall_s": found.wall_s,
         "real_time_factor": found.simulated_s / found.wall_s,

@@ -96,9 +96,9 @@ class Recorded:
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
 
-    def samples_of(self, topic: str) -> SampleReader:
-        """Return a reader that reads a topic in step with a run."""
-        return SampleReader(self._source, topic)
+    def samples_of(self, topic: str, first: int = 0) -> SampleReader:
+        """Return a reader that reads a topic in step with a run, from sample ``first`` on."""
+        return SampleReader(self._source, topic, first)
 
     def step_ns(self, topic: str) -> int:
         """Return the sampling step of a topic [ns]; 0 if it has no block."""

@@ -245,10 +245,11 @@ class SampleReader:
     Args:
         source: the bag; must stay open while the topic is read.
         topic: fully qualified topic.
+        first: index of the first sample to read.
     """
 
-    def __init__(self, source: Source, topic: str) -> None:
-        self._dense = _Dense(topic, source.topics[topic].type)
+    def __init__(self, source: Source, topic: str, first: int = 0) -> None:
+        self._dense = _Dense(topic, source.topics[topic].type, first)
         self._batches = source.batches({topic})
 
     def take(self, samples: int) -> Signals:
@@ -270,6 +271,26 @@ class SampleReader:
                 raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
             self._dense.read_all(found.whole, found.places[:, 2:])
         self._dense.take_into(signals)
+
+
+class From:
+    """Sink that passes the samples and messages from a sample on to another sink.
+
+    Args:
+        sink: the other sink.
+        first: index of the first sample that it receives.
+    """
+
+    def __init__(self, sink: Sink, first: int) -> None:
+        self._sink, self._first = sink, first
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Pass on the part of a chunk that is due (implements `lathe_rc.cell.engine.Sink`)."""
+        left = max(self._first - first, 0)
+        if left < samples:
+            late = {topic: {name: array[left:] for name, array in part.items()} for topic, part in dense.items()}
+            told = {topic: [each for each in found if each.index >= self._first] for topic, found in sparse.items()}
+            self._sink.chunk(first + left, samples - left, late, told)
 
 
 def first_of(source: Source) -> int:

@@ -12,7 +12,7 @@ from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import SampleReader
+from lathe_rc.bag.reading.stream import SampleReader, first_of
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import DONE, Fields, Reached, Sparse
@@ -61,14 +61,16 @@ class _RecordedSpindle(TimeMaster):
 
     step = staticmethod(step)
 
-    def __init__(self, made: TimeMaster, reader: SampleReader, samples: int, said: Spindle | None = None) -> None:
+    def __init__(
+        self, made: TimeMaster, reader: SampleReader, first: int, samples: int, said: Spindle | None = None
+    ) -> None:
         super().__init__(made.name, made.parameters)
         self._made, self.law = made, made.law
         self._reader, self.samples, self._said = reader, samples, said
         self.place_triggers()
         self.declare(outputs=made.outputs, tells=made.tells)  # its events are in the recording
         self._ready = messages.allocate(messages.ENCODER, messages.MAX_BLOCK)
-        self._span = np.zeros(2, np.int64)
+        self._span = np.full(2, first)
 
     def speed_range(self) -> tuple[float, float]:
         """Return the speed range of the bag's own scenario or, with another scenario, the recorded range [rad/s].
@@ -159,7 +161,7 @@ class Comparison:
         self.topics = topics
         self._encoder = remapped(cell.master.shared, "encoder")
         self._tool = remapped(tool.shared, tool.outputs[0].topic)
-        self._readers = [(recorded.samples_of(topic), field) for topic, field in topics]
+        self._readers = [(recorded.samples_of(topic, cell.first), field) for topic, field in topics]
         self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -223,10 +225,15 @@ def wire(
                 f"{source.path}: {of} has a step of {step_ns} ns, the scenario one of {master.shared.step_ns} ns; "
                 f"allowed: sample_rate = {1e9 / step_ns:.10g} Hz under /**"
             )
-    cell.replace(_RecordedSpindle(master, recorded.samples_of(topic), samples, spindle))
+    if not (begin := first_of(source)) <= (first := cell.first) < samples:
+        raise InputError(
+            f"{source.path} has samples {begin} to {samples - 1}, and the cell would begin at {first}; allowed: a "
+            "checkpoint in the bag (--from FILE)"
+        )
+    cell.replace(_RecordedSpindle(master, recorded.samples_of(topic, first), first, samples, spindle))
     cell.check()
     compared = Comparison(recorded, cell, tool, topics) if tool and topics else None
-    return cell, compared, _events(source) if original is not None else {}
+    return cell, compared, _events(source, first) if original is not None else {}
 
 
 def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
@@ -263,8 +270,8 @@ def _samples(source: Source, topic: str) -> int:
     return last.first_index + last.samples
 
 
-def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
-    """Return the events of each node: the sample at which each took effect, and its action."""
+def _events(source: Source, first: int) -> dict[str, list[tuple[int, str]]]:
+    """Return the events of each node from sample ``first`` on: the sample at which each took effect, and its action."""
     topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
     found: dict[str, list[tuple[int, str]]] = {}
     for topic, _, data in source.messages(topics):
@@ -272,5 +279,7 @@ def _events(source: Source) -> dict[str, list[tuple[int, str]]]:
             event = messages.decode(messages.EVENT, data)
         except ValueError as error:
             raise LatheError(f"{source.path}: {topic}: {error}") from None
-        found.setdefault(event.source.strip("/").rpartition("/")[2], []).append((int(event.sample_index), event.action))
+        if event.sample_index >= first:
+            name = event.source.strip("/").rpartition("/")[2]
+            found.setdefault(name, []).append((int(event.sample_index), event.action))
     return found

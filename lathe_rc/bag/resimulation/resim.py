@@ -10,7 +10,7 @@ scenario, optionally with the drive identified from the recorded command and pos
 
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,20 +21,22 @@ from lathe_rc import messages
 from lathe_rc.bag import check, provenance
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import feed, first_of
+from lathe_rc.bag.reading.stream import From, feed, first_of
 from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for, wire
 from lathe_rc.bag.resimulation.identify import Identified
-from lathe_rc.bag.snapshot import span_of
+from lathe_rc.bag.snapshot import GONE_ON, span_of
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.checkpoint import START_FROM
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.messages import Samples, Signals
@@ -49,6 +51,8 @@ class Resimulation:
     Attributes:
         scenario: the simulated scenario.
         changed: whether the scenario differs from that of the bag, or the bag has none.
+        first: index of the first sample.
+        turns_before: number of revolutions before the first one in ``rms``.
         samples: number of samples of the run.
         wall_s: wall time of the run [s].
         digest: digest of each signal topic.
@@ -64,6 +68,8 @@ class Resimulation:
 
     scenario: Scenario
     changed: bool
+    first: int
+    turns_before: int
     samples: int
     wall_s: float
     digest: Mapping[str, str]
@@ -92,22 +98,27 @@ class Resimulation:
 
 
 class _Digests:
-    """Sink that computes the digests of an offline run, by fully qualified topic."""
+    """Sink that computes the digests of a run or a bag, by fully qualified topic.
 
-    def __init__(self, cell: Cell) -> None:
-        self._step_ns = cell.master.shared.step_ns
+    Args:
+        step_ns: sampling step [ns].
+        sparse: topics with messages at chosen samples.
+    """
+
+    def __init__(self, step_ns: int, sparse: Iterable[str]) -> None:
+        self._step_ns = step_ns
         self._digester = Digester()
-        self._sparse = {f"/{topic}": SparseTopic() for topic in cell.sparse}
+        self._sparse = {messages.full(topic): SparseTopic() for topic in sparse}
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add a chunk to the digests."""
         for topic, signals in dense.items():
-            self._digester.dense(f"/{topic}", signals)
+            self._digester.dense(messages.full(topic), signals)
         for topic, found in sparse.items():
             for message in found:
                 stamp = messages.START_NS + message.index * self._step_ns
                 head = {"sample_index": message.index} if message.type.startswith(messages.PACKAGE) else {}
-                self._sparse[f"/{topic}"].append(stamp, head | message.values)
+                self._sparse[messages.full(topic)].append(stamp, head | message.values)
 
     def result(self) -> dict[str, str]:
         return self._digester.result(self._sparse)
@@ -135,7 +146,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
     return Scenario(scenario.name, models.resolved(nodes))
 
 
-def _refuse_part(source: Source) -> None:
+def _refuse_part(source: Source, *, begun: bool) -> None:
     held = provenance.held(source.about)
     if held:
         topic, sample = next(iter(held.items()))
@@ -144,12 +155,12 @@ def _refuse_part(source: Source) -> None:
             "run that nothing interrupted"
         )
     first = first_of(source)
-    if first:
+    if first and not begun and GONE_ON not in source.about:
         what = "is a snapshot" if span_of(source.about) else "was recorded"
         raise InputError(
             f"{source.path} {what} from sample {first} on: the start of the run, from which controllers and "
-            "drives have their state, is missing; allowed: a bag from sample 0 on (recorder.mode = both records the "
-            "whole run beside the snapshots)"
+            "drives have their state, is missing; allowed: a checkpoint (--from FILE), or a bag from sample 0 on "
+            "(recorder.mode = both records the whole run beside the snapshots)"
         )
 
 
@@ -163,6 +174,7 @@ def resimulate(
     identified: bool = False,
     parameters: Path | None = None,
     output: Path | None = None,
+    start_from: Path | None = None,
 ) -> Resimulation:
     """Run the cell of a bag again with the recorded spindle.
 
@@ -175,6 +187,7 @@ def resimulate(
         identified: whether to identify the electrodynamic drives from the bag.
         parameters: file to which the parameters of the simulated scenario are written; None: no file.
         output: folder of a new bag for the result; must not exist yet; None: no bag.
+        start_from: checkpoint of the run in the bag, from which the cell goes on; None: the start of the bag.
 
     Raises:
         InputError: the bag has no encoder, or it has no scenario and none is given; the changes are not possible; or a
@@ -184,15 +197,17 @@ def resimulate(
     if output is not None:
         refuse_existing(output)
     with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
-        _refuse_part(source)
+        _refuse_part(source, begun=start_from is not None)
         recorded = Recorded(source, topics or {})
+        overrides = [*overrides, *_start(source, start_from, given=scenario is not None)]
         original = None if scenario is not None else _of_bag(recorded, source, Path(folder), overrides)
         if scenario is not None:
             chosen = scenarios.load(scenario, overrides)
         else:
             assert original is not None, "it is the other source of a scenario"
             _refuse_overrides(original, overrides)
-            chosen = provenance.scenario_of(source.about, Path(folder), overrides) if overrides else original
+            asked = [text for text in overrides if not _names(text, {START_FROM})]
+            chosen = provenance.scenario_of(source.about, Path(folder), overrides) if asked else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
         warnings = provenance.changes(source.about, original) if original is not None else []
@@ -209,14 +224,15 @@ def resimulate(
         for name, stage in cell.stages.items():
             for index, action in events.get(name, []):
                 stage.replay(action, index)
-        digests = _Digests(cell)
+        first = cell.first
+        digests = _Digests(cell.master.shared.step_ns, cell.sparse)
         errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
         samples = cell.master.samples
         assert samples is not None, "a bag has an end"
         writer = begin(output, chosen) if output is not None else None
         all_sinks: list[Sink] = [digests, errors, *([compared] if compared else [])]
         if writer is not None:
-            all_sinks.append(OfflineRecorder(cell, samples, writer))
+            all_sinks.append(OfflineRecorder(cell, samples, writer, first=first))
         engine = Engine(cell)
         start = time.monotonic()
         try:
@@ -226,16 +242,15 @@ def resimulate(
                 writer.close()
         digest = digests.result()
         wall = time.monotonic() - start
-    found = _recorded_digests(path) if original is not None else {}
+    found = _digests_from(path, cell) if original is not None else {}
     digest_of_bag = {topic.removeprefix(recorded.namespace): digest for topic, digest in found.items()}
-    before = errors
-    if changed and compared is None:
-        before = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
-        feed(path, [before])
+    before = _errors_from(path, first) if changed and compared is None else errors
     return Resimulation(
         scenario=chosen,
         changed=changed,
-        samples=samples,
+        first=first,
+        turns_before=errors.turns_before,
+        samples=samples - first,
         wall_s=wall,
         digest=digest,
         recorded=digest_of_bag,
@@ -257,7 +272,7 @@ def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequenc
     if provenance.SCENARIO not in source.about:
         raise InputError(f"{source.path}: {asked_for(recorded)}")
     lacks = {name for name in provenance.named_files(source.about) if not name.endswith(scenarios.WRITTEN)}
-    given = [text for text in overrides if text.partition("=")[0].strip() in lacks]
+    given = [text for text in overrides if _names(text, lacks | {START_FROM})]
     return provenance.scenario_of(source.about, folder, given)
 
 
@@ -280,6 +295,29 @@ def _without_strangers(path: Path, *, changed: bool) -> Iterator[None]:
         ) from None
 
 
+def _names(override: str, parameters: Collection[str]) -> bool:
+    """Return whether an override sets one of some parameters, given as NODE.PARAM or PARAM of any node."""
+    name = override.partition("=")[0].strip()
+    return name in parameters or name.rpartition(".")[2] in parameters
+
+
+def _start(source: Source, path: Path | None, *, given: bool) -> list[str]:
+    """Return the override that lets the cell of a bag go on from a checkpoint, if there is one.
+
+    Raises:
+        InputError: the bag has no scenario, or another one is given.
+    """
+    if path is None:
+        return []
+    nodes = provenance.values_of(source.about)
+    master = next((name for name, values in nodes.items() if str(values.get("stage") or name) in MASTERS), "")
+    if given or not master:
+        raise InputError(
+            f"--from {path}: a checkpoint is one of the run in a bag; allowed: with the scenario of the bag"
+        )
+    return [f"{master}.{START_FROM}={path.absolute()}"]
+
+
 _PAST = (
     "events and faults come from the bag, as they took effect; leave them as they are, or run the scenario with others"
 )
@@ -289,6 +327,8 @@ def _refuse_overrides(original: Scenario, overrides: Sequence[str]) -> None:
     spindle = original.masters[0]
     for text in overrides:
         name = text.partition("=")[0].strip()
+        if _names(text, {START_FROM}):
+            continue
         if name.endswith((".events", ".faults")):
             raise InputError(f"--set {text!r}: {_PAST}")
         if name.partition(".")[0] == spindle or "." not in name:
@@ -304,6 +344,26 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
             asked = getattr(table, what)
             if asked and asked != getattr(original.nodes[name], what):
                 raise InputError(f"{name}.{what} = {asked}: {_PAST}")
+
+
+def _digests_from(path: Path, cell: Cell) -> dict[str, str]:
+    """Return the digests of a bag from the first sample of a cell on; empty if the recording is incomplete."""
+    found = _recorded_digests(path)
+    with Source(path) as source:
+        if not found or cell.first <= first_of(source):
+            return found
+        sparse = [topic for topic, said in source.topics.items() if said.type in messages.sparse_types()]
+    rest = _Digests(cell.master.shared.step_ns, sparse)
+    feed(path, [From(rest, cell.first)])
+    return rest.result()
+
+
+def _errors_from(path: Path, first: int) -> ErrorsByRevolution:
+    """Return the recorded form errors of a bag from a sample on."""
+    with Source(path) as source:
+        errors = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
+    feed(path, [From(errors, first)])
+    return errors
 
 
 def _recorded_digests(path: Path) -> dict[str, str]:
