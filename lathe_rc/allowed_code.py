@@ -66,6 +66,9 @@ class _CurrentFolder(MetaPathFinder):
         now = _calls[-1]
         if path is not None or not now.folder or not (self.importing or fullname in now.here):
             return None
+        specs = (finder.find_spec(fullname, path, target) for finder in sys.meta_path if finder is not self)
+        if any(spec.origin for spec in specs if spec):  # a folder of that name without __init__.py has none
+            return None
         return PathFinder.find_spec(fullname, [now.folder], target)
 
 
@@ -121,7 +124,7 @@ def _allow(package: str, *, here: bool) -> None:
         now.here.add(package)
         now.folder = now.folder or str(Path.cwd())
         if _finder not in sys.meta_path:
-            sys.meta_path.append(_finder)
+            sys.meta_path.insert(0, _finder)
 
 
 def allow_own_code() -> None:

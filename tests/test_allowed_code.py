@@ -182,6 +182,16 @@ def test_code_that_is_allowed_for_this_call_runs_from_the_current_folder(receive
     refused(lathe("resim", received.bag), "--allow-code")
 
 
+def test_a_folder_that_is_no_package_hides_none_of_the_current_folder(received, monkeypatch, tmp_path_factory):
+    """As in a checkout, on Python's path, in which `lathe new law my_law` has made my_law/my_law."""
+    around = tmp_path_factory.mktemp("around")
+    (around / received.module).mkdir()
+    monkeypatch.syspath_prepend(around)
+    received.change("tool", stage=f"{received.module}:Tool")
+    found = lathe("resim", received.bag, "--allow-code", received.module)
+    assert (found.exit_code, received.mark.exists()) == (0, True), found.output
+
+
 @pytest.mark.parametrize("package", ["a.b", "", "a:b"])
 def test_a_package_that_is_no_name_is_refused(package):
     refused(lathe("resim", "bag", "--allow-code", package), "the name of a package")

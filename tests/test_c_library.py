@@ -109,6 +109,9 @@ def test_calls_that_do_not_fit_are_refused(law):
     assert made.c.lathe_init(made.cell, ctypes.c_void_p(made.block.value + 8)) == REFUSED
     for samples in (0, -1, law.library.block + 1):
         assert made.step([], [], 0, samples) == REFUSED
+    missing = (ctypes.c_void_p * len(law.library.inputs))()
+    assert made.c.lathe_step(made.block, 1, missing, None) == REFUSED
+    assert made.c.lathe_sample(made.block) == 0
 
 
 def test_the_library_needs_libm_alone(law):
@@ -163,6 +166,7 @@ def test_the_command_names_the_events_that_are_left_to_the_program(tmp_path):
     assert done.exit_code == 0, done.output
     assert "the program has to cause it: disturbance_controller: second 3: freeze" in done.stderr
     assert "new: disturbance_controller; state of" in done.stdout
+    assert "by way of tables: disturbance_controller.learning_gain; for" in done.stderr
     assert "## Formulas and their sources" in (tmp_path / "new" / "README.md").read_text(encoding="utf-8")
     again = lathe("export", "c", "disturbance_controller", *asked)
     assert (again.exit_code, "allowed: a new folder" in again.stderr) == (2, True)

@@ -289,6 +289,7 @@ def test_the_reference_of_a_stage_of_others_is_printed(begin):
         ("parameter(1.0, ", "parameter(3.0, ", ".learning_gain = 3.0; allowed: a finite number"),
         ("Annotated[float, Gt(0), Le(2)]", "dict", "learning_gain is a <class 'dict'>; allowed: bool, int"),
         ('parameter(1.0, "γ: part of the error that a revolution learns")', "1.0", "is no parameter; allowed:"),
+        ("    def tune(", "    def turn(", "without a method tune(self, parameters)"),
         ("    sample = staticmethod(sample)\n", "", " has no formula; allowed: sample = staticmethod"),
     ],
 )

@@ -155,6 +155,7 @@ class Library:
         room: offset of the room for temporary arrays [B].
         size: size of the block [B].
         left_out: events and faults of the scenario, which the caller has to cause; one line each.
+        fixed: parameters that the event ``set`` may change, and whose values the step does not read as they are.
 
     Raises:
         InputError: a stage is unknown or needs Python, a stage that is left out lies between two others, the block is
@@ -174,6 +175,7 @@ class Library:
     streams: list[Stream] = field(default_factory=list)
     relocations: list[int] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    fixed: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         known = self.cell.stages
@@ -322,6 +324,8 @@ class Library:
                 at, value = tuple(memory + place for place in places), getattr(stage.shared, name)
                 told = f"{stage.name}.{name}", row.unit, row.doc
                 found.append(Parameter(*told, low, high, row.limits, whole=False, value=value, places=at))
+            else:
+                self.fixed.append(f"{stage.name}.{name}")
         return found
 
 

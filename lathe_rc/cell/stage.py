@@ -184,6 +184,8 @@ class Stage(ABC):
             cls.kind = cls.__name__
         if "process" in vars(cls) and "step" not in vars(cls):
             cls.step = None  # an inherited step computes something else
+        if cls.tunable and cls.tune is Stage.tune:
+            raise TypeError(f"{cls.__name__}.tunable = {cls.tunable!r} without a method tune(self, parameters)")
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
@@ -217,7 +219,7 @@ class Stage(ABC):
             if 0 < port.delay < self.shared.block_size:
                 raise InputError(
                     f"{self.name}: feedback of {port.topic} is delayed by {port.delay} samples, block_size = "
-                    f"{self.shared.block_size}; allowed: a block no longer than the delay"
+                    f"{self.shared.block_size}; allowed: block_size up to the delay"
                 )
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:

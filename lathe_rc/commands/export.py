@@ -80,9 +80,18 @@ def c_library(
     done = export_nodes(scenarios.load(scenario, overrides), nodes, output, **how)
     for line in done.library.left_out:
         click.echo(f"warning: not in the library, the program has to cause it: {line}", err=True)
+    _tell_fixed(done.library.fixed)
     exported = ", ".join(part.stage.name for part in done.library.parts)
     click.echo(f"{done.place}: {exported}; state of {done.library.size} bytes")
     click.echo(f"next: cd {done.place} && cmake -B build && cmake --build build && build/{done.library.name}_main")
+
+
+def _tell_fixed(names: list[str]) -> None:
+    """Name the parameters that a running cell could change, and the exported code cannot."""
+    if names:
+        click.echo(
+            f"fixed, since they act by way of tables: {', '.join(names)}; for other values export again", err=True
+        )
 
 
 @export.command()
@@ -104,6 +113,7 @@ def fmu(
     place, library = export_fmu(scenarios.load(scenario, overrides), nodes, output, fmi=int(fmi), **how)
     for line in library.left_out:
         click.echo(f"warning: not in the FMU, the importer has to cause it: {line}", err=True)
+    _tell_fixed(library.fixed)
     exported = ", ".join(part.stage.name for part in library.parts)
     counts = f"{len(library.inputs)} inputs, {len(library.outputs)} outputs, {len(library.parameters)} parameters"
     click.echo(f"{place}: {exported}; {counts}, a step of {library.step:.9g} s")
