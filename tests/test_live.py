@@ -25,7 +25,8 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import dds
-from lathe_rc.view.rerun_live import Backlog, Live, RunOrder
+from lathe_rc.view.live_runs import Backlog, RunOrder
+from lathe_rc.view.rerun_live import Live
 from lathe_rc.view.rerun_output import Output
 from lathe_rc.view.rerun_signals import is_drawn
 

@@ -17,6 +17,8 @@ from lathe_rc.errors import InputError
 @click.option("--pace", type=click.FloatRange(0, 1000), default=1.0, show_default=True, help="0: as fast as possible")
 @click.option("--revolutions", type=options.POSITIVE, help="length of the run")
 @options.start_from
+@click.option("--attach", is_flag=True, help="show the cell of SCENARIO that runs in this ROS domain")
+@click.option("--namespace", default="/", show_default=True, help="attach: of the cell's nodes")
 @options.overrides
 @options.allow_code
 def panel(
@@ -25,22 +27,26 @@ def panel(
     pace: float,
     revolutions: float | None,
     start_from: Path | None,
+    namespace: str,
     overrides: tuple[str, ...],
     *,
+    attach: bool,
     no_browser: bool,
 ) -> None:
     """Show a SCENARIO at work on one page in the browser, which also commands it, without ROS or network.
 
     Instead of a scenario, a bag is played. Ctrl-C ends it.
     """
+    from lathe_rc.cell.varied_loop import VariedLoop
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.view import page_server
     from lathe_rc.view import panel as panels
+    from lathe_rc.view.loop_page import LoopPage
     from lathe_rc.view.panel_player import Player
     from lathe_rc.view.panel_run import Driver, LiveCell
 
     if measured.is_bag(Path(scenario)):
-        given = {"--revolutions": revolutions, "--from": start_from, "--set": overrides}
+        given = {"--revolutions": revolutions, "--from": start_from, "--set": overrides, "--attach": attach}
         if wrong := [name for name, value in given.items() if value]:
             raise InputError(f"{wrong[0]} with the bag {scenario}; allowed: with a scenario")
         player = Player(Path(scenario))
@@ -49,6 +55,12 @@ def panel(
         return
     allowed_code.allow_own_code()
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
+    if attach:
+        from lathe_rc.nodes import panel_attach
+
+        panel_attach.attach(loaded, namespace, port, click.echo, browser=not no_browser)
+        return
     cell = LiveCell(loaded, compiling=lambda names: click.echo(f"compiling {', '.join(names)}", err=True))
+    loop = LoopPage(VariedLoop(loaded), Path(f"{loaded.name}-loop.yaml")).site()
     with Driver(cell, pace) as driver:
-        page_server.serve(panels.site(driver, cell), port, click.echo, browser=not no_browser)
+        page_server.serve(panels.site(driver, cell, loop), port, click.echo, browser=not no_browser)

@@ -230,6 +230,13 @@ def open_browser(address: str) -> None:
         webbrowser.open(address)
 
 
+def announce(address: str, say: Callable[[str], object], *, browser: bool) -> None:
+    """Tell the user the address of a page, and open it in the browser if asked to."""
+    say(f"page: {address} (Ctrl-C ends it)")
+    if browser:
+        open_browser(address)
+
+
 def serve(site: Site, port: int, say: Callable[[str], object], *, browser: bool) -> None:
     """Serve a site until Ctrl-C or SIGTERM.
 
@@ -243,7 +250,5 @@ def serve(site: Site, port: int, say: Callable[[str], object], *, browser: bool)
         InputError: see `serving`.
     """
     with contextlib.suppress(KeyboardInterrupt), serving(site, port) as address:
-        say(f"page: {address} (Ctrl-C ends it)")
-        if browser:
-            open_browser(address)
+        announce(address, say, browser=browser)
         threading.Event().wait()

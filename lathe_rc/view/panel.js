@@ -3,10 +3,11 @@
 const $ = id => document.getElementById(id);
 const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, history: 0, latest: 0 }; // see Have in panel_view.py
 const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], shape: null, ranges: {} };
-let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], live: true, name: "" }, version = -1;
+let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
 const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const can = what => ABOUT.can.includes(what);
 const escaped = text => String(text).replace(/[&<>"]/g, letter => `&#${letter.charCodeAt(0)};`);
 const digits = (value, count = 4) => Number.isFinite(value) ? String(Number(value.toPrecision(count))).replace("-", "−") : "–";
 const nice = value => { // the next 1, 2 or 5 times a power of ten
@@ -66,13 +67,14 @@ function trouble(text) {
 }
 
 let changedSince = false, drawnAt = 0;
-const CALM = 400; // [ms] between drawings of revolutions, which take the browser longest
+const CALM = 1000; // [ms] between drawings of revolutions, which take the browser longest
 function draw(changed, moving = true) {
   const now = SHOWN.now, revolution = (now.angle || 0) / (2 * Math.PI);
-  $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0} of ${now.samples}`
+  $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0}` + (now.samples ? ` of ${now.samples}` : "")
+    
     + (now.factor ? `, ${digits(now.factor, 2)} × real time` : "") + (now.bag ? `, recording ${now.bag}` : "");
   $("go").textContent = now.state == "running" ? "pause" : "start";
-  $("go").disabled = $("step").disabled = ["ended", "failed"].includes(now.state) && ABOUT.live;
+  $("go").disabled = $("step").disabled = ["ended", "failed"].includes(now.state) && can("change");
   if (document.activeElement != $("pace")) $("pace").value = String(now.pace);
   if ($("seek").max != now.samples) $("seek").max = now.samples;
   if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
@@ -337,9 +339,11 @@ function options(select, names) {
 function describe() { // fills the commands from what the cell tells of itself
   document.title = `${ABOUT.name}: panel`;
   $("name").textContent = ABOUT.name;
-  $("commands").hidden = !ABOUT.live;
-  $("seeking").hidden = ABOUT.live;
-  if (!ABOUT.live) return;
+  $("commands").hidden = !can("command");
+  for (const id of ["change", "record", "repeat"]) $(id).hidden = !can("change");
+  for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
+  $("seeking").hidden = !can("seek");
+  if (!can("command")) return;
   $("actions").replaceChildren(...ABOUT.nodes.filter(node => node.actions.length || node.knobs.length).map(node => {
     const row = document.createElement("div"), name = document.createElement("b");
     row.className = "actions";

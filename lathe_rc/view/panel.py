@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from lathe_rc.cell import ros_yaml
-from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.safety import faults
 from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
 from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
-from lathe_rc.view.panel_view import Have, news
+from lathe_rc.view.panel_view import Have, View, news
 
 _PATIENCE = 1.0  # [s] until a page without news gets an answer
 _FILES = ("save", "load")  # events that need a file, which the page does not name
@@ -25,9 +25,11 @@ def page() -> Page:
     return Page("panel", own_file("panel.html"), [own_file("panel.css")], [own_file("panel.js")])
 
 
-def site(driver: Driver, cell: LiveCell) -> Site:
-    """Return the panel of an offline cell."""
-    return Site({"": page()}, {**playing(driver, lambda: outlook(cell.scenario)), **_commands(driver, cell)})
+def site(driver: Driver, cell: LiveCell, loop: Site | None = None) -> Site:
+    """Return the panel of an offline cell, with the page of its loops, if given, as a tab."""
+    tabs, answers = ({"loop": loop.pages[""]}, loop.answers) if loop else ({}, {})
+    own = {**_watching(cell.view, lambda: outlook(cell.scenario)), **_playing(driver), **_commands(driver, cell)}
+    return Site({"": page(), **tabs}, {**answers, **own})
 
 
 def player_site(driver: Driver, player: Player) -> Site:
@@ -50,22 +52,40 @@ def player_site(driver: Driver, player: Player) -> Site:
         driver.call(moved)
         return {}
 
-    about = {**player.outlook, "live": False, "nodes": [], "faults": {}, "parameters": []}
+    about = {**player.outlook, "can": ["run", "seek"], "nodes": [], "faults": {}, "parameters": []}
     answers = {"about": lambda _: about, "seek": seek, "start": start}
-    return Site({"": page()}, {**playing(driver, lambda: player.outlook), **answers})
+    return Site({"": page()}, {**_watching(player.view, lambda: player.outlook), **_playing(driver), **answers})
 
 
-def playing(driver: Driver, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str, Answer]:
-    """Return the answers that every run has: news, start, pause, step, pace, and the part as a file.
+def attached_site(view: View, outlook: Mapping[str, Any], cell: Cell, act: Callable[[str, str], str]) -> Site:
+    """Return the panel of a cell that runs elsewhere.
 
     Args:
-        driver: thread of the run.
+        view: its view.
+        outlook: `outlook` of its scenario.
+        cell: the cell of its scenario, for the choice of commands.
+        act: asks a node for an event, and returns it as in a scenario.
+    """
+
+    def acting(question: Mapping[str, Any]) -> object:
+        return {"text": act(_text(question, "node"), _text(question, "action"))}
+
+    nodes = [_node(stage) for stage in cell.stages.values()]
+    about = {**outlook, "can": ["command"], "nodes": nodes, "faults": _faults(), "parameters": []}
+    return Site({"": page()}, {**_watching(view, lambda: outlook), "about": lambda _: about, "act": acting})
+
+
+def _watching(view: View, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str, Answer]:
+    """Return the answers that every run has: news, and the part as a file.
+
+    Args:
+        view: view of the run.
         outlooks: returns the `outlook` of its scenario.
     """
 
     def frame(question: Mapping[str, Any]) -> object:
         have = Have.of(question)
-        return news(driver.run.view.wait(have.number, _PATIENCE), have)
+        return news(view.wait(have.number, _PATIENCE), have)
 
     def part(question: Mapping[str, Any]) -> object:
         from lathe_rc.view import panel_part
@@ -75,21 +95,25 @@ def playing(driver: Driver, outlooks: Callable[[], Mapping[str, Any]]) -> dict[s
             raise InputError(f"enlarged = {enlarged:g}; allowed: above 0, up to 1000")
         outlook = outlooks()
         limit = outlook["tolerance"] * 2e-6 or 10e-6
-        mesh = panel_part.body(driver.run.view.revolutions, outlook["radius"] * 1e-3, enlarged, limit)
+        mesh = panel_part.body(view.revolutions, outlook["radius"] * 1e-3, enlarged, limit)
         name = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in outlook["name"])
         return Download(f"{name}.{ending}", panel_part.TYPES.get(ending, ""), panel_part.file(mesh, ending))
 
-    def done(command: Any) -> object:
+    return {"frame": frame, "part": part}
+
+
+def _playing(driver: Driver) -> dict[str, Answer]:
+    """Return the answers of a run with a pace."""
+
+    def done(command: Callable[[], object]) -> object:
         driver.call(command)
         return {}
 
     return {
-        "frame": frame,
         "start": lambda _: done(driver.start),
         "pause": lambda _: done(driver.pause),
         "step": lambda _: done(driver.step),
         "pace": lambda question: done(lambda: driver.pace(_number(question, "factor"))),
-        "part": part,
     }
 
 
@@ -144,21 +168,25 @@ def about(cell: LiveCell) -> dict[str, Any]:
     scenario = cell.scenario
     return {
         **outlook(scenario),
-        "live": True,
-        "nodes": [_node(scenario, stage) for stage in cell.cell.stages.values()],
-        "faults": {
-            name: {"doc": kind.doc, "values": {key: value.default for key, value in kind.values.items()}}
-            for name, kind in faults.KINDS.items()
-        },
+        "can": ["run", "command", "change"],
+        "nodes": [_node(stage) for stage in cell.cell.stages.values()],
+        "faults": _faults(),
         "parameters": [f"{node}.{name}" for node, table in scenario.nodes.items() for name in table.rows()],
     }
 
 
-def _node(scenario: Scenario, stage: Stage) -> dict[str, Any]:
+def _faults() -> dict[str, Any]:
+    """Return the kinds of faults with the values that they need."""
+    return {
+        name: {"doc": kind.doc, "values": {key: value.default for key, value in kind.values.items()}}
+        for name, kind in faults.KINDS.items()
+    }
+
+
+def _node(stage: Stage) -> dict[str, Any]:
     rows = type(stage.shared).rows()
     return {
         "name": stage.name,
-        "kind": scenario.kind(stage.name),
         "actions": [action for action in stage.actions if action not in _FILES],
         "knobs": [
             {"name": name, "value": getattr(stage.parameters_now, name), "unit": rows[name].unit, "doc": rows[name].doc}

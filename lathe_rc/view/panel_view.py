@@ -27,7 +27,7 @@ from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
 Array = npt.NDArray[np.float64]
 
 CELLS = 180  #: cells of a row of the map
-PERIOD = 0.1  #: least time between two snapshots [s]
+PERIOD = 0.125  #: least time between two snapshots [s]
 MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
@@ -127,22 +127,30 @@ class View:
     """
 
     def __init__(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
-        self.topics = Topics.of(types)
-        self._types, self._step_ns = {full(topic): kind for topic, kind in types.items()}, step_ns
-        self._supervised = messages.SAFETY_STATUS in self._types.values()
         self._news = threading.Condition()
         self._due = 0.0
         self.run = 0
         self.latest: Snapshot | None = None
-        self._margin = margin
+        self.begin(types, step_ns, margin)
+
+    def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
+        """Begin with another run of another cell (arguments as for the class)."""
+        self._types: dict[str, str] = {}
+        self._step_ns, self._margin = step_ns, margin
+        self.learn(types)
         self.clear(margin)
 
+    def learn(self, types: Mapping[str, str]) -> None:
+        """Add topics."""
+        self._types |= {full(topic): kind for topic, kind in types.items()}
+        self.topics = Topics.of(self._types)
+
     def clear(self, margin: float | None = None) -> None:
-        """Begin with another run."""
+        """Begin with another run of the same cell."""
         self.run += 1
         self._revolutions = Revolutions()
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
-        if self._supervised:
+        if messages.SAFETY_STATUS in self._types.values():
             self._now["safety"] = {"state": State.NOMINAL.name.lower(), "alarm": ""}
         self._scale: Scale | None = None
         self._epoch, self._every = 0, 1
@@ -176,7 +184,6 @@ class View:
             self._now |= {"angle": float(encoder["angle_true"][-1]), "rpm": float(encoder["speed"][-1]) * _RPM}
         if cut:
             self._now |= {name: float(cut[name][-1]) for name in ("force", "measured_force")}
-            self._now["deflection"] = float(cut["deflection"][-1]) * _UM
         self._now["drives"] = {
             topic.strip("/").removesuffix("/state"): float(named[topic]["position"][-1]) * _UM
             for topic in self.topics.drives

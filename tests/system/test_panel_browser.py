@@ -13,7 +13,9 @@ import lathe_rc
 from chromium import Chromium
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
+from lathe_rc.cell.varied_loop import VariedLoop
 from lathe_rc.view import page_server, panel
+from lathe_rc.view.loop_page import LoopPage
 from lathe_rc.view.panel_run import Driver, LiveCell
 
 pytestmark = pytest.mark.system
@@ -26,9 +28,10 @@ STATE = "SHOWN.now.safety.state"
 def page(tmp_path):
     """The panel of the full cell under a supervisor, and the address that it has in the browser."""
     cell = LiveCell(load(ROOT / "config" / "supervised_full_cell.yaml", ["spindle_encoder.revolutions=60"]))
+    loop = LoopPage(VariedLoop(cell.scenario), tmp_path / "loop.yaml").site()
     with (
         Driver(cell, 0.0) as driver,
-        page_server.serving(panel.site(driver, cell)) as address,
+        page_server.serving(panel.site(driver, cell, loop)) as address,
         Chromium(tmp_path) as browser,
     ):
         browser.look(1440, 1000)
@@ -133,3 +136,10 @@ def test_a_refused_command_is_shown_and_the_cell_goes_on(page):
     browser.click("#go")
     browser.until("SHOWN.now.state == 'ended'")
     assert cell.scenario.value("spindle_encoder.revolutions") == 4.0
+
+
+def test_the_loops_of_the_cell_are_another_tab(page):
+    browser, _ = page
+    browser.open(browser.run("document.querySelector('nav a:not([aria-current])').href"))
+    browser.until("document.title == 'Loop of supervised_full_cell'")
+    browser.until("document.querySelectorAll('.vega-embed').length > 2")

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Listener to running cells that takes no part in them, for views.
+
+It is not a member, so no node waits for it: it gives no credit, and its subscriptions are best effort and volatile. For
+a reliable reader, publishers would repeat missed messages, and at the end of a run they would wait 2 s for a stuck one.
+It polls its subscriptions 50 times a second: a wake-up for every message would cost the cell more than the whole
+display.
+"""
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import islice
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from lathe_rc.errors import LatheError
+from lathe_rc.nodes.ports import message_class
+from lathe_rc.view.live_runs import Backlog, LiveRuns, ShownRun
+from lathe_rc.view.rerun_signals import is_drawn
+
+_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=4096,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
+_BACKLOG = 2**25  # [B]: some seconds of a cell
+_BURST = 16  # messages
+_NICE = 10  # the view is less urgent than the cell
+_PERIOD = 0.02  # [s] between polls of messages; also of the graph, like members that wait for peers
+_BUSY = 0.5  # [s] between polls of the graph while messages of a run arrive
+
+
+class Listener:
+    """Listener that reads a cell's signal topics in one thread and shows them in another.
+
+    Args:
+        node: node in the namespace of the cell.
+        live: view of the runs.
+        over: returns True when nothing more is to be shown.
+    """
+
+    def __init__(self, node: Node, live: LiveRuns, over: Callable[[], bool] = lambda: False) -> None:
+        self._node, self._live, self._over = node, live, over
+        self._backlog = Backlog(_BACKLOG)
+        self._subscriptions: dict[str, tuple[Subscription, str]] = {}
+        self._heard = self._heard_before = 0
+        self._failure: LatheError | None = None
+        self._stop = False
+
+    def stop(self, *_: object) -> None:
+        """Stop after all received messages are shown; a signal handler."""
+        self._stop = True
+
+    def run(self) -> list[ShownRun]:
+        """Show one run after the other until stopped.
+
+        Returns:
+            The runs shown.
+
+        Raises:
+            LatheError: a malformed message, or the view cannot be written.
+        """
+        shower = threading.Thread(target=self._show)
+        shower.start()
+        os.nice(_NICE)  # only this thread; the DDS threads keep their priority, and so lose fewer messages
+        due = 0.0
+        try:
+            while not (self._stop or self._over()):
+                if not shower.is_alive():
+                    break
+                if (now := time.monotonic()) >= due:
+                    due = now + (_BUSY if self._look() else _PERIOD)
+                self._hear()
+                time.sleep(_PERIOD)
+            self._hear()
+        finally:
+            self._backlog.close()
+            shower.join()
+        if self._failure:
+            raise self._failure
+        return self._live.shown
+
+    def _look(self) -> bool:
+        """Subscribe to new topics and detect the end of all publishers; return True if messages have arrived."""
+        namespace = self._node.get_namespace().rstrip("/") + "/"
+        present = {
+            topic: kind
+            for topic, kinds in self._node.get_topic_names_and_types()
+            for kind in kinds
+            if is_drawn(kind) and topic.startswith(namespace) and self._node.count_publishers(topic)
+        }
+        for topic in sorted(present.keys() - self._subscriptions.keys()):
+            self._subscribe(topic, present[topic])
+        quiet = self._heard == self._heard_before
+        if quiet and self._live.present and not present:
+            self._backlog.put(None)
+        if present or quiet:
+            self._live.present = present
+        self._heard_before = self._heard
+        return not quiet
+
+    def _subscribe(self, topic: str, msgtype: str) -> None:
+        subscription = self._node.create_subscription(message_class(msgtype), topic, _nothing, _QOS, raw=True)
+        self._subscriptions[topic] = subscription, msgtype
+        self._node.get_logger().info(f"listens to {topic}")
+
+    def _hear(self) -> None:
+        """Take the received messages in turns, a few per topic, since chunks wait only briefly for late topics."""
+        count = -1
+        while count < (count := self._heard):
+            for topic, (subscription, msgtype) in self._subscriptions.items():
+                take = partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
+                heard = [(topic, msgtype, data) for data, _ in islice(iter(take, None), _BURST)]
+                self._heard += len(heard)
+                self._backlog.put(*heard)
+
+    def _show(self) -> None:
+        """Show the received messages; main function of the second thread."""
+        os.nice(_NICE)  # also for the threads that Rerun starts from this one
+        try:
+            for message in self._backlog:
+                if message:
+                    self._live.take(*message)
+                else:
+                    self._live.end()
+            self._live.end()
+        except LatheError as error:
+            self._failure = error
+
+
+def _nothing(_: bytes) -> None:
+    """Unused callback of the subscriptions: messages are taken without an executor."""

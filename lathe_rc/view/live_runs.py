@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of cells as a listener receives them: queue of messages, order of runs, one view after the other.
+
+A view delays no member. Messages that arrive faster than they can be shown are dropped, and each new run, even of the
+same name, has a view of its own. Independent of ROS.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from lathe_rc import messages
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wire import Decoder
+from lathe_rc.errors import LatheError
+from lathe_rc.view.rerun_signals import drawn_fields
+
+Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
+
+
+class Backlog:
+    """Queue of messages to be shown. When it is full, all of them are dropped, so that later chunks are complete again.
+
+    If every second message were dropped instead, every chunk would have gaps.
+
+    Args:
+        limit: size of the queue [B].
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._size = 0
+        self._messages: deque[Message | None] = deque()
+        self._news = threading.Condition()
+        self._closed = False
+
+    def put(self, *added: Message | None) -> None:
+        """Add messages; None means that no publisher is left."""
+        with self._news:
+            for message in added:
+                size = len(message[2]) if message else 0
+                if self._size + size > self._limit:
+                    self._messages.clear()
+                    self._size = 0
+                self._size += size
+                self._messages.append(message)
+            self._news.notify()
+
+    def close(self) -> None:
+        """Close the queue; the reader ends after the last message."""
+        with self._news:
+            self._closed = True
+            self._news.notify()
+
+    def __iter__(self) -> Iterator[Message | None]:
+        """Yield messages as they arrive, until the queue is closed and empty."""
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._messages or self._closed)
+                if not self._messages:
+                    return
+                message = self._messages.popleft()
+                self._size -= len(message[2]) if message else 0
+            yield message
+
+
+class RunOrder:
+    """Assignment of samples of many topics to runs; samples arrive in order within each topic, but not across topics.
+
+    Runs have run ids, but equal scenarios have equal ids, so a topic whose sample index decreases also starts a new
+    run. Late samples of the previous run are recognised because they continue that topic.
+    """
+
+    def __init__(self) -> None:
+        self._run: str | None = None
+        self._before: str | None = None
+        self._ends: dict[str, int] = {}  # sample after the newest of each topic, in this run
+        self._old: dict[str, int] = {}  # likewise in the previous run
+
+    def place(self, topic: str, run: str, first: int, end: int) -> Literal["same", "new", "old"]:
+        """Return the run that a topic's samples belong to: the current one, a new one, or the previous one."""
+        newest = max(self._ends.values(), default=0)
+        if run == self._run and first >= self._ends.get(topic, 0):
+            # The same run id twice in a row: the first samples of a topic may still belong to the previous run, if they
+            # continue it there and are ahead of all topics of this run.
+            again = run == self._before and topic not in self._ends
+            if again and newest < first and first >= self._old.get(topic, first + 1):
+                return "old"
+            self._ends[topic] = end
+            return "same"
+        if run == self._before != self._run and first >= self._old.get(topic, 0):  # a late topic of the previous run
+            return "old"
+        self._run, self._before = run, self._run
+        self._ends, self._old = {topic: end}, self._ends
+        return "new"
+
+
+@dataclass
+class ShownRun:
+    """Summary of a run that was shown.
+
+    Attributes:
+        run_id: run id.
+        file: file of the recording; None if it was sent to a viewer.
+        first: first sample shown; above 0 if the view was started late.
+        end: sample after the last one received.
+        revolutions: number of revolutions shown.
+        left_out: number of chunks that lack some or all topics.
+        complete: whether the last block of every topic was received.
+    """
+
+    run_id: str
+    file: Path | None
+    first: int = 0
+    end: int = 0
+    revolutions: int = 0
+    left_out: int = 0
+    complete: bool = False
+
+
+class RunView(Protocol):
+    """View of one run."""
+
+    def block(self, topic: str, msgtype: str, block: Block) -> bool:
+        """Add a block; return True if the run ends with it."""
+
+    def message(self, message: Sparse) -> None:
+        """Add a message at its sample."""
+
+    def close(self) -> ShownRun:
+        """Show the remaining samples, and end the view."""
+
+
+class LiveRuns:
+    """Live view of running cells, one run after the other.
+
+    Args:
+        begin: returns the view of a run, given its first block received and the message types of its topics.
+
+    Attributes:
+        present: message type by topic, for all topics with publishers; a new run begins with these topics.
+        shown: summaries of the finished runs.
+    """
+
+    def __init__(self, begin: Callable[[Block, Mapping[str, str]], RunView]) -> None:
+        self._begin = begin
+        self.present: Mapping[str, str] = {}
+        self.shown: list[ShownRun] = []
+        self._order = RunOrder()
+        self._decoders: dict[str, Decoder] = {}
+        self._run: RunView | None = None
+        self._over = False  # the current run has ended; further samples of it are ignored
+        self._early: list[Sparse] = []  # messages before the first block
+
+    def take(self, topic: str, msgtype: str, data: bytes) -> None:
+        """Add an encoded message of a plotted topic.
+
+        Raises:
+            LatheError: the message is malformed, or the view cannot be written.
+        """
+        try:
+            if msgtype in messages.block_types():
+                if topic not in self._decoders:
+                    self._decoders[topic] = Decoder(msgtype, sorted(drawn_fields(msgtype)))
+                block = self._decoders[topic].decode(data)
+                if self._belongs(topic, block.run_id, block.first_index, block.first_index + block.samples):
+                    self._block(topic, msgtype, block)
+            else:
+                message = messages.decode(msgtype, data)
+                index = int(message.sample_index)
+                if self._belongs(topic, message.run_id, index, index):
+                    take = self._run.message if self._run else self._early.append
+                    take(Sparse(topic, msgtype, index, messages.values_of(msgtype, data)))
+        except ValueError as error:
+            raise LatheError(f"{topic}: {error}") from None
+
+    def _block(self, topic: str, msgtype: str, block: Block) -> None:
+        if self._run is None:
+            self._run = self._begin(block, {**self.present, topic: msgtype})
+            for message in self._early:
+                self._run.message(message)
+        if self._run.block(topic, msgtype, block):
+            self.end()
+
+    def _belongs(self, topic: str, run_id: str, first: int, end: int) -> bool:
+        """Return True if samples belong to the current run, after starting a new one if necessary."""
+        where = self._order.place(topic, run_id, first, end)
+        if where == "new":
+            self.end()
+            self._early, self._over = [], False
+        return where != "old" and not self._over
+
+    def end(self) -> None:
+        """Close the view of the current run once it has ended or no publishers remain.
+
+        Raises:
+            LatheError: the view cannot be written.
+        """
+        if self._run:
+            run, self._run, self._over = self._run, None, True
+            self.shown.append(run.close())
