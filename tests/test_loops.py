@@ -2,6 +2,8 @@
 """Results of force and position loops: figures, verdict, and what is called unstable."""
 
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from cells import SCENARIOS, config, cuts, in_blocks
 from click.testing import CliRunner
 from hypothesis import given
 from numpy.testing import assert_allclose
+from shown_page import ShownPage
 
 from lathe_rc import harness
 from lathe_rc.analysis.form_errors import form_errors
@@ -197,6 +200,61 @@ def test_a_tolerance_of_a_loop_can_be_required():
     done = CliRunner().invoke(main, [*run, "position_controller.tolerance=1e-18"])
     assert done.exit_code == 1
     assert done.stderr.startswith("lathe: position_controller of approach is not in tolerance (±1e-12 µm): ")
+
+
+# --- pages
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
+    """Bags of a force loop that holds its set point and of one that diverges, and their results."""
+    folder = tmp_path_factory.mktemp("loops")
+    changes = {"calm": [], "wild": ["force_controller.integral=0.2"]}
+    results = {
+        name: harness.run(config("force_turning", "spindle_encoder.revolutions=60", *more), bag=folder / name)
+        for name, more in changes.items()
+    }
+    return SimpleNamespace(folder=folder, results=results)
+
+
+def shown(folder, *words):
+    done = CliRunner().invoke(main, [*map(str, words), "-o", str(folder / "page.html")])
+    assert done.exit_code == 0, done.output
+    return ShownPage((folder / "page.html").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(("name", "mood"), [("calm", "good"), ("wild", "bad")])
+def test_a_report_judges_and_draws_a_loop_as_the_run_does(turned, tmp_path, name, mood):
+    page = shown(tmp_path, "report", turned.folder / name)
+    loop = turned.results[name].loops["force_controller"]
+    said = " ".join(f"force_controller: {text}." for text, _ in loop.judged())
+    head = re.search(rf'<section class="verdict {mood}".*?<p class="said">([^<]*)</p>', page.source, re.DOTALL)
+    assert head[1] == said
+    assert all(f"{text[1:]}." in page.text for text in loop.behaviour())
+    last = loop.row(-1)
+    assert page.rows("Force and position")[1][1:3] == [str(last["revolution"]), f"{last['rms']:.4g}"]
+    drawn = page.specs["figure-0-0"][""]["data"]["values"]
+    assert_allclose([row["b"] for row in drawn if row["l"] == "largest"], loop.found.errors.largest, rtol=1e-4)
+    assert "No form to" not in page.text
+
+
+def test_a_comparison_shows_the_loops_of_runs_without_a_part(turned, tmp_path):
+    page = shown(tmp_path, "compare", turned.folder / "calm", turned.folder / "wild")
+    rows = page.rows("Force and position")
+    found = [turned.results[name].loops["force_controller"] for name in ("calm", "wild")]
+    assert [row[:2] for row in rows] == [["force_controller [N]", "calm"], ["force_controller [N]", "wild"]]
+    assert [row[3] for row in rows] == [f"{loop.row(-1)['rms']:.4g}" for loop in found]
+    assert [row[8] for row in rows] == [f"{found[0].found.step.settling / 64e3:.4g}", "–"]
+    drawn = page.specs["figure-0-0"][""]
+    assert drawn["usermeta"] == {"signals": ["revolution"]}
+    largest = [row["v"] for row in drawn["layer"][0]["data"]["values"] if row["l"] == "wild"]
+    assert_allclose(largest, found[1].found.errors.largest, rtol=1e-4)
+
+
+@pytest.mark.parametrize("angle", [[0.0, 2.0, 1.0], [0.0, np.nan, 1.0], [0.0, 1.0, np.inf], [0.0, 1.0, 1e300]])
+def test_an_absurd_angle_of_a_bag_is_refused(angle):
+    with pytest.raises(InputError):
+        RunningLoop(0, 0, 1.0).add(np.array(angle), *np.zeros((3, 3)))
 
 
 # --- sweeps and tunings

@@ -30,12 +30,14 @@ import numpy.typing as npt
 
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 
 Array = npt.NDArray[np.float64]
 
 BAND = 0.02  #: share of a step within which it is settled, without a tolerance
 _TURN = 2.0 * np.pi
+_MOST_TURNS = 1e9
 _REST = 2  # longest rest at a reversal [sample]
 _SOON = 0.1  # part of the time since the last reversal in which an error counts as that of a reversal
 _SWINGS, _STAYS, _AGAINST = 0.2, 0.9, 0.5  # shares of the samples, see the module docstring
@@ -252,7 +254,7 @@ class RunningLoop:
         """Process the next samples, shape (n,): true angle [rad], and the fields of the controller's messages.
 
         Raises:
-            InputError: a revolution has no sample.
+            InputError: the angle falls or is absurd, or a revolution has no sample.
         """
         held = np.concatenate([self._waiting, np.stack([angle, set_point, error, command])], axis=1)
         count = max(held.shape[1] - self._delay, 0)
@@ -262,11 +264,14 @@ class RunningLoop:
         known, seen = held[:, :count], held[:, self._delay :]
         process = seen[2] - seen[1] + known[1]
         turns = known[0] / _TURN
+        # The kernel finds the row of a sample by its angle.
+        if not (self._turns <= turns[0] and (np.diff(turns) >= 0.0).all() and turns[-1] < _MOST_TURNS):
+            raise InputError(f"the angle falls, or is beyond {_MOST_TURNS:.0e} turns; allowed: one that increases")
+        self._errors.add(known[0], process)
         self._turns = float(turns[-1])
         if (missing := int(self._turns) - self._first + 1 - len(self._rows)) > 0:
             more = np.zeros((max(missing, len(self._rows)), _COLUMNS))
             self._rows = np.concatenate([self._rows, more])
-        self._errors.add(known[0], process)
         samples = np.ascontiguousarray(known[1:])
         _watch(self._state, self._rows, self._first, turns, samples, process, self._limit, self._tolerance)
 

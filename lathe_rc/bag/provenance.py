@@ -22,9 +22,12 @@ from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.stages.force_controller import ForceController, ForceControllerParameters
+from lathe_rc.cell.stages.position_controller import PositionController, PositionControllerParameters
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
+from lathe_rc.loops import Loop, loops
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
@@ -37,6 +40,10 @@ _MOST_FILE = 2**19  # longest file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # number of characters displayed of a hash
 _MOST_ORIGINS = 256
+_SERVOS: Mapping[str, type[NodeParameters]] = {
+    ForceController.kind: ForceControllerParameters,
+    PositionController.kind: PositionControllerParameters,
+}
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
 
@@ -229,6 +236,16 @@ def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
             found[next((new for old, _, new in rules if old == "tool"), "tool")] = allowed
     return found
+
+
+def servo_loops(nodes: Mapping[str, Mapping[str, Value]]) -> list[Loop]:
+    """Return the force and position loops of a bag's scenario, from the result of `values_of`."""
+    tables: dict[str, NodeParameters] = {}
+    for node, values in nodes.items():
+        kind = _SERVOS.get(str(values.get("stage") or node))
+        with contextlib.suppress(InputError):  # of another version, or absurd
+            tables |= {node: kind.read(node, values)} if kind else {}
+    return loops(tables)
 
 
 def _versions() -> dict[str, str]:

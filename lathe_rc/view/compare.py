@@ -10,6 +10,7 @@ import numpy as np
 
 from lathe_rc import __version__
 from lathe_rc.errors import InputError
+from lathe_rc.loops import FIGURES
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view import report_figures
 from lathe_rc.view.charts import Charts, page_template
@@ -17,10 +18,19 @@ from lathe_rc.view.pages import Grid, check_page, grid, printable, write_page
 from lathe_rc.view.report import SIGNALS, losses
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import Gathered, gather
+from lathe_rc.view.report_servo import Servo
 from lathe_rc.view.report_verdict import assess
 
 _MOST = 6  # runs, as many as there are colours
 _ABSENT = "–"
+#: figures of a loop in the table, and their headings
+_SERVO_FIGURES = {
+    "steady_error": "steady error",
+    "steady_deviation": "deviation",
+    "overshoot": "overshoot",
+    "settling": "settling [s]",
+    "saturated": "at limits [1]",
+}
 
 
 def _forms(runs: Mapping[str, Gathered]) -> dict[str, Form]:
@@ -38,9 +48,61 @@ def _results(runs: Mapping[str, Gathered], forms: Mapping[str, Form]) -> Grid | 
         largest = float(form.last.numbers["max"]) if form and form.last else np.nan
         wrong = found.wrong[0].text if found.wrong else ""
         more = f" and {len(found.wrong) - 1} more" if len(found.wrong) > 1 else ""
-        rows.append([name, form.rms.size if form else 0, *numbers, largest, found.verdict.text, wrong + more])
-    columns = ("run", "revolutions", "RMS first", "RMS best", "RMS last", "max last", "verdict", "what went wrong")
+        turns = form.rms.size if form else max((each.result.found.errors.rms.size for each in data.servos), default=0)
+        rows.append([name, turns, *numbers, largest, found.verdict.text, wrong + more])
+    columns = ["run", "revolutions", "RMS first", "RMS best", "RMS last", "max last", "verdict", "what went wrong"]
+    if not forms:
+        columns, rows = [*columns[:2], *columns[6:]], [[*row[:2], *row[6:]] for row in rows]
     return grid(columns, rows, ("run", "verdict", "what went wrong"))
+
+
+Servos = Mapping[str, Mapping[str, Servo]]  #: loops with a complete revolution, by controller and run
+
+
+def _servos(runs: Mapping[str, Gathered]) -> Servos:
+    nodes = dict.fromkeys(servo.loop.node for data in runs.values() for servo in data.servos)
+    found = {
+        node: {
+            name: servo
+            for name, data in runs.items()
+            for servo in data.servos
+            if servo.loop.node == node and servo.result.found.errors.rms.size
+        }
+        for node in nodes
+    }
+    return {node: servos for node, servos in found.items() if servos}
+
+
+def _servo_results(servos: Servos) -> Grid | None:
+    rows = []
+    for node, by_run in servos.items():
+        for name, servo in by_run.items():
+            result, quantity = servo.result, servo.loop.quantity
+            first, last = result.row(0), result.row(-1)
+            told = [of(result) for of, _ in (FIGURES[each] for each in _SERVO_FIGURES)]
+            scales = [quantity.scale if not FIGURES[each][1] else 1.0 for each in _SERVO_FIGURES]
+            more = [np.nan if value is None else value * scale for value, scale in zip(told, scales, strict=True)]
+            rows.append([f"{node} [{quantity.unit}]", name, first["rms"], last["rms"], last["max"], *more])
+    columns = ("controller", "run", "RMS first", "RMS last", "max last", *_SERVO_FIGURES.values())
+    return grid(columns, rows, ("controller", "run"))
+
+
+def _servo_figures(
+    runs: Mapping[str, Gathered], servos: Servos, shown: int, charts: Charts
+) -> Iterator[dict[str, Any]]:
+    """Yield the figures of each controller: error by revolution, course and command of all runs."""
+    for node, by_run in servos.items():
+        name, first = next(iter(by_run.items()))
+        loop, against_time = first.loop, report_figures.against_time
+        courses = {run: servo.measured for run, servo in by_run.items()} | {"set point": first.set_point}
+        commands = {run: servo.command for run, servo in by_run.items()}
+        unit = f"{loop.name} [{loop.quantity.unit}]"
+        drawn = {
+            "error": figures.servo_error({run: servo.result for run, servo in by_run.items()}, shown),
+            "course": against_time(runs[name], courses, unit, loop.quantity.scale),
+            "command": against_time(runs[name], commands, "command", 1.0),
+        }
+        yield {"node": node, "loop": loop, "run": name, **{each: charts.place([spec]) for each, spec in drawn.items()}}
 
 
 def _parameters(runs: Mapping[str, Gathered]) -> Grid | None:
@@ -87,6 +149,9 @@ def render(runs: Mapping[str, Gathered], command: str) -> str:
         forms = _forms(runs)
         tolerance = max((form.tolerance for form in forms.values()), default=0.0)
         together = figures.compared(forms, tolerance) if forms else None
+        servos = _servos(runs)
+        ends = [each.result.found.errors.rms.size for by_run in servos.values() for each in by_run.values()]
+        shown = together.shown if together else min(ends, default=1)
         places = {}
         if together:
             charts.data.update(together.data)
@@ -111,6 +176,10 @@ def render(runs: Mapping[str, Gathered], command: str) -> str:
             together=together,
             formless=[name for name in runs if name not in forms],
             figures=places,
+            shown=shown,
+            revolutions=max([together.revolutions if together else 1, *ends]),
+            servos=list(_servo_figures(runs, servos, shown, charts)),
+            servo_results=_servo_results(servos),
             signals=list(_signals(runs, charts)),
         )
     return text

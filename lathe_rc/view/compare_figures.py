@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_rc.loops import LoopResult
 from lathe_rc.messages import Samples
 from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.view.report_figures import LEGEND, colour_range, diverging, um
 from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_series import Envelope
 
 MAPS, SPECTRA, SIZES = "maps", "spectra", "sizes"  #: names of the data sets
 _FIELDS = 60_000  # total number of fields in the maps of a page
@@ -203,6 +205,36 @@ def convergence(runs: Compared) -> Spec:
     }
     layer = [drawn, _rule("y", "tolerance", (6, 4)), _rule("x", "revolution")]
     return _steered(runs, chart(280, layer=layer))
+
+
+def servo_error(results: Mapping[str, LoopResult], shown: int) -> Spec:
+    """Return the largest error of a force or position loop by revolution of all runs, with the chosen revolution.
+
+    Args:
+        results: results of the loop by run, of one quantity.
+        shown: revolution shown first.
+    """
+    quantity_ = next(iter(results.values())).loop.quantity
+    data, limits = [], {}
+    for name, result in results.items():
+        sizes = Envelope()
+        sizes.add(result.found.errors.largest)
+        place, _, high = sizes.curve()
+        data += rows(r=place + 1.0 + result.before, v=high * quantity_.scale, l=name)
+        limits[name] = result.loop.tolerance * quantity_.scale
+    line = {
+        "data": {"values": data},
+        "transform": [{"filter": "datum.v > 0"}],
+        "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
+        "encoding": {
+            "x": quantity("r", "revolution", scale=axis_scale(), axis={"grid": False}),
+            "y": quantity("v", f"largest {quantity_.error} [{quantity_.unit}]", scale=axis_scale(log=True)),
+            **_by_run(results, r="revolution", v=f"largest [{quantity_.unit}]"),
+        },
+    }
+    tolerances = [_rule("y", str(number(limit)), (6, 4)) for limit in sorted({*limits.values()}) if limit > 0.0]
+    spec = chart(240, layer=[line, *tolerances, _rule("x", "revolution")])
+    return {**spec, "params": [{"name": "revolution", "value": shown}], "usermeta": {"signals": ["revolution"]}}
 
 
 def maps(runs: Compared) -> list[Spec]:

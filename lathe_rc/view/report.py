@@ -90,6 +90,29 @@ def _signals(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
             }
 
 
+def _servos(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
+    """Return the section of each force or position loop."""
+    for servo in data.servos:
+        result, quantity = servo.result, servo.loop.quantity
+        known = bool(result.found.errors.rms.size)
+        courses = {"set point": servo.set_point, f"{servo.loop.name}, measured": servo.measured}
+        drawn = {
+            "error": [figures.servo_error(result)] if known else [],
+            "course": [figures.against_time(data, courses, f"{servo.loop.name} [{quantity.unit}]", quantity.scale)],
+            "command": [figures.against_time(data, {"command": servo.command}, "command", 1.0)],
+        }
+        rows = [[name, *result.row(place).values()] for name, place in (("first", 0), ("last", -1)) if known]
+        columns = ("", "revolution", "RMS", "max", "P-V", "mean")
+        yield {
+            "loop": servo.loop,
+            "limit": shown(servo.loop.limit),
+            "refused": servo.refused,
+            "numbers": grid(columns, rows, ("",)),
+            "told": [*(text for text, _ in result.judged()), *result.behaviour()],
+            **{name: charts.place(specs) if specs else None for name, specs in drawn.items()},
+        }
+
+
 def _nodes(data: Gathered) -> Grid | None:
     levels = ("ok", "warning", "error", "stale")
     rows = (
@@ -116,6 +139,7 @@ def losses(data: Gathered) -> list[str]:
     found += [f"{name} lost {count} blocks" for name, count in host.lost_blocks.items()]
     found += host.errors
     found += [f"{form.tool}: {form.refused}" for form in data.forms if form.refused]
+    found += [f"{servo.loop.node}: {servo.refused}" for servo in data.servos if servo.refused]
     if data.unjudged:
         found.append(f"no tolerance is known: {data.unjudged}")
     if data.about.get(RECOVERED):
@@ -196,6 +220,16 @@ def _facts(data: Gathered) -> Iterator[tuple[str, str, str]]:
             yield "revolutions", str(form.rms.size), ""
             yield "RMS, first revolution", f"{shown(form.first.numbers['rms'])} µm", ""
             yield "RMS, last revolution", f"{shown(form.last.numbers['rms'])} µm", ""
+    for servo in data.servos if not any(form.last for form in data.forms) else ():
+        result = servo.result
+        if result.found.errors.rms.size:
+            last = result.row(-1)
+            yield "revolutions", str(last["revolution"]), ""
+            yield (
+                f"{servo.loop.name} error, RMS, last revolution",
+                f"{shown(last['rms'])} {servo.loop.quantity.unit}",
+                "",
+            )
     if data.run_id:
         yield "run", printable(data.run_id, 16), ""
 
@@ -227,6 +261,7 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
     with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers, which are shown unchanged
         cycles = {f"{topic}: {field}": found for (topic, field), found in data.curves.cycles.items() if found.size}
         forms = [_form(form, cycles, len(data.forms), charts) for form in data.forms]
+        servos = list(_servos(data, charts))
         signals = list(_signals(data, charts))
         curves, unknown_loop = _loops(data)
         loops = [charts.place(report_loop.loop(curve)) for curve in curves]
@@ -245,6 +280,7 @@ def render(data: Gathered, name: str, command: str, made_of: Budget | None = Non
             budget=_budget(made_of) if made_of else None,
             cutoff=f"{CUTOFF:.0f}",
             forms=forms,
+            servos=servos,
             signals=signals,
             loops=loops,
             unknown_loop=unknown_loop,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import Lay
+from lathe_rc.loops import LoopResult
 from lathe_rc.messages import Samples
 from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.view.report_form import Form, Revolution
@@ -305,6 +306,7 @@ def _lines(
     height: int,
     log: bool,
     limit: float = 0.0,
+    unit: str = "µm",
 ) -> Spec:
     """Return a plot of named lines, with a band where a point stands for several values; a limit is drawn dashed.
 
@@ -317,6 +319,7 @@ def _lines(
         height: height of the plot [px].
         log: whether the values have a logarithmic axis.
         limit: value of the limit line; 0: no limit.
+        unit: unit of the limit.
     """
     across, up = titles
     data: Rows = []
@@ -341,7 +344,7 @@ def _lines(
         encoding = {"y": {"field": "m"}, "tooltip": tooltip}
         layer.append({"transform": [{"filter": drawn}], "mark": mark, "encoding": encoding})
     if limit > 0.0:
-        data_ = {"values": [{"v": number(limit), "t": f"tolerance {limit:.3g} µm"}]}
+        data_ = {"values": [{"v": number(limit), "t": f"tolerance {limit:.4g} {unit}"}]}
         where = {"y": {"field": "v"}, "color": {"value": "#888"}}
         rule = {"type": "rule", "strokeDash": [6, 4], "clip": True}
         text = {"type": "text", "align": "right", "dy": -6, "clip": True, "fontSize": 11}
@@ -374,6 +377,23 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     limit = form.tolerance * 1e6 if form else 0.0
     titles = "revolution or cycle", "error [µm]"
     return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
+
+
+def servo_error(result: LoopResult) -> Spec:
+    """Return a plot of the error of a force or position loop by revolution."""
+    quantity_, errors = result.loop.quantity, result.found.errors
+    rms, largest = Envelope(), Envelope()
+    rms.add(errors.rms)
+    largest.add(errors.largest)
+    return _lines(
+        {"RMS": (rms, LAST, False), "largest": (largest, _GREY, False)},
+        (lambda place: place + 1 + result.before, lambda values: _clipped(values) * quantity_.scale),
+        ("revolution", f"{quantity_.error} [{quantity_.unit}]"),
+        height=240,
+        log=True,
+        limit=result.loop.tolerance * quantity_.scale,
+        unit=quantity_.unit,
+    )
 
 
 def almost_equal(low: float, high: float) -> bool:

@@ -20,11 +20,13 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.event_log import LOGGED, LogEntry
+from lathe_rc.loops import watches
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
+from lathe_rc.view.report_servo import Servo
 
 _MOST_OF_A_TYPE = 4  # largest number of topics of a type that have figures
 _MOST_EVENTS = 100
@@ -133,6 +135,7 @@ class Gathered:
         step_ns: sampling step [ns].
         run_id: identity of the run.
         forms: form error of each tool.
+        servos: force and position loops.
         curves: signals and cycles.
         host: data of the host topics.
         stopped: reason why the bag was not read to its end; empty if it was.
@@ -144,6 +147,7 @@ class Gathered:
     topics: dict[str, Tally]
     forms: list[Form]
     curves: Curves
+    servos: list[Servo] = field(default_factory=list)
     host: Host = field(default_factory=Host)
     samples: int = 0
     step_ns: int = 0
@@ -203,9 +207,10 @@ def gather(path: Path) -> Gathered:
             for tool in of_type(types, messages.TOOL)
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
-        gathered = Gathered(source.about, tallies, forms, Curves(types), nodes=nodes, unjudged=unjudged)
+        servos = [Servo(watch) for watch in watches(provenance.servo_loops(nodes), types)]
+        gathered = Gathered(source.about, tallies, forms, Curves(types), servos, nodes=nodes, unjudged=unjudged)
         first = first_of(source)
-        feeder = Feeder(types, [*forms, gathered.curves], _PIECE, first)
+        feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first)
         try:
             _feed(source, feeder, gathered)
         except LatheError as error:

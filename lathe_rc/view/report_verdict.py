@@ -74,7 +74,8 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
             limits.append(Finding(f"{node} came to the limits of its command, {_when(data, kind)}.", WARN))
     if form and not incidents and not growth:  # otherwise incidents or growth determine the form error
         limits += _form(data, form)
-    verdict = _verdict(data, form)
+    verdict = _verdict(data, form) if form or not data.servos else None
+    verdict = _with_loops(data, verdict)
     if growth:
         mood = BAD if growth.diverges or verdict.mood == BAD else WARN
         verdict = Finding(f"{_sentence(growth.told())} {verdict.text}", mood)
@@ -97,6 +98,16 @@ def _verdict(data: Gathered, form: Form | None) -> Finding:
             f"{last['max']:.3g} µm at most."
         )
     return Finding(_sentence(form.verdict.told()), GOOD if form.verdict.in_tolerance else BAD)
+
+
+def _with_loops(data: Gathered, verdict: Finding | None) -> Finding:
+    """Return the verdict on the form, if there is one, together with those on the force and position loops."""
+    texts, moods = ([verdict.text], [verdict.mood]) if verdict else ([], [])
+    for servo in data.servos:
+        for text, good in servo.result.judged():
+            texts.append(f"{servo.loop.node}: {text}.")
+            moods.append("" if good is None else GOOD if good else BAD)
+    return Finding(" ".join(texts), BAD if BAD in moods else GOOD if GOOD in moods else "")
 
 
 def _when(data: Gathered, kind: EventKind) -> str:

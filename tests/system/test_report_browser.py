@@ -77,8 +77,8 @@ def test_the_report_is_quiet(page, tmp_path):
     assert visit.console == []
     assert visit.requests == []
     assert "Error map" in visit.document
-    assert visit.document.count('class="drawn"') == 9  # the figures are drawn by the script that the page allows
-    assert visit.document.count('class="chart vega-embed') == 12  # the polar figure has two, and so have the loops
+    assert visit.document.count('class="drawn"') == 15  # the figures are drawn by the script that the page allows
+    assert visit.document.count('class="chart vega-embed') == 18  # the polar figure has two, and so have the loops
 
 
 # Runs in the page once its figures stand: marks a field of one, then clicks twice.
