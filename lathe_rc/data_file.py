@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of plain data: JSON with arrays, compressed, between a first line and a checksum. They contain no code."""
+"""Files of plain data: JSON and the bytes of its arrays, compressed, between a first line and a checksum.
 
-import base64
+They contain no code. The compressed content begins with a line that gives the length of the JSON text.
+"""
+
 import errno
 import json
+import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +18,7 @@ from lathe_rc.errors import InputError, shown
 from lathe_rc.files import DamagedError, contents, sealed, unsealed
 
 MOST = 2**28  #: largest file, and largest content [B]
+_DTYPE, _SHAPE = "dtype", "shape"
 _NUMBERS = "biuf"  # allowed kinds of array elements
 
 T = TypeVar("T")
@@ -31,7 +35,9 @@ def packed(kind: str, told: object, level: int = 1) -> bytes:
     Raises:
         TypeError: ``told`` contains something else.
     """
-    return sealed(_head(kind) + zlib.compress(json.dumps(told, default=_encoded).encode(), level))
+    arrays = _Arrays()
+    text = json.dumps(told, default=arrays.encoded).encode()
+    return sealed(_head(kind) + zlib.compress(b"".join([b"%d\n" % len(text), text, *arrays.written]), level))
 
 
 def read(path: Path, kind: str, make: Callable[[Any], T], most: int = MOST) -> T:
@@ -47,7 +53,11 @@ def read(path: Path, kind: str, make: Callable[[Any], T], most: int = MOST) -> T
         InputError: the file cannot be read, is damaged, or is of another kind.
     """
     try:
-        return make(json.loads(_unpacked(contents(path, most), _head(kind), most), object_hook=_decoded))
+        content = _unpacked(contents(path, most), _head(kind), most)
+        start = content.index(b"\n") + 1
+        end = start + int(content[:start])
+        arrays = _Arrays(content[end:])
+        return make(json.loads(content[start:end], object_hook=arrays.decoded))
     except InputError:
         raise
     except OSError as error:
@@ -63,21 +73,32 @@ def _head(kind: str) -> bytes:
     return f"lathe_rc {kind} 1\n".encode()
 
 
-def _encoded(part: object) -> object:
-    if isinstance(part, np.ndarray):
-        return {"dtype": part.dtype.str, "shape": part.shape, "data": base64.b64encode(part.tobytes()).decode()}
-    if isinstance(part, np.generic):
-        return part.item()
-    raise TypeError(f"a {type(part).__name__} in a file of plain data")
+class _Arrays:
+    """Arrays of a file, whose bytes follow its text in their order."""
 
+    def __init__(self, data: bytes = b"") -> None:
+        self._data = memoryview(data)
+        self.written: list[bytes] = []
 
-def _decoded(part: dict[str, Any]) -> object:
-    if part.keys() != {"dtype", "shape", "data"}:
-        return part
-    dtype = np.dtype(str(part["dtype"]))
-    if dtype.kind not in _NUMBERS:
-        raise ValueError(f"elements {part['dtype']!r:.80}")
-    return np.frombuffer(base64.b64decode(part["data"]), dtype).reshape(part["shape"]).copy()
+    def encoded(self, part: object) -> object:
+        """Return what stands for an array or a number of NumPy in the text."""
+        if isinstance(part, np.ndarray):
+            self.written.append(part.tobytes())
+            return {_DTYPE: part.dtype.str, _SHAPE: part.shape}
+        if isinstance(part, np.generic):
+            return part.item()
+        raise TypeError(f"a {type(part).__name__} in a file of plain data")
+
+    def decoded(self, part: dict[str, Any]) -> object:
+        """Return the next array for what stands for it in the text."""
+        if part.keys() != {_DTYPE, _SHAPE}:
+            return part
+        dtype = np.dtype(str(part[_DTYPE]))
+        if dtype.kind not in _NUMBERS:
+            raise ValueError(f"elements {part[_DTYPE]!r:.80}")
+        size = dtype.itemsize * math.prod(part[_SHAPE])
+        found, self._data = self._data[:size], self._data[size:]
+        return np.frombuffer(found, dtype).reshape(part[_SHAPE]).copy()
 
 
 def _unpacked(content: bytes, head: bytes, most: int) -> bytes:

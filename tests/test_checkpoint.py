@@ -2,7 +2,6 @@
 """Checkpoints: a run that goes on from one gives the bits of the uninterrupted run."""
 
 import json
-import zlib
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -13,13 +12,12 @@ from bags import lathe, sized
 from test_restart import OWN, Killer
 
 import lathe_rc
-from lathe_rc import harness
+from lathe_rc import data_file, harness
 from lathe_rc.bag import check
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
-from lathe_rc.files import sealed, unsealed
 from lathe_rc.harness.result import Mode
 from lathe_rc.sweep import row
 
@@ -28,7 +26,6 @@ SCENARIOS = (
     *("piston", "full_cell", "supervised_two_channel", "periodic", "robust", "gauged", "loaded_cutting", "vibration"),
     *("supervised_turning", "series"),
 )
-_HEAD = len(b"lathe_rc checkpoint 1\n")
 
 
 def rest(whole: Recording, first: int) -> dict[str, str]:
@@ -199,9 +196,7 @@ def test_parameters_on_which_the_state_depends_are_refused(override: str, why: s
 
 def changed(path: Path, **told: object) -> bytes:
     """Return the content of a checkpoint with some entries replaced."""
-    content = json.loads(zlib.decompress(bytes(unsealed(path.read_bytes()))[_HEAD:]))
-    whole = path.read_bytes()[:_HEAD] + zlib.compress(json.dumps({**content, **told}).encode())
-    return sealed(whole)
+    return data_file.packed("checkpoint", {**data_file.read(path, "checkpoint", dict), **told})
 
 
 def test_damaged_foreign_and_other_versions_files_are_refused_in_one_line(learned: Path, tmp_path: Path) -> None:
