@@ -134,7 +134,9 @@ for rpm in np.linspace(900.0, 4800.0, 14):
         early, late = np.ptp(signal[: signal.size // 8]), np.ptp(signal[-signal.size // 8 :])
         grows = late > min(early, 1e-6)  # the worst of them has chattered before the kick already
         label = ("grows" if grows else "dies out") if rpm == 900.0 and stiffness in {300e3, 2300e3} else None
-        chart.plot(rpm, stiffness / 1e3, ".", ms=6, color=RED if grows else "#58a55c", label=label)
+        # Crosses and circles also differ where red and blue do not.
+        mark = {"marker": "x", "color": RED} if grows else {"marker": "o", "mfc": "none", "color": BLUE}
+        chart.plot(rpm, stiffness / 1e3, ls="", ms=4, label=label, **mark)
 chart.set(xlabel="spindle speed [rpm]", ylabel="K [N/mm]", ylim=(200, 3100), xlim=(800, 4900))
 chart.set_title("regeneration, realistic W3: chart and simulated cuts", fontsize=10)
 

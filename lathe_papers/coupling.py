@@ -38,6 +38,7 @@ _TURNS, _SPINDLE_TURNS = 3, 12  # simulated revolutions, of which the last is co
 _LEAD = 1.425e-3  # lead T0 of a controller of this drive (spec/learning.md) [s]
 _FEED = 1e-3  # [m/rev]; at this feed, K is kc1 times 1 mm
 _GAPS = ((1.0, 0.35), (1.0 + np.pi, 0.35))
+_LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 _COLOURS = ("#1f6f8b", "#2e8b57", "#e08e0b", "#c0392b", "#7d3c98", "#555555")
 
 
@@ -132,9 +133,9 @@ class CouplingResult:
         edge, stable, spindle = figure.subplots(1, 3)
         degrees = np.degrees(self.angle - self.angle[0])
         for k, delay in enumerate(given.delays):
-            colour = _COLOURS[k % len(_COLOURS)]
-            edge.plot(degrees, 1e6 * self.moved[k], color=colour, lw=0.9, label=_samples(delay))
-            spindle.plot(degrees, self.slowed[k], color=colour, lw=0.9, label=_samples(delay))
+            style = {"color": _COLOURS[k % len(_COLOURS)], "ls": _LINES[k % len(_LINES)], "lw": 0.9}
+            edge.plot(degrees, 1e6 * self.moved[k], label=_samples(delay), **style)
+            spindle.plot(degrees, self.slowed[k], label=_samples(delay), **style)
         edge.set(xlabel="spindle angle [°]", ylabel="edge less that of one stage [µm]", title="drive and cut")
         stable.semilogx(given.delays, self.limits[1:] / 1e3, "o-", color=_COLOURS[0], label="with a delay")
         stable.axhline(self.limits[0] / 1e3, color=_COLOURS[3], lw=0.9, label="one stage")

@@ -30,6 +30,7 @@ Array = npt.NDArray[np.float64]
 _SETTLED = 50  # revolutions after which learning has settled
 _POINTS = 1024  # points of the profile per revolution
 _COLOURS = ("#c0392b", "#e08e0b", "#7d3c98", "#1f6f8b")
+_UNITS = ((1.0, "µm"), (1e3, "nm"), (1e6, "pm"))  # of a figure, from µm
 
 
 class PistonParameters(StudyParameters):
@@ -80,10 +81,11 @@ class PistonResult:
         """Draw the error against the angle, by formula and by simulation."""
         degrees = np.arange(_POINTS) * 360 / _POINTS
         for row, (axes, name) in enumerate(zip(figure.subplots(2, 2, sharex=True).flat, ROWS, strict=True)):
-            axes.plot(degrees, self.simulated[row], color=_COLOURS[row], lw=2.5, alpha=0.5, label="run")
-            axes.plot(degrees, self.expected[row], color="black", lw=0.8, label="formula")
+            factor, unit = next((each for each in _UNITS if np.ptp(self.simulated[row]) * each[0] > 1.0), _UNITS[-1])
+            axes.plot(degrees, factor * self.simulated[row], color=_COLOURS[row], lw=2.5, alpha=0.5, label="run")
+            axes.plot(degrees, factor * self.expected[row], color="black", lw=0.8, ls="--", label="formula")
             axes.set_title(name, fontsize=10)
-            axes.set(ylabel="form error [µm]", xlim=(0, 360), xticks=range(0, 361, 60))
+            axes.set(ylabel=f"form error [{unit}]", xlim=(0, 360), xticks=range(0, 361, 60))
             axes.grid(visible=True, alpha=0.3)
             axes.legend(fontsize=7)
         figure.supxlabel("spindle angle [°]", fontsize=10)

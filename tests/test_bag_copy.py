@@ -48,6 +48,15 @@ def test_bags_are_merged_by_log_time_and_a_database_becomes_mcap(turned, tmp_pat
     assert len(list((tmp_path / "both").glob("*.mcap"))) == 1
 
 
+def test_the_scenario_does_not_scroll_the_topics_away_where_it_is_not_asked_for(turned):
+    whole, short = lathe("bag", "info", turned).stdout, lathe("bag", "info", turned, "--no-scenario").stdout
+    count = whole.count("\n") - short.count("\n")
+    assert "ros__parameters" in whole
+    assert "ros__parameters" not in short
+    assert f"scenario: {count} lines; --scenario prints them" in short
+    assert short.index("/tool") < short.index("scenario:")
+
+
 def test_a_recording_that_joined_late_or_lacks_samples_is_described(turned, tmp_path):
     for name, words in {"first": ["--end", "0.03"], "late": ["--start", "0.06"]}.items():
         assert lathe("bag", "copy", turned, "-o", tmp_path / name, *words).exit_code == 0

@@ -15,7 +15,7 @@ import pytest
 from cells import run
 from rich.console import Console
 
-from lathe_rc.commands import plot
+from lathe_rc.commands import plot, tables
 
 COMMAND = [sys.executable, "-m", "lathe_rc", "run", "piston", "--revolutions", "4"]
 HEADING = "form error [µm] by revolution"
@@ -101,3 +101,11 @@ def test_the_tolerance_is_drawn_on_its_side_of_a_power_of_ten(tolerance, above):
     label = next(k for k, line in enumerate(lines) if line.lstrip().startswith("1┤"))
     assert (drawn < label) == above
     assert drawn != label
+
+
+def test_headings_that_do_not_fit_break_after_dots_and_underscores():
+    names = ["cell", "learning_controller.lead_time", "tool.max_error"]
+    assert tables.broken(names, 80) == names
+    told = tables.broken(names, 40)
+    assert told == ["cell", "learning_\ncontroller.\nlead_time", "tool.max_\nerror"]
+    assert [name.replace("\n", "") for name in told] == names

@@ -432,7 +432,10 @@ def test_the_command_shows_and_writes_what_it_found(tmp_path, command):
     assert "by formula, learning_controller.lead_time: T0 with the least sup|Q - γZ|" in shown.stdout
     assert f"best:    lathe run {folder / 'best.yaml'}" in shown.stdout
     assert (folder / "history.png").read_bytes().startswith(b"\x89PNG")
-    assert "https://cdn" not in (folder / "history.html").read_text(encoding="utf-8")
+    page = (folder / "history.html").read_text(encoding="utf-8")
+    assert "https://cdn" not in page
+    assert "prefers-color-scheme: dark" in page
+    assert f">{LEAD}</td><td>0.0009</td>" in page, "the parameters, of the start and of the best"
     told = json.loads(command(*asked, "--json").stdout)
     assert (told["trials"], told["cells"], told["best"]["feasible"]) == (3, 4, True)
     assert told["best"]["goals"]["tool.max_error"] <= told["start"]["goals"]["tool.max_error"]

@@ -46,9 +46,15 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @bag.command()
 @_BAG
 @click.option("--metrics/--no-metrics", default=True, help="form error of the part; reads the whole bag")
+@click.option(
+    "--scenario/--no-scenario",
+    "whole",
+    default=None,
+    help="the whole scenario; default: only if the output is not a terminal, whose top it would scroll away",
+)
 @options.as_json
 @click.pass_context
-def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> None:
+def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, as_json: bool) -> None:
     """Show topics, rates, time span, date, scenario and the form error of the part.
 
     For a damaged bag, or one that lacks samples, show the readable content and what is wrong; exit code 3.
@@ -110,14 +116,16 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, as_json: bool) -> Non
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
-    _print_about(console, summary["about"])
+    _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)
     ctx.exit(_LOSSY if source.damage else 0)
 
 
-def _print_about(console: Console, about: Mapping[str, str]) -> None:
-    """Print the metadata strings of a bag."""
+def _print_about(console: Console, about: Mapping[str, str], *, whole: bool) -> None:
+    """Print the metadata strings of a bag; of the scenario the ``whole`` or its length."""
     for key, text in about.items():
-        if key == provenance.SCENARIO:
+        if key == provenance.SCENARIO and not whole:
+            console.print(f"scenario: {text.strip().count(chr(10)) + 1} lines; --scenario prints them")
+        elif key == provenance.SCENARIO:
             console.print("scenario:")
             console.print("  " + text.strip().replace("\n", "\n  "))
         elif key == provenance.ORIGINS:

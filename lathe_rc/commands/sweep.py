@@ -163,7 +163,7 @@ def best(found: "Sweep") -> list[dict[str, Any]]:
 
 
 def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) -> None:
-    from lathe_rc.commands.tables import console, table
+    from lathe_rc.commands.tables import broken, console, table
     from lathe_rc.sweep import row
 
     statuses, top, folder = found.statuses(), best(found), found.folder
@@ -175,7 +175,7 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
         return
     out = console()
     if top:
-        lines = table(*top[0], title="smallest errors", overflow="fold")
+        lines = table(*broken(list(top[0]), out.width), title="smallest errors", overflow="fold")
         for each in top:
             lines.add_row(*(_formatted(value, *row.unit(name, folder.scenario)) for name, value in each.items()))
         out.print(lines, soft_wrap=False)

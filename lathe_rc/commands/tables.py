@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables and text lines for the terminal."""
 
+import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+_HEADING = 13  # characters of a line of a broken heading
 
 
 def console() -> Console:
@@ -17,6 +21,21 @@ def console() -> Console:
 def spread(whole: int, count: int = 10) -> list[int]:
     """Return up to ``count`` indices below ``whole``, including the first and the last, denser at the beginning."""
     return sorted({round(place) - 1 for place in np.geomspace(1, whole, count).tolist()})
+
+
+def broken(columns: Sequence[str], width: int) -> list[str]:
+    """Return headings in lines that end after a dot or an underscore, if together they are wider than ``width``."""
+    if sum(map(len, columns)) + 3 * len(columns) <= width:
+        return [*columns]
+    found = []
+    for column in columns:
+        lines = [""]
+        for piece in re.findall(r"[^_.]*[_.]?", column):
+            if lines[-1] and len(lines[-1] + piece) > _HEADING:
+                lines.append("")
+            lines[-1] += piece
+        found.append("\n".join(lines))
+    return found
 
 
 def table(*columns: str, title: str | None = None, left: int = 0, **options: Any) -> Table:

@@ -143,7 +143,7 @@ def _show(tuning: "Tuning", picture: Path) -> None:
         out.print(_front_table(tuning), soft_wrap=False)
         out.print(f"{folder / 'front'}: a parameter file of each")
     if best and start:
-        out.print(_best_table(tuning, start, best), soft_wrap=False)
+        out.print(_best_table(tuning), soft_wrap=False)
         if not math.isnan(best.score.margin):
             out.print(_cost_of(start, best))
     for formula in dict.fromkeys(found.formula for found in tuning.formulas.values()):
@@ -162,36 +162,20 @@ def _show(tuning: "Tuning", picture: Path) -> None:
     out.print(f"rows:    lathe sweep show {folder} --cell {shown.number * tuning.cells if shown else 0}")
 
 
-def _best_table(tuning: "Tuning", start: "Trial", best: "Trial") -> "Table":
+def _best_table(tuning: "Tuning") -> "Table":
     """Return a table of parameters and results for the start, the best trial, and the formulas."""
     from lathe_rc.commands.tables import table
 
-    def text(value: object) -> str:
-        return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-    given = {target: text(found.value) for target, found in tuning.formulas.items()}
-    made = table("", "start", "best", *(["by formula"] if given else []), left=1, overflow="fold")
+    columns, values, results = tuning.compared()
+    made = table(*columns, left=1, overflow="fold")
     for column in made.columns[1:]:
         column.no_wrap = True
-    for target, value in best.values.items():
-        made.add_row(target, text(start.values[target]), text(value), *([given.get(target, "")] if given else []))
+    for row in values:
+        made.add_row(*row)
     made.add_section()
-    trials = [trial for trial in (start, best, tuning.by_formula) if trial]
-    results = [_results(tuning, trial) for trial in trials]
-    for name in results[0]:
-        made.add_row(name, *(result.get(name, "") for result in results))
-    made.add_row("meets all subjects", *("yes" if trial.score.feasible else "no" for trial in trials))
+    for row in results:
+        made.add_row(*row)
     return made
-
-
-def _results(tuning: "Tuning", trial: "Trial") -> dict[str, str]:
-    """Return the formatted goals and margin of a trial by name."""
-    percentile = tuning.objectives.percentile
-    which = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g} %"
-    shown = {f"{name}{which}": value for name, value in tuning.goals_shown(trial).items()}
-    if not math.isnan(trial.score.margin):
-        shown[f"margin{which}"] = f"{trial.score.margin:.4g}"
-    return shown
 
 
 def _cost_of(start: "Trial", best: "Trial") -> str:
@@ -218,7 +202,7 @@ def _history(tuning: "Tuning") -> str:
 def _front_table(tuning: "Tuning") -> "Table":
     from lathe_rc.commands.tables import table
 
-    results = {trial.number: _results(tuning, trial) for trial in tuning.front}
+    results = {trial.number: tuning.results(trial) for trial in tuning.front}
     names = next(iter(results.values()))
     made = table("trial", *names, title="no other trial is better in all goals", overflow="fold")
     made.columns[0].no_wrap = True

@@ -7,13 +7,16 @@ from typing import Any, cast
 
 import altair as alt
 
+from lathe_rc import __version__
 from lathe_rc.sweep.folder import writing
 from lathe_rc.sweep.row import unit
 from lathe_rc.sweep.tuning import Tuning
+from lathe_rc.view.charts import Charts, page_template
 
 _WIDTH, _HEIGHT = 560, 300
-_START, _FEASIBLE, _OTHER, _BEST = "#e08e0b", "#1f6f8b", "#c8cdd0", "#c0392b"
+_START, _FEASIBLE, _OTHER, _BEST = "#e08e0b", "#2f8fb0", "#8f979b", "#c0392b"
 _KINDS = ("start", "meets all subjects", "does not")
+_SHAPES = ["diamond", "circle", "cross"]
 
 
 def _title(tuning: Tuning, column: str) -> str:
@@ -41,11 +44,12 @@ def chart(tuning: Tuning) -> alt.LayerChart:
         kind = _KINDS[0] if trial.number == 0 else _KINDS[1] if trial.score.feasible else _KINDS[2]
         told = {"trial": trial.number, "kind": kind, "first": first, "second": second, "best": best}
         rows.append(told | {"front": trial.number in front})
+    legend = alt.Legend(orient="top")
     colour = alt.Color(
         "kind:N",
         title=None,
         scale=alt.Scale(domain=_KINDS, range=[_START, _FEASIBLE, _OTHER]),
-        legend=alt.Legend(orient="top"),
+        legend=legend,
     )
     base = alt.Chart(alt.InlineData(values=rows))
     scale = _scale(rows, "first")
@@ -59,7 +63,10 @@ def chart(tuning: Tuning) -> alt.LayerChart:
         up = alt.Y("first:Q", title=_title(tuning, columns[0]), scale=scale)
         line = base.mark_line(color=_BEST, interpolate="step-after").encode(across, alt.Y("best:Q", scale=scale))
         tip = "kind:N"
-    dots = base.mark_circle(size=40).encode(across, up, colour, tooltip=["trial:Q", "first:Q", tip])
+    shape = alt.Shape("kind:N", title=None, scale=alt.Scale(domain=_KINDS, range=_SHAPES), legend=legend)
+    dots = base.mark_point(size=60, filled=True, opacity=1.0).encode(
+        across, up, colour, shape, tooltip=["trial:Q", "first:Q", tip]
+    )
     text = f"Tuning of {tuning.folder.scenario.name}: {len(tuning.trials)} trials"
     without = sum(not all(map(math.isfinite, trial.score.costs)) for trial in tuning.trials)
     subtitle = f"{without} of them refused or diverged: not in the figure" if without else []
@@ -86,5 +93,25 @@ def write(tuning: Tuning) -> Path:
     made, folder = chart(tuning), tuning.folder.path
     with writing(folder):
         made.save(str(folder / "history.png"), scale_factor=2.0)
-        made.save(str(folder / "history.html"), inline=True)
+        (folder / "history.html").write_text(_page(tuning, made), encoding="utf-8")
     return folder / "history.png"
+
+
+def _page(tuning: Tuning, made: alt.LayerChart) -> str:
+    """Return the page: the figure in the page's colours, and a table of start, best trial and formulas."""
+    spec, charts = made.to_dict(), Charts()
+    charts.data.update(spec.pop("datasets", {}))
+    spec.pop("config", None)
+    charts.add("history", {"": {**spec, "autosize": {"type": "fit-x", "contains": "padding"}}})
+    columns, values, results = tuning.compared()
+    return page_template(Path(__file__).with_name("history.html.j2")).render(
+        title=f"Tuning of {tuning.folder.scenario.name}",
+        charts=charts,
+        columns=columns,
+        rows=[*values, *results],
+        best=tuning.best,
+        front=[[str(trial.number), *tuning.results(trial).values()] for trial in tuning.front],
+        front_columns=["trial", *(tuning.results(tuning.front[0]) if tuning.front else ())],
+        folder=tuning.folder.path,
+        version=__version__,
+    )

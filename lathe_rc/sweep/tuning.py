@@ -136,6 +136,36 @@ class Tuning:
             found[column] = f"{value * factor:.4g} {name}".rstrip() if math.isfinite(value) else "none"
         return found
 
+    def results(self, trial: Trial) -> dict[str, str]:
+        """Format the goals and the margin of a trial, by name."""
+        percentile = self.objectives.percentile
+        which = "" if self.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g} %"
+        found = {f"{name}{which}": value for name, value in self.goals_shown(trial).items()}
+        if not math.isnan(trial.score.margin):
+            found[f"margin{which}"] = f"{trial.score.margin:.4g}"
+        return found
+
+    def compared(self) -> tuple[list[str], list[list[str]], list[list[str]]]:
+        """Return columns, rows of parameters and rows of results of a table of start, best trial and formulas."""
+        start, best = self.start, self.best
+        if start is None or best is None:
+            return ["", "start", "best"], [], []
+
+        def text(value: object) -> str:
+            return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+        given = {target: text(found.value) for target, found in self.formulas.items()}
+        columns = ["", "start", "best", *(["by formula"] if given else [])]
+        values = [
+            [target, text(start.values[target]), text(value), *([given.get(target, "")] if given else [])]
+            for target, value in best.values.items()
+        ]
+        trials = [trial for trial in (start, best, self.by_formula) if trial]
+        found = [self.results(trial) for trial in trials]
+        rows = [[name, *(result.get(name, "") for result in found)] for name in found[0]]
+        rows.append(["meets all subjects", *("yes" if trial.score.feasible else "no" for trial in trials)])
+        return columns, values, rows
+
     def scenario(self, trial: Trial) -> Scenario:
         """Return the scenario with a trial's parameters and the nominal plant and spindle."""
         return self.folder.scenario.varied(trial.values)
