@@ -184,6 +184,16 @@ def test_a_run_that_fails_says_so_and_can_be_restarted(opened, monkeypatch):
     shown.until(lambda now: now["state"] == "ended")
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_panel_whose_thread_has_ended_answers(opened, monkeypatch):
+    shown = opened(scenario("piston", 4))
+    monkeypatch.setattr(shown.cell, "advance", lambda _: 1 / 0)
+    shown.ask("start")
+    assert "ZeroDivisionError" in shown.until(lambda now: now["state"] == "failed")["error"]
+    with pytest.raises(LatheError, match="start lathe panel again"):
+        shown.ask("pause")
+
+
 def test_a_page_that_does_not_ask_delays_no_sample(opened, monkeypatch):
     """It then gets the newest snapshot, and the rows that it lacks, a few at a time."""
     monkeypatch.setattr(panel_view, "MOST_ROWS", 16)

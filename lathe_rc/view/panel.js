@@ -2,9 +2,9 @@
 // The panel: takes snapshots of a run from the server and draws them; sends commands.
 const $ = id => document.getElementById(id);
 const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, history: 0, latest: 0 }; // see Have in panel_view.py
-const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], shape: null, ranges: {} };
+const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], force: [], shape: null, ranges: {} };
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
-const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
+const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
@@ -22,10 +22,11 @@ const seen = (name, value, least) => { // the largest magnitude so far, for scal
 
 function merge(told) {
   if (told.run != HAVE.run) {
-    Object.assign(SHOWN, { rows: [], history: [], latest: [], log: [], shape: null, ranges: {} });
+    Object.assign(SHOWN, { rows: [], history: [], latest: [], log: [], force: [], shape: null, ranges: {} });
     HAVE.epoch = told.epoch;
   }
   for (; HAVE.epoch < told.epoch; HAVE.epoch++) SHOWN.rows = SHOWN.rows.filter((_, k) => k % 2 == 0);
+  if (told.now.measured_force !== undefined && told.now.time != SHOWN.now.time) SHOWN.force = [...SHOWN.force, [told.now.time, told.now.measured_force]].slice(-MOST_FORCE);
   SHOWN.now = told.now;
   SHOWN.rows.push(...told.rows);
   SHOWN.history.push(...told.history);
@@ -84,10 +85,12 @@ function draw(changed, moving = true) {
   drawMachine(now);
   drawDials(now);
   changedSince ||= changed;
-  if (changedSince && (!moving || performance.now() - drawnAt > CALM)) {
+  if (ABOUT.part && changedSince && (!moving || performance.now() - drawnAt > CALM)) {
     drawMap(); drawWaterfall(); drawHistory();
     [changedSince, drawnAt] = [false, performance.now()];
   }
+  $("forces").hidden = now.measured_force === undefined;
+  if (now.measured_force !== undefined) drawForce();
   drawLog();
 }
 
@@ -118,7 +121,7 @@ function drawMachine(now) {
   const limited = um => Math.max(-40, Math.min(40, um * scale));
   const at = (r, angle) => `${(cx + r * Math.cos(angle)).toFixed(1)},${(cy - r * Math.sin(angle)).toFixed(1)}`;
   const turn = now.angle || 0, parts = [];
-  const size = 13 * Math.max(1, 560 / $("machine").clientWidth); // readable on a telephone as well
+  const size = 13 * Math.max(1, 560 / ($("machine").getBoundingClientRect().width || 640)); // readable on a telephone as well
   const text = (x, y, words, more = "") => parts.push(`<text x="${x}" y="${y}" fill="${ink}" font-size="${size}" font-family="system-ui, sans-serif" stroke="${style("--paper")}" stroke-width="3" paint-order="stroke" ${more}>${escaped(words)}</text>`);
   parts.push(`<circle cx="${cx}" cy="${cy}" r="${radius + 42}" fill="${field}" stroke="${line}"/>`);
   for (let jaw = 0; jaw < 3; jaw++) {
@@ -156,8 +159,8 @@ function drawMachine(now) {
     text(tip + 9, cy + length + 12, `${digits(force, 3)} N`);
   }
   const bar = nice(40 / scale / 2);
-  parts.push(`<path d="M16 334 v8 h${(bar * scale).toFixed(1)} v-8" fill="none" stroke="${ink}"/>`);
-  text(24 + bar * scale, 342, `${digits(bar)} µm of radius (×${digits(now.exaggeration || 1)})`);
+  if (ABOUT.part) parts.push(`<path d="M16 334 v8 h${(bar * scale).toFixed(1)} v-8" fill="none" stroke="${ink}"/>`);
+  if (ABOUT.part) text(24 + bar * scale, 342, `${digits(bar)} µm of radius (×${digits(now.exaggeration || 1)})`);
   const slides = Object.entries(now.slides || {});
   slides.forEach(([name, mm], k) => {
     const x = 340, y = 280 + 66 * k, half = nice(seen(name, mm, 0.001)), place = x + 130 + 120 * mm / half;
@@ -166,14 +169,14 @@ function drawMachine(now) {
     text(x + 250, y + 8 + size, `±${digits(half)} mm`, 'text-anchor="end"');
   });
   if (!slides.length && ABOUT.fed) text(340, 300, `height along the part ${digits(now.height || 0)} mm`);
-  $("machine-note").textContent = ABOUT.gaps.length ? `with ${ABOUT.gaps.length} keyways` : "";
+  $("machine-note").textContent = [ABOUT.gaps.length ? `keyways: ${ABOUT.gaps.length}` : "", ABOUT.part ? "" : "no tool in this cell"].filter(Boolean).join(", ");
   $("machine").innerHTML = parts.join("");
 }
 
 function drawDials(now) {
   const dials = [["speed", "1/min", now.rpm, nice((ABOUT.rpm || now.rpm || 1) * 1.25), ABOUT.rpm]];
   if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force) * 1.2), ABOUT.force]);
-  dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), 0]);
+  if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), 0]);
   const ink = style("--ink"), soft = style("--soft"), line = style("--line"), good = style("--good"), bad = style("--bad");
   $("dials").innerHTML = dials.map(([name, unit, value, most, wanted], k) => {
     const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
@@ -311,6 +314,31 @@ function drawHistory() {
   for (const n of new Set([first, Math.round((first + last) / 2), last])) label(pen, String(n), x(n), height - 6, soft, "center");
 }
 
+function drawForce() {
+  const { pen, width, height, soft, line, good, bad } = canvas("force"), [left, top, right, bottom] = [46, 8, width - 14, height - 24];
+  const found = SHOWN.force, values = [...found.map(([, force]) => force), ABOUT.force, 0];
+  if (found.length < 2) return;
+  const most = nice(Math.max(...values, 1)), least = Math.min(0, ...values), first = found[0][0], last = found[found.length - 1][0];
+  const x = time => left + (right - left) * (time - first) / (last - first), y = force => bottom - (bottom - top) * (force - least) / (most - least);
+  for (const force of [0, most / 2, most]) {
+    Object.assign(pen, { strokeStyle: line, lineWidth: 1 });
+    pen.beginPath(); pen.moveTo(left, y(force)); pen.lineTo(right, y(force)); pen.stroke();
+    label(pen, digits(force), left - 5, y(force) + 4, soft, "right");
+  }
+  if (ABOUT.force) {
+    pen.strokeStyle = bad;
+    pen.setLineDash([6, 4]);
+    pen.beginPath(); pen.moveTo(left, y(ABOUT.force)); pen.lineTo(right, y(ABOUT.force)); pen.stroke();
+    pen.setLineDash([]);
+    label(pen, "set point", right - 4, y(ABOUT.force) - 4, bad, "right");
+  }
+  Object.assign(pen, { strokeStyle: good, lineWidth: 1.6 });
+  pen.beginPath();
+  found.forEach(([time, force], k) => pen[k ? "lineTo" : "moveTo"](x(time), y(force)));
+  pen.stroke();
+  for (const time of [first, last]) label(pen, `${time.toFixed(2)} s`, x(time), height - 6, soft, time == first ? "left" : "right");
+}
+
 // ---- commands ------------------------------------------------------------------------------------------------------
 
 async function tell(name, question) {
@@ -340,9 +368,10 @@ function describe() { // fills the commands from what the cell tells of itself
   document.title = `${ABOUT.name}: panel`;
   $("name").textContent = ABOUT.name;
   $("commands").hidden = !can("command");
-  for (const id of ["change", "record", "repeat"]) $(id).hidden = !can("change");
+  for (const id of ["change", "record", "repeat", "restart"]) $(id).hidden = !can("change");
   for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
   $("seeking").hidden = !can("seek");
+  for (const place of document.querySelectorAll(".of-part")) place.hidden = !ABOUT.part;
   if (!can("command")) return;
   $("actions").replaceChildren(...ABOUT.nodes.filter(node => node.actions.length || node.knobs.length).map(node => {
     const row = document.createElement("div"), name = document.createElement("b");
@@ -404,6 +433,7 @@ $("record").addEventListener("submit", event => {
 });
 $("go").addEventListener("click", () => tell(SHOWN.now.state == "running" ? "pause" : "start"));
 $("step").addEventListener("click", () => tell("step"));
+$("restart").addEventListener("click", () => tell("change", { values: {}, here: false }));
 $("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pace").value) }); $("pace").blur(); });
 $("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
 for (const format of ["stl", "glb"]) $(format).addEventListener("click", () => tell("part", { format, enlarged: Number($("enlarged").value) }));
@@ -414,7 +444,8 @@ $("picture").addEventListener("click", async () => {
 });
 
 async function drawn() { // the drawings of the page beside each other, as one picture
-  const boxes = ["machine", "dials", "history", "map", "waterfall"].map(id => [$(id), $(id).getBoundingClientRect()]);
+  const shown = ["machine", "dials", ...(ABOUT.part ? ["history", "map", "waterfall"] : []), ...(SHOWN.force.length ? ["force"] : [])];
+  const boxes = shown.map(id => [$(id), $(id).getBoundingClientRect()]);
   const left = Math.min(...boxes.map(([, box]) => box.left)), top = Math.min(...boxes.map(([, box]) => box.top));
   const right = Math.max(...boxes.map(([, box]) => box.right)), bottom = Math.max(...boxes.map(([, box]) => box.bottom));
   const picture = Object.assign(document.createElement("canvas"), { width: 2 * (right - left + 20), height: 2 * (bottom - top + 50) }), pen = picture.getContext("2d");

@@ -18,6 +18,7 @@ def outlook(scenario: Scenario) -> dict[str, Any]:
     return {
         "name": scenario.name,
         "step": scenario.shared.step,
+        "part": tool is not None,
         "tolerance": tool.tolerance * 1e6 if tool else 0.0,
         "fed": bool(tool and (tool.feed or tool.height_from == "slide")),
         "gaps": list(zip(cut.gap_start, cut.gap_width, strict=True)) if cut else [],
@@ -29,5 +30,13 @@ def outlook(scenario: Scenario) -> dict[str, Any]:
 
 def plain_outlook(name: str, step: float) -> dict[str, Any]:
     """Return the same for an unknown scenario with a sampling step [s]."""
-    unknown: dict[str, Any] = {"tolerance": 0.0, "fed": False, "gaps": [], "radius": 50.0, "rpm": 0.0, "force": 0.0}
+    unknown: dict[str, Any] = {
+        "part": True,
+        "tolerance": 0.0,
+        "fed": False,
+        "gaps": [],
+        "radius": 50.0,
+        "rpm": 0.0,
+        "force": 0.0,
+    }
     return {"name": name, "step": step, **unknown}

@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar
@@ -33,6 +33,7 @@ from lathe_rc.view.panel_view import View
 T = TypeVar("T")
 
 _FRAME = 0.04  # [s] of wall time between two advances of a paced run
+_PATIENCE = 1.0  # [s] between looks whether the thread that is to answer still runs
 _LATE = 0.25  # [s] behind its pace after which a run no longer makes up for the lost time
 
 
@@ -104,10 +105,13 @@ class Driver:
         """Carry out a command between two blocks, and return its result.
 
         Raises:
-            LatheError: the command is refused or fails.
+            LatheError: the command is refused or fails, or the thread has ended with an error.
         """
         answer: Future[T] = Future()
         self._commands.put((command, answer))
+        while not wait([answer], _PATIENCE).done:
+            if not self._thread.is_alive():
+                raise LatheError(f"the run has ended ({self._error}); start lathe panel again")
         return answer.result()
 
     # ---- commands, in the thread --------------------------------------------------------------------
@@ -152,15 +156,21 @@ class Driver:
                 while self._obey():
                     if self._running:
                         self._advance()
+            except Exception as error:
+                self._error, self._running = f"{type(error).__name__}: {error}", False
+                self.run.view.publish(self._told(), at_once=True)
+                raise
             finally:
                 self.run.close()
 
     def _obey(self) -> bool:
         """Carry out the waiting commands, and wait until the next block is due; return False at the end."""
         while True:
-            wait = self._due() - time.monotonic() if self._running else None
+            pause = self._due() - time.monotonic() if self._running else None
             try:
-                found = self._commands.get(timeout=wait) if wait is None or wait > 0.0 else self._commands.get_nowait()
+                found = (
+                    self._commands.get(timeout=pause) if pause is None or pause > 0.0 else self._commands.get_nowait()
+                )
             except Empty:
                 return True
             if found is None:
