@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of the force and position loops of a run: figures and verdict from the messages of their controllers."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -249,7 +249,7 @@ class LoopWatch:
         return LoopResult(self.loop, (self._running or self.loop.running(0)).found(), self._before)
 
 
-def watches(found: list[Loop], types: Mapping[str, str]) -> list[LoopWatch]:
+def watches(found: Sequence[Loop], types: Mapping[str, str]) -> list[LoopWatch]:
     """Return a sink for each loop whose messages are among topics with these message types, together with an angle."""
     encoder = next((topic for topic, kind in types.items() if kind == messages.ENCODER), None)
     named = ((loop, next((topic for topic in types if full(topic).endswith(f"/{loop.topic}")), None)) for loop in found)

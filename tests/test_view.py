@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import listening, scenario
+from cells import config, listening, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -241,6 +241,28 @@ def test_a_bag_without_a_tool_has_only_curves():
         "spindle speed [1/min]: measured blue, true orange",
         "slides [mm]",
         "servo [own units]: command blue, error orange",
+    ]
+
+
+def test_force_and_position_loops_have_errors_set_points_and_a_text(tmp_path):
+    """By revolution as the run finds them, in a view without a part."""
+    result = harness.run(config("approach"), bag=tmp_path / "bag")
+    done = lathe("view", tmp_path / "bag", "-o", tmp_path / "out.rrd")
+    assert done.exit_code == 0, done.output
+    view, loop = View(tmp_path / "out.rrd"), result.loops["position_controller"]
+    time, revolution, value = view.scalars("/loops/position_controller/largest")
+    errors = loop.found.errors
+    assert_allclose(10**value, np.maximum(errors.largest * 1e6, 1e-9), rtol=1e-9)
+    assert_array_equal(revolution, np.arange(1, errors.rms.size + 1))
+    assert_array_equal(time, errors.starts[1:] * STEP_NS)
+    assert set(view.scalars("/signals/cross/command/set_point")[2]) == {5.0}  # mm
+    texts = [chunk for chunk in RrdReader(tmp_path / "out.rrd").stream() if chunk.entity_path == "/loop_results"]
+    told = texts[-1].to_record_batch().column("TextDocument:text").to_pylist()[0][0]
+    assert next(loop.judged())[0] in told
+    views = blueprint(result.recording.types, loops=[loop.loop]).root_container.contents[0].contents
+    assert [view.origin for view in views if view.origin.startswith("/loop")] == [
+        "/loops/position_controller",
+        "/loop_results",
     ]
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun view of a bag: logged to a recording, or written as an .rrd file."""
 
+import contextlib
 import os
 from collections import deque
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.bag import provenance
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.cell.beside import RERUN_RATE
@@ -59,7 +61,11 @@ def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
             )
         silent = [topic for topic in types if not source.topics[topic].count]
         rate = min(rate, _POINTS / max((source.last_ns - START_NS) * 1e-9, 1e-9))
-    return Scene(recording, types, step_ns, outlook=Outlook(turned, travel), rate=rate, silent=silent)
+        nodes = {}
+        with contextlib.suppress(InputError):  # a bag without a readable scenario shows no results of loops
+            nodes = provenance.values_of(source.about)
+    outlook, found = Outlook(turned, travel), provenance.servo_loops(nodes)
+    return Scene(recording, types, step_ns, outlook=outlook, rate=rate, silent=silent, loops=found)
 
 
 def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layout of a run in Rerun: form error at the top, part and error map on the left, curves on the right."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import rerun.blueprint as rrb
 
 from lathe_rc import messages
 from lathe_rc.event_log import LOGGED
+from lathe_rc.loops import Loop
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # range before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
+LOOPS, LOOP_RESULTS = "loops", "loop_results"  #: entity paths of the force and position loops
 _COLOURS = ("blue", "orange", "green")  # names of the colours of a plot's first curves
 
 
@@ -30,14 +32,14 @@ _LATEST = _until_cursor(  # this range sets the scale of a plot
 )
 
 
-def _plots(types: Mapping[str, str]) -> dict[str, rrb.TimeSeriesView]:
+def _plots(types: Mapping[str, str], loops: Sequence[Loop]) -> dict[str, rrb.TimeSeriesView]:
     """Return one plot per group of curves, for the curves that exist.
 
     Since a legend would cover the curves, the title names their colours instead if there are only a few.
     """
     paths: dict[str, list[str]] = {}
     labels: dict[str, list[str]] = {}
-    for topic, fields in curves(types).items():
+    for topic, fields in curves(types, loops).items():
         for field, curve in fields.items():
             paths.setdefault(curve.plot, []).append("/" + curve_path(topic, field))
             labels.setdefault(curve.plot, []).append(curve.label)
@@ -86,17 +88,33 @@ def _part() -> rrb.Vertical:
     )
 
 
-def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collection[str] = ()) -> rrb.Blueprint:
+def _loops(loops: Sequence[Loop]) -> list[rrb.View]:
+    """Return a plot of the error of each force or position loop by revolution, and a text with their results."""
+    found: list[rrb.View] = [
+        rrb.TimeSeriesView(
+            origin=f"/{LOOPS}/{loop.node}",
+            name=f"{loop.quantity.error}, {loop.node} [10^y {loop.quantity.unit}]: RMS blue, largest orange",
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for loop in loops
+    ]
+    return [*found, rrb.TextDocumentView(origin=f"/{LOOP_RESULTS}", name="force and position: results")] * bool(loops)
+
+
+def blueprint(
+    types: Mapping[str, str], *, live: bool = False, silent: Collection[str] = (), loops: Sequence[Loop] = ()
+) -> rrb.Blueprint:
     """Return the layout for a run with the given topics.
 
     Args:
         types: message type by topic.
         live: whether the view follows incoming data.
         silent: topics without messages.
+        loops: force and position loops whose results are logged.
     """
     kinds = set(types.values())
     said = {kind for topic, kind in types.items() if topic not in silent}
-    plots = _plots(types)
+    plots = _plots(types, loops)
     left = _part() if {messages.ENCODER, messages.TOOL} <= kinds else None
     cycles = sum(kind in CYCLES for kind in types.values())
     top: list[rrb.View] = []
@@ -119,13 +137,17 @@ def blueprint(types: Mapping[str, str], *, live: bool = False, silent: Collectio
     first = [plots.pop(plot) for plot in (ERROR, POSITION) if plot in plots]
     rows: list[rrb.View | rrb.Container] = [*first]
     tabs: list[rrb.View] = list(plots.values())
+    if left:
+        tabs += _loops(loops)
+    else:
+        top += _loops(loops)
     if live or said & {*LOGGED}:  # the live view reports dropped chunks there
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
     if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
         rows.append(rrb.StateTimelineView(origin=f"/{STATES}", name="states of the supervisor, faults, limits met"))
-    above = [rrb.Horizontal(*top, column_shares=[3, 2][: len(top)])] if top else []
+    above = [rrb.Horizontal(*top, column_shares=[3, 2, 3, 3][: len(top)])] if top else []
     right = rrb.Vertical(*rows)
     below = rrb.Horizontal(left, right, column_shares=[4, 5]) if left else right
     return rrb.Blueprint(

@@ -2,31 +2,34 @@
 """Rerun scene of a run: part, tool, signals and learning progress, logged in columns, chunk by chunk.
 
 The timelines are ``time``, the simulated time since sample 0, and ``revolution``, counted from 1. Memory use does not
-grow with the run.
+grow with the run, but for a hundred bytes per revolution of a force or position loop.
 """
 
 import contextlib
 import itertools
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
+import rerun.blueprint as rrb
 
 from lathe_rc import event_log, messages
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.event_log import LOGGED
+from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.rerun_blueprint import blueprint
+from lathe_rc.view.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
 from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
 from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
 
 _POSES = 250.0  # poses of part and tool per second
 _ROWS = 512  # rows of the map
+_LEAST = 1e-9  # smallest error of a loop that is shown, in its unit
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their position
 _FLUSH, _EVER = 30.0, 1e9  # [s] allowed for a viewer to take the rest of a live recording, and for a file
 _GROWTH = 8  # the map is resent when it has grown by 1/8
@@ -48,6 +51,7 @@ class Scene:
         rate: largest number of curve points per second.
         live: whether the view follows incoming data.
         silent: topics without messages.
+        loops: force and position loops whose results are shown.
 
     Attributes:
         window: number of samples represented by two points of a curve.
@@ -65,7 +69,9 @@ class Scene:
         rate: float = RERUN_RATE,
         live: bool = False,
         silent: Collection[str] = (),
+        loops: Sequence[Loop] = (),
     ) -> None:
+        self._loops = watches(loops, {full(topic): kind for topic, kind in types.items()})
         self._recording, self._step_ns = recording, step_ns
         self._live, self._silent = live, {full(topic) for topic in silent}
         self._types: dict[str, str] = {}
@@ -90,11 +96,15 @@ class Scene:
             LatheError: the recording cannot be written.
         """
         self._types |= {full(topic): kind for topic, kind in types.items()}
-        self._curves = curves(self._types)
+        self._curves = curves(self._types, [watch.loop for watch in self._loops])
         by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first topic of each type
         self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
-        self._recording.send_blueprint(blueprint(self._types, live=self._live, silent=self._silent))
+        self._recording.send_blueprint(self._blueprint())
         self._describe()
+
+    def _blueprint(self) -> rrb.Blueprint:
+        shown_loops = [watch.loop for watch in self._loops]
+        return blueprint(self._types, live=self._live, silent=self._silent, loops=shown_loops)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Log consecutive samples and the messages among them.
@@ -102,7 +112,6 @@ class Scene:
         Raises:
             LatheError: the recording cannot be written, or the spindle angle is not plausible.
         """
-        del samples
         self._log_nominal(first)
         named = {full(topic): signals for topic, signals in dense.items()}
         angle = named[self._encoder]["angle_true"] if self._encoder in named else None
@@ -113,6 +122,8 @@ class Scene:
         for topic, found in sparse.items():
             if found:
                 self._log_messages(full(topic), found)
+        for watch in self._loops:
+            watch.chunk(first, samples, named, sparse)
         if angle is not None and self._tool in named:
             self._log_part(first, angle, named[self._tool])
 
@@ -125,6 +136,7 @@ class Scene:
         self._log_revolutions(list(self._revolutions.finish()))
         if self._newest and self._sent != len(self._rows):
             self._send_map(self._newest)
+        self._log_loops()
         with _write_errors():
             self._recording.flush(timeout_sec=_FLUSH if self._live else _EVER)
 
@@ -270,6 +282,24 @@ class Scene:
         tensor = rr.encodings.TensorData(array=np.stack(self._rows), dim_names=names)
         columns = rr.Tensor.columns(data=tensor, value_range=[parts.LOG_RANGE])
         self._send("form_error/map", columns, *_times_of([revolution]))
+
+    def _log_loops(self) -> None:
+        """Log the errors of the force and position loops by revolution, and their verdicts and figures as text."""
+        told = []
+        for watch in self._loops:
+            result = watch.result()
+            errors, loop = result.found.errors, result.loop
+            number = np.arange(errors.rms.size) + 1 + result.before
+            for name, values in (("rms", errors.rms), ("largest", errors.largest)):
+                path = f"{LOOPS}/{loop.node}/{name}"
+                self._static(path, rr.SeriesLines(names=name, colors=_PALETTE[name == "largest"], widths=1.5))
+                logarithm = np.log10(np.maximum(values * loop.quantity.scale, _LEAST))
+                if number.size:
+                    self._send(path, rr.Scalars.columns(scalars=logarithm), errors.starts[1:], number)
+            lines = [*(text for text, _ in result.judged()), *result.behaviour()]
+            told += [f"**{loop.node}**", *(f"- {line}" for line in lines), ""]
+        if told:
+            self._static(LOOP_RESULTS, rr.TextDocument("\n".join(told), media_type=rr.MediaType.MARKDOWN))
 
     # --- sending
 

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plotted parts of a recording: fields as curves, downsampled where necessary, and states as bands over time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.analysis.tolerance import FORCE as NEWTONS
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.event_log import LOGGED
+from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, full
 from lathe_rc.safety.state_machine import State
 
@@ -72,16 +74,20 @@ _PART = {
 }  # for the view of the part
 
 
-def curves(types: Mapping[str, str]) -> dict[str, dict[str, Curve]]:
+def curves(types: Mapping[str, str], loops: Sequence[Loop] = ()) -> dict[str, dict[str, Curve]]:
     """Return the plotted curves of a recording, by fully qualified topic and field.
 
     Args:
         types: message type by topic.
+        loops: force and position loops, whose set points are drawn with what they control.
     """
     named = {full(topic): kind for topic, kind in types.items()}
     driven = {topic.rpartition("/")[0] for topic, kind in named.items() if kind == messages.SERVO}
     found = {topic: _CURVES[kind] for topic, kind in named.items() if kind in _CURVES}
     slides = {t: _SLIDE for t, kind in named.items() if kind == messages.STATE and t.rpartition("/")[0] in driven}
+    for watch in watches(loops, named):
+        set_point = Curve(FORCE, "set point", 1.0) if watch.loop.quantity == NEWTONS else Curve(SLIDE, "set point", 1e3)
+        found[watch.topics[1]] = {**found[watch.topics[1]], "set_point": set_point}
     return found | slides
 
 
