@@ -153,6 +153,12 @@ FAULTS = (
     ),
     Fault(
         "time_master",
+        "        self.blocks_in_run = -(-(samples - self._first) // self._reactions.block_size)\n",
+        "        self.blocks_in_run = -(-samples // self._reactions.block_size)\n",
+        "the blocks of a run from a checkpoint are counted from sample 0",
+    ),
+    Fault(
+        "time_master",
         'self._lose(dict.fromkeys(self._dead, "died") | {name: why}, now)',
         "self._lose({next(iter(self.completed)): why}, now)",
         "the wrong member is named",

@@ -174,8 +174,8 @@ class Process:
         self.protocol: MemberProtocol
         if is_master:
             reactions = Reactions(cell.stalls, 0.5, RESTART_TIME, cell.safe_blocks * SIZE, SIZE)
-            self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters)
-            self.protocol.know_end(cell.length * SIZE)
+            self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters, first=cell.first)
+            self.protocol.know_end(cell.sample(cell.length))
         else:
             self.protocol = MemberProtocol(own, cell.window, masters=masters, wired=not design.records)
 
@@ -272,8 +272,8 @@ class Process:
         order = self.orders.get(topic) or self._pace
         assert order is not None, "it reads the topic"
         order.admit(self.cell.run_id, block.source)
-        if order.missing(block.source, block.index * SIZE, SIZE) is not None:
-            order.append((block.index + 1) * SIZE, last=block.last)
+        if order.missing(block.source, self.cell.sample(block.index), SIZE) is not None:
+            order.append(self.cell.sample(block.index + 1), last=block.last)
             if order is self._pace:
                 return
             self.taken[topic].append(block.value)
@@ -375,7 +375,7 @@ class Process:
         peers = self.protocol.master.members if self.protocol.master else ()
         for name, order in self.orders.items():
             if name in peers and name in self.protocol.members and order.source != name:
-                order.expect(name)
+                order.expect(name, self.cell.first)
                 order.repeats = self.protocol.restarts(name)
 
     def _begin(self, *, joins: bool) -> None:
@@ -411,13 +411,13 @@ class Process:
     # ---- role
 
     def _lose(self, action: actions.Lose) -> None:
-        if not action.again and self.blocks * SIZE > action.first:
+        if not action.again and self.cell.sample(self.blocks) > action.first:
             self.cell.overrun = f"{self.identity} hears of the safe state after its first sample"
-        lost, end = action.lost, action.end // SIZE
+        lost, end = action.lost, self.cell.block(action.end)
         for name, order in self.orders.items():
             if name in lost and order.held_from is None:
                 self.held[name] = len(self.taken[name])
-                order.hold(end * SIZE)
+                order.hold(self.cell.sample(end))
                 self.last[name] = max(end - 1, len(self.taken[name]) - 1)
         forward = [name for name, delay in self.design.inputs if not delay]
         if forward and all(name in self.held for name in forward) and self._pace is None:
@@ -426,7 +426,7 @@ class Process:
     def _follow(self, master: str) -> None:
         """Limit the member to the spindle's progress."""
         self._pace = BlockOrder(master, self.cell.run_id)
-        self._pace.expect(master, self.blocks * SIZE)
+        self._pace.expect(master, self.cell.sample(self.blocks))
         self._pace.repeats = True
         self.cell.discover(self)
 
@@ -462,7 +462,7 @@ class Process:
 
     def _compute(self, *, last: bool) -> bool:
         """Compute the next block, if its inputs have arrived; return True if it was computed."""
-        if self._pace is not None and self.blocks * SIZE >= self._pace.end:
+        if self._pace is not None and self.cell.sample(self.blocks) >= self._pace.end:
             return False
         inputs = []
         for name, delay in self.design.inputs:
@@ -479,7 +479,7 @@ class Process:
         if not self.design.records:
             block = Block(self.design.name, self.blocks - 1, value, last)
             self.cell.network.publish(self.identity, self.design.name, block)
-        self.protocol.computed(self.blocks, self.blocks * SIZE, self.cell.now, last=last)
+        self.protocol.computed(self.blocks, self.cell.sample(self.blocks), self.cell.now, last=last)
         if self.design.name == self.cell.master and not self.namesake:
             self.cell.look_at_window(self)
             for call in self.cell.at_block.pop(self.blocks, ()):
@@ -501,6 +501,7 @@ class Simulation:
     """
 
     def __init__(self, seed: int, designs: tuple[Design, ...], window: int, length: int, stalls: str) -> None:
+        self.first = 1001 * (seed % 2)  # first sample: that of a checkpoint in every other run
         self.random = random.Random(seed)  # noqa: S311 - NumPy's draws are slower one by one
         self.designs, self.window, self.length, self.stalls = designs, window, length, stalls
         self.master, self.run_id, self.safe_blocks = designs[0].name, "run", 3
@@ -521,6 +522,14 @@ class Simulation:
         self.culprits: set[str] = set()  # members with a disturbance that may end the run
         self.plan: list[str] = []
         self.overrun = ""
+
+    def sample(self, blocks: int) -> int:
+        """Return the sample at which a block begins."""
+        return self.first + blocks * SIZE
+
+    def block(self, sample: int) -> int:
+        """Return the number of blocks before a sample."""
+        return (sample - self.first) // SIZE
 
     def delay(self) -> float:
         """Return a random transmission time of a message [s]: mostly short, sometimes long."""
@@ -803,9 +812,9 @@ def violations(cell: Simulation) -> list[str]:
     found = [f"{process.identity} hangs" for process in cell.processes.values() if not _waits_for_another(process)]
     found += [cell.overrun] if cell.overrun else []
     expected = cell.expected()
-    safe = next((values["sample"] // SIZE for _, _, event, values in cell.reports if event == "safe"), cell.length)
+    safe = next((cell.block(values["sample"]) for _, _, event, values in cell.reports if event == "safe"), cell.length)
     for _, _, event, values in cell.reports:
-        if event == "safe" and values["end"] // SIZE != (safe if safe == cell.length else safe + cell.safe_blocks):
+        if event == "safe" and cell.block(values["end"]) != (safe if safe == cell.length else safe + cell.safe_blocks):
             found.append(f"a safe state from block {safe} ends with sample {values['end']}")
     everyone = [process for process in (*cell.gone, *cell.processes.values()) if not process.namesake]
     held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
