@@ -178,7 +178,7 @@ def test_a_run_that_fails_says_so_and_can_be_restarted(opened, monkeypatch):
     monkeypatch.setattr(shown.cell._engine, "advance", diverge)
     shown.ask("start")
     shown.until(lambda now: now["state"] == "failed")
-    assert shown.now["error"] == "/tool: error is nan at sample 7"
+    assert shown.now["failure"] == "/tool: error is nan at sample 7"
     shown.ask("change", values={}, here=False)
     shown.ask("start")
     shown.until(lambda now: now["state"] == "ended")
@@ -189,7 +189,7 @@ def test_a_panel_whose_thread_has_ended_answers(opened, monkeypatch):
     shown = opened(scenario("piston", 4))
     monkeypatch.setattr(shown.cell, "advance", lambda _: 1 / 0)
     shown.ask("start")
-    assert "ZeroDivisionError" in shown.until(lambda now: now["state"] == "failed")["error"]
+    assert "ZeroDivisionError" in shown.until(lambda now: now["state"] == "failed")["failure"]
     with pytest.raises(LatheError, match="start lathe panel again"):
         shown.ask("pause")
 
@@ -295,6 +295,8 @@ def test_a_bag_is_played_with_pause_steps_and_jumps(bag):
         history, log, state = shown.history, shown.log, shown.now["safety"]
         assert (len(history), state["state"]) == (8, "safe")
         assert any("missed_index" in line["text"] for line in log)
+        now = shown.now
+        assert now["reference"] - now["error"] == pytest.approx(now["displacement"])  # where the tool is drawn
         shown.ask("seek", sample=history[3][0] * 3900)
         shown.until(lambda now: now["sample"] == history[3][0] * 3900)
         assert shown.history == history[: len(shown.history)]

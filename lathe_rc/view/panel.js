@@ -62,7 +62,7 @@ async function follow() {
 }
 
 function trouble(text) {
-  if (!text && SHOWN.now.error) text = SHOWN.now.error;
+  if (!text) text = SHOWN.now.failure || "";
   $("trouble").textContent = text;
   $("trouble").hidden = !text;
 }

@@ -82,5 +82,5 @@ class LivePanel(LiveRuns):
         self.view.publish(self._status("waiting"))
 
     def _status(self, state: str) -> Mapping[str, Any]:
-        told = {"error": "", "pace": 1.0, "factor": 0.0, "samples": 0, "bag": "", "events": "", "begun": 0}
+        told = {"failure": "", "pace": 1.0, "factor": 0.0, "samples": 0, "bag": "", "events": "", "begun": 0}
         return {"state": state, **told, "version": self.view.run}

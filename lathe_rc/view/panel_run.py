@@ -223,7 +223,7 @@ class Driver:
         state = "failed" if self._error else "running" if self._running else "ended" if ended else "paused"
         return {
             "state": state,
-            "error": self._error,
+            "failure": self._error,
             "pace": self._pace,
             "factor": self._factor if self._running else 0.0,
             "samples": self.run.samples,
