@@ -110,6 +110,11 @@ class LoopResult:
         limits = self.found.limits
         return bool((self.growth and self.growth.diverges) or (limits and limits.state in ("swings", "runs away")))
 
+    def told(self) -> list[str]:
+        """Describe the error in the first and the last revolution as a text line; none without a revolution."""
+        quantity = self.loop.quantity
+        return self.found.errors.told(quantity.error, quantity.unit, quantity.scale)
+
     def judged(self) -> Iterator[tuple[str, bool | None]]:
         """Yield the statements on growth, swings and tolerance, and whether each is good; None: neither."""
         loop, errors = self.loop, self.found.errors

@@ -5,7 +5,7 @@ import warnings
 from xml.etree import ElementTree as ET
 
 import pytest
-from cells import SCENARIOS, run, scenario
+from cells import SCENARIOS, config, run, scenario
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
@@ -47,10 +47,19 @@ def test_what_has_no_revolution_says_so():
     assert repr(short) == "<Result of test: offline, 0 revolutions, no bag>"
     assert "<img" not in short._repr_html_()
     alone = harness.run(Scenario("spindle", {"spindle_encoder": scenario().nodes["spindle_encoder"]}))
-    assert "0 revolutions" in repr(alone.recording)
+    assert "3 revolutions" in repr(alone.recording)
     for made, why in ((short, "no complete revolution; let it run longer"), (alone, "no tool; record both")):
         with pytest.raises(InputError, match=f"^nothing to draw: the recording has {why}"):
             made.plot()
+
+
+def test_what_has_no_part_tells_the_errors_of_its_loops():
+    """Two revolutions of three are complete with their measurements."""
+    held = harness.run(config("approach", "spindle_encoder.revolutions=3"))
+    first, last = held.loops["position_controller"].found.errors.rms * 1e6
+    error = f"{first:.4g} to {last:.4g} µm RMS"
+    assert repr(held) == f"<Result of approach: offline, 3 revolutions, position error {error}, no bag>"
+    assert dict(rows(held._repr_html_()))["position error"] == error
 
 
 def test_a_recording_lists_its_topics_with_units(result):

@@ -39,11 +39,16 @@ class FormErrors:
     peak_to_valley: Array
     starts: npt.NDArray[np.int64]
 
-    def told(self) -> list[str]:
-        """Describe the number of revolutions, and the form error in the first and last one, as text lines."""
-        count = f"{self.rms.size} revolution{'' if self.rms.size == 1 else 's'}"
-        ends = [f"{rms * 1e6:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
-        return [count, f"form error {' to '.join(ends)} µm RMS"] if ends else [count]
+    def told(self, error: str = "form error", unit: str = "µm", scale: float = 1e6) -> list[str]:
+        """Describe the error in the first and the last revolution as a text line; none without a revolution.
+
+        Args:
+            error: name of the error.
+            unit: unit in the text.
+            scale: number of these units in an SI unit.
+        """
+        ends = [f"{rms * scale:.4g}" for rms in (*self.rms[:1], *self.rms[1:][-1:])]
+        return [f"{error} {' to '.join(ends)} {unit} RMS"] if ends else []
 
 
 def turns_before(angle: Array) -> int:

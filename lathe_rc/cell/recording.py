@@ -76,7 +76,8 @@ class Recording:
     def __repr__(self) -> str:
         """Return a one-line summary of the content."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
-        return f"<Recording: {', '.join([f'{len(self.types)} topics', size, *self.errors.told()])}>"
+        told = [f"{len(self.types)} topics", size, self.turned(), *self.errors.told()]
+        return f"<Recording: {', '.join(told)}>"
 
     def _repr_html_(self) -> str:
         """Return an HTML table of the topics with their fields and units, for notebooks."""
@@ -91,6 +92,11 @@ class Recording:
     def errors_picture(self) -> str:
         """Return an HTML image of the form error by revolution; empty without a revolution."""
         return html.errors_picture(self.errors, self.turns_before if self.errors.rms.size else 0)
+
+    def turned(self) -> str:
+        """Describe the number of complete revolutions."""
+        count = self.revolutions
+        return f"{count} revolution{'' if count == 1 else 's'}"
 
     @property
     def turns_before(self) -> int:

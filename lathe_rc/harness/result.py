@@ -84,14 +84,20 @@ class Result:
     def __repr__(self) -> str:
         """Return the scenario and its result in one line."""
         bag = f"bag {self.bag}" if self.bag else "no bag"
-        return f"<Result of {self.scenario.name}: {', '.join([self.mode, *self.errors.told(), bag])}>"
+        told = [self.mode, self.recording.turned(), *self._errors_told(), bag]
+        return f"<Result of {self.scenario.name}: {', '.join(told)}>"
+
+    def _errors_told(self) -> list[str]:
+        """Describe the form error, or without a part the errors of the loops, in the first and the last revolution."""
+        if self.errors.rms.size:
+            return self.errors.told()
+        return [line for loop in self.loops.values() for line in loop.told()]
 
     def _repr_html_(self) -> str:
         """Return the result as an HTML table with the form error by revolution, for notebooks."""
-        count, *errors = self.recording.errors.told()
         rows = [("scenario", self.scenario.name), ("host", self.mode)]
-        rows += [("length", f"{self.simulated_s:.4g} s, {count}")]
-        rows += [("form error", text.removeprefix("form error ")) for text in errors]
+        rows += [("length", f"{self.simulated_s:.4g} s, {self.recording.turned()}")]
+        rows += [(" ".join(words[:2]), " ".join(words[2:])) for words in map(str.split, self._errors_told())]
         rows += [("bag", str(self.bag or "none"))]
         return html.table((), rows) + self.recording.errors_picture()
 
