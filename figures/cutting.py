@@ -137,7 +137,7 @@ for rpm in np.linspace(900.0, 4800.0, 14):
         # Crosses and circles also differ where red and blue do not.
         mark = {"marker": "x", "color": RED} if grows else {"marker": "o", "mfc": "none", "color": BLUE}
         chart.plot(rpm, stiffness / 1e3, ls="", ms=4, label=label, **mark)
-chart.set(xlabel="spindle speed [rpm]", ylabel="K [N/mm]", ylim=(200, 3100), xlim=(800, 4900))
+chart.set(xlabel="spindle speed [rpm]", ylabel="K [N/mm]", ylim=(200, 3700), xlim=(800, 4900))
 chart.set_title("regeneration, realistic W3: chart and simulated cuts", fontsize=10)
 
 period, step = limit.period(1), 5e-5
