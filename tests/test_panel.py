@@ -239,7 +239,7 @@ def revolution(number, height, deviation=0.0, error=0.0):
 
 
 def test_the_part_is_a_closed_body_of_its_size_with_the_colours_of_its_error():
-    """STL in mm, GLB in m; a revolution that does not lie further along the part is left out."""
+    """STL in mm, GLB in m; blue where the cut is too deep; a revolution that does not lie further along the part is left out."""
     turned = [revolution(k + 1, 1e-3 * height, 2e-4, 5e-6 * k) for k, height in enumerate([0, 10, 5, 40])]
     mesh = panel_part.body(turned, 0.05, 1.0, 15e-6)
     for ending, unit in (("stl", 1.0), ("glb", 1e-3)):
@@ -249,7 +249,7 @@ def test_the_part_is_a_closed_body_of_its_size_with_the_colours_of_its_error():
         assert read.volume > 0.0
         assert read.extents == pytest.approx(np.array([100.4, 99.6, 40.0]) * unit, abs=0.01 * unit)
     rings = mesh.visual.vertex_colors[:-2].reshape(3, ANGLES, 4)
-    assert [tuple(ring[0]) for ring in rings][::2] == [(0xF4, 0xF4, 0xF4, 255), (0x67, 0, 0x1F, 255)]
+    assert [tuple(ring[0]) for ring in rings][::2] == [(0xF4, 0xF4, 0xF4, 255), (0x08, 0x30, 0x6B, 255)]
 
 
 def test_a_part_without_feed_has_its_revolutions_beside_each_other():

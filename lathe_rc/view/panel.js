@@ -252,8 +252,7 @@ function drawMap() {
   for (const k of new Set([0, rows.length >> 1, rows.length - 1])) label(pen, told(rows[k]), left - 5, Math.min(top + (k + 0.7) * tall, bottom), soft, "right");
   label(pen, ABOUT.fed ? "height" : "revolution", 2, bottom + 14, soft);
   for (let x = 0; x < 160; x++) { pen.fillStyle = `rgb(${colour(x / 80 - 1)})`; pen.fillRect(left + x, bottom + 22, 1, 8); }
-  const ticks = [[0, -end], [80, 0], [160, end]];
-  for (const [x, um] of ticks) label(pen, digits(um, 3), left + x, bottom + 42, soft, "center");
+  for (const um of end > 24 * bend ? [-end, -8 * bend, 8 * bend, end] : [-end, 0, end]) label(pen, digits(um, 2), left + 80 + 80 * share(um), bottom + 42, soft, "center");
   label(pen, ABOUT.tolerance ? `tolerance ±${digits(ABOUT.tolerance)} µm` : "no tolerance given", left + 185, bottom + 32, soft);
 }
 

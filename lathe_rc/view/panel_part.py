@@ -48,7 +48,7 @@ def body(revolutions: Sequence[Revolution], radius: float, enlarged: float, limi
     rings = np.stack([radii * np.cos(angle), radii * np.sin(angle), z], axis=-1).reshape(-1, 3)
     ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, z[-1, 0]]])
     errors = np.stack([revolutions[k].error for k in further]).ravel()
-    colours = np.concatenate([_colours(errors / limit), np.full((2, 4), 160, np.uint8)])
+    colours = np.concatenate([_colours(-errors / limit), np.full((2, 4), 160, np.uint8)])
     return trimesh.Trimesh(
         np.concatenate([rings, ends]) * _MM, _faces(len(further)), vertex_colors=colours, process=False
     )

@@ -75,7 +75,7 @@ class Row:
 
     Attributes:
         revolution: its form.
-        cells: form error of largest magnitude in each cell [µm].
+        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
     """
 
     revolution: Revolution
@@ -112,7 +112,7 @@ def _short(values: Array) -> list[float]:
 
 
 def _row(revolution: Revolution) -> Row:
-    parts = revolution.error.reshape(CELLS, ANGLES // CELLS)
+    parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
     return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)))
 
