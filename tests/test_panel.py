@@ -239,7 +239,7 @@ def revolution(number, height, deviation=0.0, error=0.0):
 
 
 def test_the_part_is_a_closed_body_of_its_size_with_the_colours_of_its_error():
-    """STL in mm, GLB in m; blue where the cut is too deep; a revolution that does not lie further along the part is left out."""
+    """STL in mm, GLB in m; blue: cut too deep; a revolution not further along the part is left out."""
     turned = [revolution(k + 1, 1e-3 * height, 2e-4, 5e-6 * k) for k, height in enumerate([0, 10, 5, 40])]
     mesh = panel_part.body(turned, 0.05, 1.0, 15e-6)
     for ending, unit in (("stl", 1.0), ("glb", 1e-3)):
