@@ -372,6 +372,19 @@ def test_progress_of_another_start_of_the_scenario_is_a_stranger(session):
     assert protocol.completed["/c"] == 1
 
 
+def test_a_time_master_that_hears_its_own_progress_after_the_end_refuses_nothing():
+    """One process publishes the progress of all its nodes, and DDS brings it to them as well."""
+    protocol = leads()
+    protocol.know_end(4)
+    release(protocol, 1)
+    for name in ("/c", "/recorder"):
+        protocol.hear_progress(Progress("", name, 1, 4, 5), 0.0)
+    assert not protocol.running
+    protocol.hear_progress(Progress("", "/spindle", 1, 4, 0), 0.0)
+    with pytest.raises(ForeignMessage, match="it is over"):
+        protocol.hear_progress(Progress("", "/c", 1, 4, 5), 0.0)
+
+
 def test_a_member_that_claims_blocks_that_were_not_sent_is_lost():
     protocol = leads()
     release(protocol, 1)

@@ -200,6 +200,14 @@ def test_of_a_member_that_nobody_knows_its_topics_count_and_what_is_not_checked_
     assert sorted(cell.unchecked) == sorted(LEFT_OPEN.format(unknown) + each for each in left_open)
 
 
+def test_a_listener_that_nobody_knows_is_no_drive_of_a_controller():
+    """A recorder reads the command as a drive does, and publishes no samples."""
+    nodes = load("piston").nodes
+    cell = Cell(nodes, {"recorder": Unknown({}, {}, frozenset({"coarse/command"}))})
+    cell.check()
+    assert cell.unchecked == []
+
+
 def test_what_does_not_depend_on_members_that_nobody_knows_is_checked():
     slow = scenario({"nominal_rpm": 3000.0}, learning_controller={"feedback_delay": 3200})
     with pytest.raises(InputError, match=r"^learning_controller.feedback_delay = 3200 samples: "):

@@ -184,6 +184,8 @@ class TimeMasterProtocol(MemberProtocol):
         if progress.run_id != self.own.run_id:
             raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
         name = progress.name
+        if name == self.own.name and progress.session in (0, self.own.session):
+            return  # a process publishes the progress of all its nodes, which reaches them too
         if not self.running:
             raise ForeignMessage("progress", name, progress.run_id, "the run has not begun, or it is over")
         if progress.session not in (0, self.own.session):

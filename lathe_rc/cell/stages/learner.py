@@ -261,7 +261,8 @@ class Learner(Obedient):
 
     def _check_convergence(self, cell: WiredCell, speeds: Collection[float], *, cures: bool) -> None:
         command = remapped(self.shared, self.outputs[0].topic)
-        unknown = [name for name in cell.unknown if name in cell.reader_names(command)]
+        # A member without samples of its own, such as a recorder, is no drive.
+        unknown = [name for name in cell.unknown if name in cell.reader_names(command) and cell.unknown[name].dense]
         for name in unknown:
             cell.leave_open(f"whether {self.name} converges with {name}", name)
         learned, untold = self.learned(cell.stages.values()), list[str]()
