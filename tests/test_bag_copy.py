@@ -28,7 +28,7 @@ def turned(tmp_path_factory):
 def test_a_part_of_a_bag_holds_the_chosen_messages_to_the_byte(turned, tmp_path):
     whole = read_by_others(turned)
     first = whole[0][1]
-    words = ["--topics", "/tool", "--topics", "/encoder", "--without", "/encoder", "--start", "0.02", "--end", "0.05"]
+    words = ["--topics", "/tool,/encoder", "--without", "/encoder", "--start", "0.02", "--end", "0.05"]
     done = lathe("bag", "copy", turned, "-o", tmp_path / "part", *words, "--json")
     wanted = [m for m in whole if m[0] == "/tool" and first + 20_000_000 <= m[1] < first + 50_000_000]
     assert done.exit_code == 0

@@ -210,7 +210,7 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
 @bag.command("copy")
 @click.argument("paths", metavar="BAG...", type=options.PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=options.PATH, required=True, help="folder of the new bag")
-@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
+@options.topics("all")
 @click.option("--without", multiple=True, metavar="TOPIC", help="left out; repeatable")
 @click.option("--start", type=click.FloatRange(0), default=0.0, help="[s] from the first message on")
 @click.option("--end", type=click.FloatRange(0), help="[s] from the first message on; default: to the end")

@@ -37,7 +37,7 @@ def export() -> None:
     type=options.PATH,
     help="folder, for --npz file, to make; must not exist; default: BAG-csv, BAG-parquet or BAG.npz, here",
 )
-@click.option("--topics", multiple=True, metavar="LIST", help="like /tool,/encoder; repeatable; default: all signals")
+@options.topics("all signals")
 def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[str, ...]) -> None:
     """Export the signal topics of a recording, with units."""
     if len(kinds) != 1:
@@ -48,8 +48,7 @@ def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[st
     (kind,) = kinds
     name = name_of(bag).removesuffix(".mcap")
     place = output or Path(f"{name}.npz" if kind == "npz" else f"{name}-{kind}")
-    wanted = [topic.strip() for text in topics for topic in text.split(",") if topic.strip()]
-    done = exporting.export_bag(bag, place, kind, wanted)
+    done = exporting.export_bag(bag, place, kind, topics)
     click.echo(f"{len(done.rows)} topics, {sum(done.rows.values())} rows: {done.place}")
 
 

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments and options shared by several commands; this module imports only Click."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 
 from lathe_rc import allowed_code
 from lathe_rc.commands import completers
 from lathe_rc.sweep import LOOP_FIGURES
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 PATH = click.Path(path_type=Path)
@@ -50,6 +53,21 @@ groups = click.option(
     shell_complete=completers.nodes,
     help="nodes that share a process, instead of those that the scenario names; repeatable; none: one each",
 )
+
+
+
+def topics(default: str) -> Callable[[F], F]:
+    """Return the option ``--topics``, a list of topics; ``default``: what it is without the option, in words."""
+    return click.option(
+        "--topics",
+        multiple=True,
+        metavar="LIST",
+        callback=lambda _context, _option, lists: tuple(
+            topic.strip() for text in lists for topic in text.split(",") if topic.strip()
+        ),
+        help=f"like /tool,/encoder; repeatable; default: {default}",
+    )
+
 
 start = click.option(
     "--start",

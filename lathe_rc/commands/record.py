@@ -12,7 +12,7 @@ from lathe_rc.commands import options
 
 @click.command()
 @options.bag
-@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all but those of ROS itself")
+@options.topics("all but those of ROS itself")
 @click.option("--all", is_flag=True, help="hidden topics, /rosout and /parameter_events as well")
 @click.option("--sim-time", is_flag=True, help="log times from /clock; default: the wall time of publication")
 @click.option("--once", is_flag=True, help="end when all publishers are gone")

@@ -16,7 +16,7 @@ from lathe_rc.commands import options
 @click.option("--loop", is_flag=True, help="begin again at the end")
 @click.option("--start", type=click.FloatRange(min=0), default=0.0, help="[s] from the bag's first message on")
 @click.option("--end", type=click.FloatRange(min=0), default=0.0, help="[s] from its first message on; 0: to its end")
-@click.option("--topics", multiple=True, metavar="TOPIC", help="repeatable; default: all")
+@options.topics("all")
 @click.option("--remap", multiple=True, metavar="FROM:=TO", help="send a topic under another name; repeatable")
 @click.option("--delay", type=click.FloatRange(min=0), default=0.0, help="[s] before the first message, in each round")
 @click.option("--start-paused", is_flag=True, help="wait for the service ~/resume or a key")
