@@ -55,7 +55,6 @@ groups = click.option(
 )
 
 
-
 def topics(default: str) -> Callable[[F], F]:
     """Return the option ``--topics``, a list of topics; ``default``: what it is without the option, in words."""
     return click.option(
