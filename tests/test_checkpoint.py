@@ -59,6 +59,20 @@ def test_a_run_goes_on_from_any_sample_with_the_same_bits(name: str, tmp_path: P
     gone_on(name, tmp_path, 2)
 
 
+def test_a_run_goes_on_after_faults_with_the_same_bits(tmp_path: Path) -> None:
+    """One in force of each kind with a state of its own, and one repaired; those of a random sequence go on in it."""
+    target, values = "coarse/state.measured_position", {"garbage": "amplitude=1e-7", "noisy": "rms=1e-8", "stuck": ""}
+    values |= {"slow": "time=1e-3", "delayed": "time=1e-3", "intermittent": "good=1e-3 off=1e-4", "wrong": "scale=0.9"}
+    ends = {"stuck": " to 1.2", "garbage": " to 2.5"}
+    faults = [f"revolution 1.1{ends.get(kind, '')}: {target} {kind} {given}" for kind, given in values.items()]
+    given = ["allow_faults=true", f"electrodynamic_actuator.faults={json.dumps(faults)}"]
+    lost = "spindle_encoder.faults=['revolution 1.3: encoder lost_counts angle=1e-6']"
+    scenario = lathe_rc.load("piston", [*LONG, *given, lost])
+    whole = lathe_rc.run(scenario, checkpoints={"revolution:2": tmp_path / "broken"})
+    found = lathe_rc.run(scenario, start_from=tmp_path / "broken")
+    assert found.digest == rest(whole.recording, found.recording.first)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_run_goes_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:

@@ -147,6 +147,30 @@ def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_p
     assert len(shown.history) == 12
 
 
+def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
+    """The second checkpoint at the same sample goes on like the first; a fault before it stays."""
+    shown = opened(scenario("supervised", 12, "allow_faults=true"))
+    for _ in range(3):
+        shown.ask("step")
+        shown.until(lambda now: now["state"] == "paused" and now["sample"])
+    shown.ask("act", node="electrodynamic_actuator", action="fault coarse/command.position wrong scale=0.99")
+    shown.ask("step")
+    at = shown.until(lambda now: now["state"] == "paused" and len(shown.history) == 4)["sample"]
+    shown.ask("act", node="learning_controller", action="freeze")
+    for name, value in (("learning_gain", "0.5"), ("lead_time", "1.3e-3")):
+        shown.ask("change", values={f"learning_controller.{name}": value}, here=True)
+    listed = "--set learning_controller.learning_gain=0.5 --set learning_controller.lead_time=0.0013"
+    now = shown.until(lambda now: "lead_time" in now["events"])
+    assert (now["begun"], shown.cell.reached) == (at, at)
+    assert now["events"] == f"{listed} --set 'learning_controller.events=[\"sample {at}: freeze\"]'"
+    shown.ask("step")
+    shown.until(lambda _: len(shown.history) == 5)
+    assert any(line["sample"] == at and line["text"] == "freeze" for line in shown.log)
+    assert shown.history[-1][0] > shown.history[-2][0]
+    shown.ask("change", values={}, here=False)
+    assert shown.until(lambda now: not now["begun"])["events"] == listed
+
+
 def test_mistakes_are_refused_and_the_run_goes_on(opened, tmp_path):
     shown = opened(scenario("piston", 8))
     for name, question, message in (

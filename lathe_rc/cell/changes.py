@@ -195,6 +195,8 @@ class _Comparison:
             found = [kind.__name__, [self._whole(part, path) for part in parts]]
         elif kind is dict:
             found = ["dict", [[self._whole(key, path), self._whole(part, path)] for key, part in now.items()]]
+        elif kind is np.random.Generator:
+            found = ["generator", self._whole(now.bit_generator.state, path)]
         elif hasattr(now, "__dict__") and not isinstance(now, (*_CODE, types.MethodType, Table)):
             found = ["object", _name(kind), {name: self._whole(p, path) for name, p in _attributes(now).items()}]
         if found is None:
@@ -351,6 +353,12 @@ def _object(name: str, attributes: Mapping[str, Change]) -> Any:
     return made
 
 
+def _generator(state: Change) -> np.random.Generator:
+    made = np.random.default_rng(0)
+    made.bit_generator.state = _new(state)
+    return made
+
+
 _NEW: dict[str, Callable[..., Any]] = {
     "value": _plain,
     "array": np.ndarray.copy,
@@ -360,6 +368,7 @@ _NEW: dict[str, Callable[..., Any]] = {
     "enum": lambda name, value: _class(name, enum.Enum)(value),
     "named": lambda name, parts: _class(name, tuple)._make(map(_new, parts)),
     "object": _object,
+    "generator": _generator,
     **{name: lambda parts, kind=kind: kind(map(_new, parts)) for name, kind in _COLLECTIONS.items()},
 }
 

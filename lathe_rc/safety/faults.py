@@ -192,6 +192,7 @@ def _allowed(kind: Kind) -> str:
 # ---- effects on samples -------------------------------------------------------------------------------------
 
 
+@dataclass(init=False, eq=False)  # a class of data, so that checkpoints keep it
 class Disturbance:
     """Effect of a fault on the samples of a port, during the fault and after its end.
 

@@ -48,17 +48,18 @@ class Port:
 
 @dataclass
 class _Injected:
-    """Fault injected at a port from sample ``start`` of the topic up to but not including sample ``end``."""
+    """Fault injected at port number ``place`` from sample ``start`` of the topic up to but not including ``end``."""
 
     fault: Fault
-    port: Port
+    place: int
+    delay: int
     disturbance: Disturbance
     start: int
     end: float = math.inf
 
     def apply(self, first: int, signals: Signals) -> None:
         """Apply the fault in place to samples starting at ``first``, an index in the node's time."""
-        first -= self.port.delay  # the fault refers to the topic's samples, which a delayed reader receives later
+        first -= self.delay  # the fault refers to the topic's samples, which a delayed reader receives later
         samples = next(iter(signals.values())).size
         begin = min(max(self.start - first, 0), samples)
         stop = int(min(max(self.end - first, begin), samples))
@@ -133,9 +134,10 @@ class Injection:
 
     def begin(self, fault: Fault, index: int) -> None:
         """Start a fault at sample ``index``."""
-        for port in (port for port in self._ports if port.takes(fault)):
-            made = DISTURBANCES[fault.kind](fault, seed=self._seed, step=self._step, whose=self._node)
-            self._injected.append(_Injected(fault, port, made, index))
+        for place, port in enumerate(self._ports):
+            if port.takes(fault):
+                made = DISTURBANCES[fault.kind](fault, seed=self._seed, step=self._step, whose=self._node)
+                self._injected.append(_Injected(fault, place, port.delay, made, index))
 
     def end(self, target: str, index: int, fault: Fault | None = None) -> bool:
         """End the oldest instance of ``fault``, or by default all faults of a target, before sample ``index``.
@@ -159,8 +161,8 @@ class Injection:
     def inputs(self, first: int, inputs: Sequence[Signals]) -> list[Signals]:
         """Return the inputs with their faults; faulty signals are copies, since other stages read the originals."""
         changed = list(inputs)
-        for place, port in enumerate(self._inputs):
-            mine = [injected for injected in self._injected if injected.port is port]
+        for place in range(len(self._inputs)):
+            mine = [injected for injected in self._injected if injected.place == place]
             if mine:
                 changed[place] = {name: array.copy() for name, array in inputs[place].items()}
             for injected in mine:
@@ -170,5 +172,5 @@ class Injection:
     def outputs(self, first: int, outputs: Sequence[Signals]) -> None:
         """Apply the faults to the outputs of the stage in place."""
         for injected in self._injected:
-            if injected.port.out:
-                injected.apply(first, outputs[self._outputs.index(injected.port)])
+            if (place := injected.place - len(self._inputs)) >= 0:
+                injected.apply(first, outputs[place])

@@ -80,7 +80,7 @@ function draw(changed, moving = true) {
   if ($("seek").max != now.samples) $("seek").max = now.samples;
   if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
-  $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events yet");
+  $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
   drawSafety(now.safety);
   drawMachine(now);
   drawDials(now);

@@ -6,6 +6,7 @@ computed, and the run lists it, so that the same events in a scenario repeat the
 """
 
 import json
+import shlex
 import tempfile
 import threading
 import time
@@ -252,6 +253,7 @@ class LiveCell:
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-panel-")
         self._recorder: OfflineRecorder | None = None
         self._bag, self._version = "", 0
+        self._changed: dict[str, Value] = {}  # parameters changed since the panel was opened
         self._begin(scenario)
         self.view = View(self._types(), scenario.shared.step_ns, self._margin())
         self._remark()
@@ -315,7 +317,7 @@ class LiveCell:
         """Return the status of the run, for its snapshots."""
         return {
             "bag": self._bag if self._recorder else "",
-            "events": as_options(self.events),
+            "events": " ".join(filter(None, [_parameters(self._changed), as_options(self.events)])),
             "begun": self.cell.first,
             "version": self._version,
         }
@@ -351,18 +353,28 @@ class LiveCell:
         """
         masters = [f"{name}.start_from" for name in self.scenario.masters]
         changed = self.scenario.varied({**values, **dict.fromkeys(masters, "")})
-        if here and self.reached > self.cell.first:
+        here = here and self.reached > 0
+        waiting = self._waiting() if here else {}
+        if here:
             file = Path(self._folder.name) / f"{self.reached}.ckpt"
             state = checkpoint.take(self.scenario, self._engine.stages, self.reached, self._engine.past)
             checkpoint.save(file, state)
             changed = changed.varied(dict.fromkeys(masters, str(file)))
         self._begin(changed)
+        self._changed |= values
+        self.events = waiting
         self.record("")
         if here:
             self.view.say(self.reached, "panel", f"goes on with {_listed(values)}")
         else:
             self.view.clear(self._margin())
         self._remark()
+
+    def _waiting(self) -> dict[str, list[str]]:
+        """Return the events at the first sample not yet computed; a checkpoint holds them."""
+        now = f"sample {self.reached}: "
+        found = {node: [text for text in texts if text.startswith(now)] for node, texts in self.events.items()}
+        return {node: texts for node, texts in found.items() if texts}
 
     def record(self, bag: str) -> None:
         """Record from the first sample not yet computed on; an empty text ends the recording.
@@ -391,6 +403,11 @@ class LiveCell:
 
 def _listed(values: Mapping[str, Value]) -> str:
     return ", ".join(f"{name} = {value!r}" for name, value in values.items()) or "the same parameters"
+
+
+def _parameters(changed: Mapping[str, Value]) -> str:
+    """Return changed parameters as options of ``lathe run``."""
+    return " ".join(f"--set {shlex.quote(f'{name}={json.dumps(value)}')}" for name, value in changed.items())
 
 
 def as_options(told: Mapping[str, Sequence[str]]) -> str:
