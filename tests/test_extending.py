@@ -61,7 +61,9 @@ TOGETHER = """
 """
 
 
-@pytest.mark.parametrize("kinds", [["law", "plant", "stage"], ["plain law"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "kinds", [pytest.param(["law", "plant", "stage"], marks=pytest.mark.system), ["plain law"]], ids=" ".join
+)
 def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, kinds):
     """Law, drive and stage of others in one cell, and a law in plain Python in the cell that is made for it."""
     if kinds == ["plain law"]:

@@ -198,7 +198,7 @@ def test_slow_controllers_compute_at_multiples_of_their_divisor():
         (
             "full_cell",
             {"block_size": 128},
-            "delayed by 64 samples, block_size = 128; allowed: a block no longer",
+            "delayed by 64 samples, block_size = 128; allowed: block_size up to the delay",
         ),
     ],
 )

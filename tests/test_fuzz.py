@@ -41,7 +41,9 @@ def refused(said):
 BOMB = zstandard.compress(bytes(MOST_BYTES + 1))
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.system) if TARGETS[name].slow else name for name in TARGETS]
+)
 def test_what_is_valid_is_read(name):
     for data in TARGETS[name].seeds():
         TARGETS[name].read(data)

@@ -235,6 +235,7 @@ def told(bridge):
     return run, errors
 
 
+@pytest.mark.system
 def test_a_running_cell_is_shown_as_its_bag(offline, tmp_path):
     with harness.free_domain() as domain, watching(domain, tmp_path, "--once") as bridge:
         # So slow that the viewer keeps up beside other tests: one that falls behind leaves messages out.

@@ -94,7 +94,9 @@ FINE = {"fine_use_command": False, "fine_use_reference": True}
     [
         ("loaded_drive", "electrodynamic_actuator", {}),
         ("loaded_series_drive", "series_drive", FINE),
-        ("loaded_series_drive", "series_drive", {**FINE, "fine_compensates": ["coarse"]}),
+        pytest.param(
+            "loaded_series_drive", "series_drive", {**FINE, "fine_compensates": ["coarse"]}, marks=pytest.mark.system
+        ),
     ],
 )
 def test_without_a_force_on_them_drives_and_their_cut_are_those_of_two_nodes(one, drive, values):
@@ -367,6 +369,7 @@ def test_a_tool_breaks_as_in_a_cut_of_its_own():
     assert after == pytest.approx(before / 3, rel=0.3)
 
 
+@pytest.mark.system
 def test_what_a_limited_coil_cannot_is_said():
     limits = {"coarse_loop": "current", "coarse_voltage_limit": 0.1, "cut_depth": 0.0}
     events = harness.run(together(**limits)).recording.sparse["/loaded_drive/events"]

@@ -122,6 +122,7 @@ def test_the_form_error_is_that_of_the_edge_and_the_sensor_reads_its_own_place()
     assert apart.margins == pytest.approx(seen.margins, rel=1e-6)
 
 
+@pytest.mark.system
 def test_at_an_end_stop_the_edge_apart_from_the_sensor_still_makes_the_chip():
     """Depth of cut and position of the edge agree, also while the stop holds the sensor."""
     names = {"frequency": "[5e3]", "damping": "[0.02]", "participation": "[0.02]", "edge": "[0.3]"}

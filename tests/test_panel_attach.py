@@ -56,6 +56,7 @@ def attached(domain):
         assert "Traceback" not in errors
 
 
+@pytest.mark.system
 def test_a_running_cell_is_shown_and_broken_from_the_page(attached, domain):
     """The fault is an event at the sample that the page is told; the same event offline gives the same run."""
     cell = load(SUPERVISED, ["spindle_encoder.revolutions=60", "spindle_encoder.speed_factor=0.5"])

@@ -115,6 +115,7 @@ time.sleep(1000.0)
 """
 
 
+@pytest.mark.system
 def test_a_process_that_does_not_end_by_itself_is_killed_when_nobody_is_left_to_do_it():
     """Its harness has been killed, and it takes no signal that it can ignore."""
     with subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE) as harness_process:

@@ -240,6 +240,7 @@ def test_what_cannot_be_replayed_is_refused(domain, strange, tmp_path):
         assert "Traceback" not in told
 
 
+@pytest.mark.system
 def test_a_bag_of_odd_topics_is_replayed_as_far_as_it_goes(domain, tmp_path):
     """Times and topics that are asked for count; a latched message from before the start comes; waits are announced."""
     odd = odd_bag(tmp_path / "odd.mcap")

@@ -100,6 +100,7 @@ def described(path):
         }
 
 
+@pytest.mark.system
 def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
     path, sent = foreign
     again = tmp_path / "again"
@@ -121,6 +122,7 @@ def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
     assert check(again).digests == check(first).digests
 
 
+@pytest.mark.system
 def test_without_simulated_time_the_order_is_that_of_publication(foreign, domain, tmp_path):
     (path, sent), topics = foreign, ("/note", "/robot/point")
     found = recorded_again(path, tmp_path / "again", topics=topics)

@@ -251,7 +251,9 @@ def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(ghost, domai
     assert not (tmp_path / "bag").exists()
     _, interrupted = sorted((tmp_path / "bag_snapshots").iterdir())
     found = told(interrupted)
-    assert found["triggers"][0][1] == "recorder: /recorder was ended by SIGTERM in the middle of a run"
+    # The recorder may hear of another node's end before its own.
+    assert found["triggers"][0][1].startswith("recorder: ")
+    assert found["triggers"][0][1].endswith("was ended by SIGTERM in the middle of a run")
     assert found["whole"] is False
     # The nodes are stopped one by one: some blocks of the last rows are missing.
     left = read(interrupted)

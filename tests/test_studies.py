@@ -109,7 +109,12 @@ def test_help_lists_the_parameters_whose_defaults_are_allowed(name):
     assert STUDIES[name].parameters().model_dump()
 
 
-@pytest.mark.parametrize("name", KEYS)
+LONG = {"angle-domain", "coupling", "decoupling", "sampled-servo"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.system) if name in LONG else name for name in KEYS]
+)
 def test_study_prints_a_table_or_json_and_draws_a_figure(folder, name, monkeypatch):
     """A table of 80 columns, or one line of JSON with exactly the promised keys; nothing on the error stream."""
     result, items = quick(name)
