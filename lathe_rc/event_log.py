@@ -52,7 +52,13 @@ def text(message: Sparse) -> str:
     if message.type == messages.EVENT:
         return str(values["action"])
     state, reaction = _STATES.get(values["state"], "?"), _REACTIONS.get(values["reaction"], "?")
+    return f"{cause(message)}: {state}, {reaction}"
+
+
+def cause(message: Sparse) -> str:
+    """Describe what a message of the supervisor is about, with value and limit."""
+    values = message.values
     unit, scale = UNITS.get(values["monitor"], ("", 1.0))
     sizes = [f"{values[name] * scale:.4g} {unit}".rstrip() for name in ("value", "limit")]
-    found = f" {sizes[0]}, limit {sizes[1]}" if values["limit"] else ""
-    return f"{values['monitor']} {values['subject']}{found}: {state}, {reaction}"
+    found = f"{sizes[0]}, limit {sizes[1]}" if values["limit"] else ""
+    return " ".join(filter(None, [values["monitor"], values["subject"], found]))

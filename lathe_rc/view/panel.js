@@ -6,10 +6,13 @@ const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], force: [], 
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
 const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
+const SAID = { safe: "safe (stopped, tool retracted)" };
+const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
 const escaped = text => String(text).replace(/[&<>"]/g, letter => `&#${letter.charCodeAt(0)};`);
 const digits = (value, count = 4) => Number.isFinite(value) ? String(Number(value.toPrecision(count))).replace("-", "−") : "–";
+const newton = (force, count) => digits(Math.abs(force) < 1e-3 ? 0 : force, count);
 const nice = value => { // the next 1, 2 or 5 times a power of ten
   const decade = 10 ** Math.floor(Math.log10(value));
   return [1, 2, 5, 10].map(step => step * decade).find(step => step >= value * 0.9999);
@@ -71,8 +74,7 @@ let changedSince = false, drawnAt = 0;
 const CALM = 1000; // [ms] between drawings of revolutions, which take the browser longest
 function draw(changed, moving = true) {
   const now = SHOWN.now, revolution = (now.angle || 0) / (2 * Math.PI);
-  $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0}` + (now.samples ? ` of ${now.samples}` : "")
-    
+  $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}${ABOUT.revolutions ? ` of ${digits(ABOUT.revolutions, 6)}` : ""}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0}` + (now.samples ? ` of ${now.samples}` : "")
     + (now.factor ? `, ${digits(now.factor, 2)} × real time` : "") + (now.bag ? `, recording ${now.bag}` : "");
   $("go").textContent = now.state == "running" ? "pause" : "start";
   $("go").disabled = $("step").disabled = ["ended", "failed"].includes(now.state) && can("change");
@@ -82,6 +84,10 @@ function draw(changed, moving = true) {
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
   drawSafety(now.safety);
+  for (const place of document.querySelectorAll("[data-learning]")) {
+    const found = JSON.parse(place.dataset.learning).map(topic => (now.learning || {})[topic]).filter(value => value !== undefined);
+    place.textContent = [...new Set(found)].map(value => value ? "learning" : "frozen").join(", ");
+  }
   drawMachine(now);
   drawDials(now);
   changedSince ||= changed;
@@ -96,8 +102,10 @@ function draw(changed, moving = true) {
 
 function drawSafety(safety) {
   $("lamp").style.background = safety ? COLOURS[safety.state] || "none" : "none";
-  $("safety").textContent = safety ? safety.state : "no supervisor";
-  $("alarm").textContent = safety ? safety.alarm : "";
+  const since = safety && safety.cause ? ` since ${(safety.since * (ABOUT.step || 0)).toFixed(3)} s` : "";
+  $("safety").textContent = safety ? (SAID[safety.state] || safety.state) + since : "no supervisor";
+  $("alarm").textContent = safety ? safety.cause : "";
+  $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }
 
 let logged = 0, loggedRun = 0;
@@ -147,8 +155,9 @@ function drawMachine(now) {
     const coarse = k == drives.length - 1, shown = coarse ? scale : 12 / nice(seen(name, um, 0.01)); // [px/µm]
     const width = coarse ? base - left : 70 - um * shown;
     parts.push(`<rect x="${left}" y="${cy - 20}" width="${width}" height="40" rx="3" fill="${field}" stroke="${ink}"/>`);
-    text(left + width / 2, cy + 5, name, 'text-anchor="middle"');
-    text(left + width / 2, cy - 28 - 20 * (k % 2), `${digits(Math.abs(um) < 1e-4 ? 0 : um)} µm, ×${digits(shown / MM * 1e3, 1)}`, 'text-anchor="middle"');
+    parts.push(`<line x1="${left + width / 2}" y1="${cy - 20}" x2="${left + width / 2}" y2="${24 + 22 * k}" stroke="${line}"/>`);
+    const words = `${name} ${digits(Math.abs(um) < 1e-4 ? 0 : um)} µm (drawn ×${digits(shown / MM * 1e3, 1)})`;
+    text(Math.min(left + 4, 636 - 0.6 * size * words.length), 20 + 22 * k, words);
     left += width;
   });
   parts.push(`<rect x="${left}" y="${cy - 34}" width="${Math.max(40, 560 - left)}" height="68" fill="${line}" stroke="${soft}"/>`);
@@ -156,14 +165,14 @@ function drawMachine(now) {
     const force = now.measured_force, length = 70 * force / nice(seen("force", force, Math.max(ABOUT.force, 1)));
     parts.push(`<line x1="${tip}" y1="${cy}" x2="${tip}" y2="${cy + length}" stroke="${bad}" stroke-width="3"/>`);
     parts.push(`<polygon points="${tip},${cy + length + 8} ${tip - 5},${cy + length} ${tip + 5},${cy + length}" fill="${bad}"/>`);
-    text(tip + 9, cy + length + 12, `${digits(force, 3)} N`);
+    text(tip + 9, cy + Math.max(length + 12, 40), `${newton(force, 3)} N`);
   }
   const bar = nice(40 / scale / 2);
-  if (ABOUT.part) parts.push(`<path d="M16 334 v8 h${(bar * scale).toFixed(1)} v-8" fill="none" stroke="${ink}"/>`);
-  if (ABOUT.part) text(24 + bar * scale, 342, `${digits(bar)} µm of radius (×${digits(now.exaggeration || 1)})`);
+  if (ABOUT.part) parts.push(`<path d="M16 344 v8 h${(bar * scale).toFixed(1)} v-8" fill="none" stroke="${ink}"/>`);
+  if (ABOUT.part) text(24 + bar * scale, 352, `${digits(bar)} µm of radius (×${digits(now.exaggeration || 1)})`);
   const slides = Object.entries(now.slides || {});
   slides.forEach(([name, mm], k) => {
-    const x = 340, y = 280 + 66 * k, half = nice(seen(name, mm, 0.001)), place = x + 130 + 120 * mm / half;
+    const x = 340, y = 268 + 66 * k, half = nice(seen(name, mm, 0.001)), place = x + 130 + 120 * mm / half;
     parts.push(`<line x1="${x + 10}" y1="${y}" x2="${x + 250}" y2="${y}" stroke="${soft}"/><rect x="${place - 9}" y="${y - 8}" width="18" height="16" rx="2" fill="${good}"/>`);
     text(x + 10, y - 12, `${name} slide ${digits(mm)} mm`);
     text(x + 250, y + 8 + size, `±${digits(half)} mm`, 'text-anchor="end"');
@@ -176,7 +185,7 @@ function drawMachine(now) {
 function drawDials(now) {
   const dials = [["speed", "1/min", now.rpm, nice((ABOUT.rpm || now.rpm || 1) * 1.25), ABOUT.rpm]];
   if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force) * 1.2), ABOUT.force]);
-  if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), 0]);
+  if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), ABOUT.margin]);
   const ink = style("--ink"), soft = style("--soft"), line = style("--line"), good = style("--good"), bad = style("--bad");
   $("dials").innerHTML = dials.map(([name, unit, value, most, wanted], k) => {
     const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
@@ -186,7 +195,8 @@ function drawDials(now) {
     const needle = known ? `<path d="M${cx} ${cy} L${at(56, value / most)}" stroke="${value < 0 ? bad : good}" stroke-width="4" stroke-linecap="round"/>` : "";
     const words = (y, told, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(told)}</text>`;
     return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark}${needle}`
-      + words(118, known ? `${digits(value)} ${unit}` : "unknown", 15, ink) + words(136, name, 12, soft)
+      + words(118, known ? `${unit == "N" ? newton(value, 4) : digits(value)} ${unit}` : "unknown", 15, ink) + words(136, name, 12, soft)
+      + (name == "stability margin" ? words(152, wanted ? `limit ${digits(wanted)}; below 0: learning diverges` : "below 0: learning diverges", 10, soft) : "")
       + `<text x="${cx + 56}" y="${cy + 40}" font-size="10" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
   }).join("");
 }
@@ -220,18 +230,23 @@ function angles(pen, left, right, y, colour) {
   for (let degrees = 0; degrees <= 360; degrees += 90) label(pen, `${degrees}°`, left + (right - left) * degrees / 360, y, colour, "center");
 }
 
+function cut(rows) { // the rows that determine a scale: those in which the tool was in the part, if there are any
+  const found = rows.filter(row => !row.out);
+  return found.length ? found : rows;
+}
+
 function drawMap() {
   const { pen, width, height, ink, soft } = canvas("map"), [left, top, right, bottom] = [58, 8, width - 14, height - 46];
   const rows = SHOWN.rows, columns = 180;
   angles(pen, left, right, bottom + 14, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
   // As in the report (colour_range): linear up to the quietest quarter of the rows, logarithmic beyond.
-  const largest = rows.map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
+  const largest = cut(rows).map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
   const end = Math.max(largest[largest.length - 1], 1e-6), bend = Math.min(Math.max(largest[(largest.length - 1) >> 2], end * 1e-4), end) / 8;
   const share = um => Math.sign(um) * Math.log1p(Math.abs(um) / bend) / Math.log1p(end / bend), colour = diverging();
   const image = new ImageData(columns, rows.length);
   rows.forEach((row, k) => row.cells.forEach((um, column) => {
-    image.data.set([...colour(share(um)), 255], 4 * (k * columns + column));
+    image.data.set([...(row.out ? [150, 150, 150] : colour(share(um))), 255], 4 * (k * columns + column));
   }));
   const small = new OffscreenCanvas(columns, rows.length);
   small.getContext("2d").putImageData(image, 0, 0);
@@ -239,7 +254,7 @@ function drawMap() {
   pen.drawImage(small, left, top, right - left, bottom - top);
   const wide = (right - left) / columns, tall = (bottom - top) / rows.length;
   if (ABOUT.tolerance) {
-    const beyond = (k, column) => k >= 0 && k < rows.length && Math.abs(rows[k].cells[(column + columns) % columns]) > ABOUT.tolerance;
+    const beyond = (k, column) => k >= 0 && k < rows.length && !rows[k].out && Math.abs(rows[k].cells[(column + columns) % columns]) > ABOUT.tolerance;
     pen.strokeStyle = ink;
     pen.beginPath();
     for (let k = 0; k <= rows.length; k++) for (let column = 0; column < columns; column++) {
@@ -261,13 +276,13 @@ function drawWaterfall() {
   const rows = SHOWN.latest, tall = (bottom - top) / WATERFALL, tolerance = ABOUT.tolerance;
   angles(pen, left, right, height - 6, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
-  const largest = rows.map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
-  const most = nice(Math.max(largest[rows.length >> 1], tolerance, 1e-6)), scale = 0.5 * tall / most;
+  const largest = cut(rows).map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
+  const most = nice(Math.max(largest[largest.length >> 1], tolerance, 1e-6)), scale = 0.45 * tall / most;
   rows.forEach((row, k) => {
     const y = top + (k + 0.5 + WATERFALL - rows.length) * tall, x = column => left + (right - left) * (column + 0.5) / row.cells.length;
     if (tolerance) { pen.globalAlpha = 0.5; pen.fillStyle = line; pen.fillRect(left, y - tolerance * scale, right - left, 2 * tolerance * scale); pen.globalAlpha = 1; }
-    const place = um => y - Math.max(-tall, Math.min(tall, um * scale));
-    for (const [colour, wide, wanted] of [[good, 1.2, () => true], [bad, 2.2, um => tolerance && Math.abs(um) > tolerance]]) {
+    const place = um => y - Math.max(-0.45 * tall, Math.min(0.45 * tall, um * scale));
+    for (const [colour, wide, wanted] of row.out ? [[soft, 1.2, () => true]] : [[good, 1.2, () => true], [bad, 2.2, um => tolerance && Math.abs(um) > tolerance]]) {
       Object.assign(pen, { strokeStyle: colour, lineWidth: wide });
       pen.beginPath();
       row.cells.forEach((um, column) => { if (column && wanted(um)) { pen.moveTo(x(column - 1), place(row.cells[column - 1])); pen.lineTo(x(column), place(um)); } });
@@ -317,7 +332,7 @@ function drawForce() {
   const { pen, width, height, soft, line, good, bad } = canvas("force"), [left, top, right, bottom] = [46, 8, width - 14, height - 24];
   const found = SHOWN.force, values = [...found.map(([, force]) => force), ABOUT.force, 0];
   if (found.length < 2) return;
-  const most = nice(Math.max(...values, 1)), least = Math.min(0, ...values), first = found[0][0], last = found[found.length - 1][0];
+  const most = nice(1.1 * Math.max(...values, 1)), least = Math.min(0, ...values), first = found[0][0], last = found[found.length - 1][0];
   const x = time => left + (right - left) * (time - first) / (last - first), y = force => bottom - (bottom - top) * (force - least) / (most - least);
   for (const force of [0, most / 2, most]) {
     Object.assign(pen, { strokeStyle: line, lineWidth: 1 });
@@ -329,11 +344,15 @@ function drawForce() {
     pen.setLineDash([6, 4]);
     pen.beginPath(); pen.moveTo(left, y(ABOUT.force)); pen.lineTo(right, y(ABOUT.force)); pen.stroke();
     pen.setLineDash([]);
-    label(pen, "set point", right - 4, y(ABOUT.force) - 4, bad, "right");
+    label(pen, "set point", right - 4, Math.max(y(ABOUT.force) - 4, 10), bad, "right");
   }
   Object.assign(pen, { strokeStyle: good, lineWidth: 1.6 });
   pen.beginPath();
-  found.forEach(([time, force], k) => pen[k ? "lineTo" : "moveTo"](x(time), y(force)));
+  found.forEach(([time, force], k) => {
+    const joined = k && time - found[k - 1][0] <= GAP;
+    pen[joined ? "lineTo" : "moveTo"](x(time), y(force));
+    if (!joined) pen.lineTo(x(time) + 1, y(force)); // a point
+  });
   pen.stroke();
   for (const time of [first, last]) label(pen, `${time.toFixed(2)} s`, x(time), height - 6, soft, time == first ? "left" : "right");
 }
@@ -377,6 +396,11 @@ function describe() { // fills the commands from what the cell tells of itself
     row.className = "actions";
     name.textContent = node.name;
     row.append(name);
+    if (node.learning.length) {
+      const state = Object.assign(document.createElement("span"), { className: "note" });
+      state.dataset.learning = JSON.stringify(node.learning);
+      row.append(state);
+    }
     for (const action of node.actions) {
       const button = Object.assign(document.createElement("button"), { type: "button", textContent: action });
       button.addEventListener("click", () => tell("act", { node: node.name, action }));

@@ -5,10 +5,12 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from lathe_rc import messages
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.messages import full
 from lathe_rc.safety import faults
 from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
 from lathe_rc.view.panel_outlook import outlook
@@ -17,6 +19,7 @@ from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, View, news
 
 _PATIENCE = 1.0  # [s] until a page without news gets an answer
+_SHOWN = {"wrong": {"scale": 0.9}}  # values offered in place of the defaults, which change nothing
 _FILES = ("save", "load")  # events that need a file, which the page does not name
 
 
@@ -138,7 +141,9 @@ def _commands(driver: Driver, cell: LiveCell) -> dict[str, Answer]:
         return {}
 
     def record(question: Mapping[str, Any]) -> object:
-        driver.call(lambda: cell.record(_text(question, "bag")))
+        if not (bag := _text(question, "bag").strip()) and not cell.recording:
+            raise InputError("bag = ''; allowed: a name, for the folder of the bag")
+        driver.call(lambda: cell.record(bag))
         return {}
 
     return {
@@ -178,7 +183,10 @@ def about(cell: LiveCell) -> dict[str, Any]:
 def _faults() -> dict[str, Any]:
     """Return the kinds of faults with the values that they need."""
     return {
-        name: {"doc": kind.doc, "values": {key: value.default for key, value in kind.values.items()}}
+        name: {
+            "doc": kind.doc,
+            "values": {key: value.default for key, value in kind.values.items()} | _SHOWN.get(name, {}),
+        }
         for name, kind in faults.KINDS.items()
     }
 
@@ -193,4 +201,5 @@ def _node(stage: Stage) -> dict[str, Any]:
             for name in stage.tunable
         ],
         "targets": stage.fault_targets,
+        "learning": [full(topic) for topic, kind in stage.sparse_topics.items() if kind == messages.LEARNING],
     }

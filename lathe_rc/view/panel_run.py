@@ -281,6 +281,11 @@ class LiveCell:
         return min(known, default=None)
 
     @property
+    def recording(self) -> bool:
+        """Whether a bag is being recorded."""
+        return self._recorder is not None
+
+    @property
     def reached(self) -> int:
         """Number of samples computed."""
         return self._engine.reached
@@ -316,7 +321,7 @@ class LiveCell:
     def told(self) -> Mapping[str, Any]:
         """Return the status of the run, for its snapshots."""
         return {
-            "bag": self._bag if self._recorder else "",
+            "bag": self._bag if self.recording else "",
             "events": " ".join(filter(None, [_parameters(self._changed), as_options(self.events)])),
             "begun": self.cell.first,
             "version": self._version,

@@ -6,6 +6,7 @@ for a reader. Readers take the newest snapshot, and from lists that only grow wh
 browser misses snapshots and delays nothing.
 """
 
+import math
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,6 +31,7 @@ CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
 MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
+_OUT = (State.RETRACTING.name.lower(), State.SAFE.name.lower())  # states in which the tool is out of the part
 _AT_ONCE = 16  # rows in an answer
 _SHAPE = 90  # points of the part's outline
 _MOST_LINES = 2000  # of the log in an answer
@@ -76,10 +78,12 @@ class Row:
     Attributes:
         revolution: its form.
         cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
+        out: whether the supervisor held the tool out of the part in some of it.
     """
 
     revolution: Revolution
     cells: list[float]
+    out: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,10 +115,10 @@ def _short(values: Array) -> list[float]:
     return [float(f"{value:.4g}") for value in values.tolist()]
 
 
-def _row(revolution: Revolution) -> Row:
+def _row(revolution: Revolution, *, out: bool) -> Row:
     parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
-    return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)))
+    return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
 
 
 class View:
@@ -151,7 +155,10 @@ class View:
         self._revolutions = Revolutions()
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
         if messages.SAFETY_STATUS in self._types.values():
-            self._now["safety"] = {"state": State.NOMINAL.name.lower(), "alarm": ""}
+            self._now["safety"] = {"state": State.NOMINAL.name.lower(), "since": 0, "cause": "", "alarm": ""}
+        self._now["learning"] = {}
+        self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
+        self._end = 0  # sample after the last complete revolution
         self._scale: Scale | None = None
         self._epoch, self._every = 0, 1
         self._rows: list[Row] = []
@@ -212,7 +219,8 @@ class View:
 
     def _add(self, complete: Iterable[Revolution]) -> None:
         for revolution in complete:
-            row = _row(revolution)
+            row = _row(revolution, out=revolution.end > self._out[0] and self._end < self._out[1])
+            self._end = revolution.end
             rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
             self._history.append((revolution.number, rms, largest))
             self._newest = [*self._newest[1 - WATERFALL :], row]
@@ -223,14 +231,27 @@ class View:
                 self._rows, self._epoch, self._every = self._rows[::2], self._epoch + 1, 2 * self._every
 
     def _message(self, topic: str, message: Sparse) -> None:
+        if message.type == messages.LEARNING:
+            self._now["learning"] = {**self._now["learning"], topic: bool(message.values["learning"])}
         if message.type == messages.LEARNING and np.isfinite(message.values["stability_margin"]):
             self._now["margin"] = float(message.values["stability_margin"])
         if message.type in event_log.LOGGED:
             self.say(message.index, topic.strip("/"), event_log.text(message))
         if message.type == messages.SAFETY_STATUS:
-            state = message.values["state"]
-            name = State(state).name.lower() if state in set(State) else "?"
-            self._now["safety"] = {"state": name, "alarm": event_log.text(message)}
+            self._safety(message)
+
+    def _safety(self, message: Sparse) -> None:
+        """Take a message of the supervisor; the cause of a state is its first one, that of a retraction stays."""
+        state, before = message.values["state"], self._now["safety"]
+        name = State(state).name.lower() if state in set(State) else "?"
+        out = name in _OUT
+        if not before or name != before["state"]:
+            was_out = bool(before) and before["state"] in _OUT
+            cause = before["cause"] if out and was_out else event_log.cause(message)
+            before = {"since": message.index, "cause": cause}
+            if out != was_out:
+                self._out = (message.index, math.inf) if out else (self._out[0], message.index)
+        self._now["safety"] = {**before, "state": name, "alarm": event_log.text(message)}
 
     def say(self, sample: int, source: str, text: str) -> None:
         """Add a line to the log."""
@@ -307,6 +328,10 @@ class Have:
         return cls(**found)
 
 
+def _told(row: Row) -> dict[str, Any]:
+    return {"revolution": row.revolution.number, "cells": row.cells, "out": row.out}
+
+
 def news(snapshot: Snapshot, have: Have) -> dict[str, Any]:
     """Return what a page lacks, as JSON data.
 
@@ -323,13 +348,10 @@ def news(snapshot: Snapshot, have: Have) -> dict[str, Any]:
         "run": snapshot.run,
         "epoch": snapshot.epoch,
         "now": dict(snapshot.now),
-        "rows": [
-            {"revolution": row.revolution.number, "height": round(row.revolution.height * 1e3, 6), "cells": row.cells}
-            for row in rows
-        ],
+        "rows": [{**_told(row), "height": round(row.revolution.height * 1e3, 6)} for row in rows],
         "more": had + len(rows) < len(snapshot.rows),
         "log": snapshot.log[have.log : have.log + _MOST_LINES],
         "history": snapshot.history[have.history : have.history + _MOST_LINES],
-        "latest": [{"revolution": row.revolution.number, "cells": row.cells} for row in latest],
+        "latest": [_told(row) for row in latest],
         "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
     }

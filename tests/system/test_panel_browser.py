@@ -51,6 +51,12 @@ def submit(browser, form, button, **values):
     browser.click(f"#{form} {button}")
 
 
+def one_revolution(browser):
+    before = browser.run("SHOWN.now.sample")
+    browser.click("#step")
+    browser.until(f"SHOWN.now.state == 'paused' && SHOWN.now.sample > {before}")
+
+
 def saved(folder, name):
     """The file of a name, once the browser has written it."""
     for _ in range(200):
@@ -89,11 +95,13 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     # A fault, and what the supervisor makes of it
     target = "coarse/state.measured_position"
     submit(browser, "fault", "button", node="electrodynamic_actuator", target=target, kind="stuck")
-    browser.click("#go")
+    one_revolution(browser)
     browser.until(f"{STATE} != 'nominal'")
     assert "limit" in browser.until("document.getElementById('alarm').textContent")
+    assert " since " in browser.run("document.getElementById('safety').textContent")
     browser.click("#repair")
-    browser.until(f"{STATE} == 'safe'")
+    while browser.run(STATE) != "safe":
+        one_revolution(browser)
     log = browser.run("document.getElementById('log').textContent")
     assert f"electrodynamic_actuator/events: fault {target} stuck" in log
     assert "error tool" in log
@@ -101,7 +109,9 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     for action, told in (("reset", "reset"), ("retract", "operator")):
         buttons = "[...document.querySelectorAll('#actions button')]"
         browser.run(f"{buttons}.find(each => each.textContent == '{action}').click()")
+        one_revolution(browser)
         browser.until(f"SHOWN.log.some(line => line.source == 'safety/status' && line.text.startsWith('{told}'))")
+    browser.click("#go")
     browser.until("SHOWN.now.state == 'ended'")
     # The same events without the panel give the same run
     given = [f"{node}.events={events!r}" for node, events in cell.events.items()]
