@@ -177,6 +177,17 @@ def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
     assert shown.until(lambda now: not now["begun"])["events"] == listed
 
 
+def test_a_restart_begins_at_the_checkpoint_that_was_given(opened, tmp_path):
+    lathe_rc.run(scenario("piston", 6), checkpoints={"revolution:3": tmp_path / "learned"})
+    shown = opened(scenario("piston", 6, f"spindle_encoder.start_from={tmp_path / 'learned'}"))
+    begun = shown.cell.reached
+    shown.ask("step")
+    shown.until(lambda now: now["state"] == "paused" and now.get("sample", 0) > begun)
+    shown.ask("change", values={"learning_controller.learning_gain": "0.5"}, here=True)
+    shown.ask("change", values={}, here=False)
+    assert shown.cell.reached == begun > 0
+
+
 def test_mistakes_are_refused_and_the_run_goes_on(opened, tmp_path):
     shown = opened(scenario("piston", 8))
     for name, question, message in (

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
+from itertools import count
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar
@@ -253,6 +254,8 @@ class LiveCell:
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-panel-")
         self._recorder: OfflineRecorder | None = None
         self._bag, self._version = "", 0
+        masters = [f"{name}.{checkpoint.START_FROM}" for name in scenario.masters]
+        self._given = {name: scenario.value(name) for name in masters}  # checkpoint of a restart, if any
         self._changed: dict[str, Value] = {}  # parameters changed since the panel was opened
         self._begin(scenario)
         self.view = View(self._types(), scenario.shared.step_ns, self._margin())
@@ -315,8 +318,9 @@ class LiveCell:
 
     def turn_end(self) -> int:
         """Return the sample at which the revolution in progress ends."""
-        angle = 2.0 * np.pi * (np.floor(self.view.turns) + 1.0)
-        return min(self.cell.master.sample_at(angle) + 1, self.samples)
+        ends = (self.cell.master.sample_at(2.0 * np.pi * turn) + 1 for turn in count(int(self.view.turns) + 1))
+        # The view knows no angle before the first sample, which may be that of a checkpoint.
+        return min(next(end for end in ends if end > self.reached), self.samples)
 
     def told(self) -> Mapping[str, Any]:
         """Return the status of the run, for its snapshots."""
@@ -356,15 +360,14 @@ class LiveCell:
         Raises:
             InputError: a value is not allowed, or the state of the cell depends on it; the run goes on as before.
         """
-        masters = [f"{name}.start_from" for name in self.scenario.masters]
-        changed = self.scenario.varied({**values, **dict.fromkeys(masters, "")})
+        changed = self.scenario.varied({**values, **self._given})
         here = here and self.reached > 0
         waiting = self._waiting() if here else {}
         if here:
             file = Path(self._folder.name) / f"{self.reached}.ckpt"
             state = checkpoint.take(self.scenario, self._engine.stages, self.reached, self._engine.past)
             checkpoint.save(file, state)
-            changed = changed.varied(dict.fromkeys(masters, str(file)))
+            changed = changed.varied(dict.fromkeys(self._given, str(file)))
         self._begin(changed)
         self._changed |= values
         self.events = waiting
