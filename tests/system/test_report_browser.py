@@ -20,6 +20,8 @@ pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).parents[2]
 HEADLESS = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--virtual-time-budget=10000"]
+#: map, two polar, spectrum, convergence, two of each learning loop, three of force and position, speed, force, wear
+FIGURES = 18
 BROWSER = "not an origin"  # what the log calls the browser itself
 QUIET = ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"]
 QUIET += ["--disable-default-apps", "--no-default-browser-check", "--disable-domain-reliability"]
@@ -162,7 +164,7 @@ def test_a_telephone_shows_the_page_without_scrolling_sideways(page, tmp_path, s
     told = json.loads(html.unescape(re.search(r"<title>(.*)</title>", visit.document)[1]))
     assert told["width"] == told["frame"] >= 400  # less a scroll bar
     assert (told["paper"], told["ink"], told["labels"]) == (paper, ink, [labels])
-    assert len(told["charts"]) == 12
+    assert len(told["charts"]) == FIGURES
     assert all(250 < width <= 420 for width in told["charts"])
 
 
@@ -192,13 +194,13 @@ def test_figures_are_painted_with_and_without_scripts_and_on_paper(page, tmp_pat
 def test_every_figure_of_the_report_renders(page, tmp_path):
     """The images in a page of our own, with a script that the report forbids itself."""
     images = re.findall(r'<img src="data:[^"]+"', page.read_text(encoding="utf-8"))
-    assert len(images) == 12  # map, two polar ones, spectrum, convergence, two of each loop, speed, force, wear
+    assert len(images) == FIGURES
     script = "onload=\"document.title=[...document.images].map(i=>i.naturalWidth+'x'+i.naturalHeight).join()\""
     gallery = tmp_path / "gallery.html"
     gallery.write_text(f"<body {script}>{'>'.join(images)}></body>", encoding="utf-8")
     title = re.search(r"<title>(.*)</title>", Visit(gallery, tmp_path).document)
     sizes = [tuple(map(int, size.split("x"))) for size in title[1].split(",")]
-    assert len(sizes) == 12
+    assert len(sizes) == FIGURES
     assert all(width > 400 and height > 150 for width, height in sizes)
 
 
