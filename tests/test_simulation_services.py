@@ -94,6 +94,8 @@ def test_a_run_pauses_goes_on_and_refuses_what_a_cell_cannot_do(ghost, domain, t
         code, why = client.set(state.STATE_PAUSED)
         if code == Result.RESULT_INCORRECT_STATE:  # asked so early
             assert why.startswith("the run has not begun: waits for ")
+        else:
+            assert client.set(state.STATE_PLAYING) == (Result.RESULT_OK, "")
         client.wait_until(state.STATE_PLAYING)
         offered = {name for name, _ in ghost.get_service_names_and_types_by_node("spindle_encoder", "/")}
         assert offered == {f"/{name}" for name in allowed["spindle_encoder"]}, "the policy allows these, and no others"
