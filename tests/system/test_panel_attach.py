@@ -19,7 +19,7 @@ from lathe_rc.cell.scenario import load
 from lathe_rc.view.page_server import TOKEN
 from lathe_rc.view.panel_view import Have
 
-SUPERVISED = Path(__file__).parents[1] / "config" / "supervised.yaml"
+SUPERVISED = Path(__file__).parents[2] / "config" / "supervised.yaml"
 
 
 class Asked:
