@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 from lathe_rc import messages
@@ -96,7 +97,7 @@ class LoopResult:
             return None
         return judge(self.found.errors.largest, loop.tolerance, self.before, loop.quantity)
 
-    @property
+    @cached_property
     def growth(self) -> Growth | None:
         """Growth of the error; it also diverges if the command is at its limits a quarter of the time at the end."""
         grown = swing_growth(self.found.errors.largest, self.before, self.loop.quantity)
