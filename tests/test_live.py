@@ -271,7 +271,8 @@ def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv(dds.PROFILES, str(small))
             bridges = [stack.enter_context(watching(domain, folder)) for folder in folders]
-        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.5") as (processes, begin):
+        # So slow that the bridges show something before they are stopped, beside other tests too.
+        with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.1") as (processes, begin):
             for bridge in bridges:
                 listens(bridge)
             begin()
