@@ -54,32 +54,10 @@ def test_an_argument_that_there_is_not_is_refused():
     )
 
 
-TWO_CELLS = """
-from launch import LaunchDescription
-from launch.actions import GroupAction, IncludeLaunchDescription
-from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import PathJoinSubstitution
-from launch_ros.actions import PushRosNamespace
-from launch_ros.substitutions import FindPackageShare
-
-FILE = PathJoinSubstitution([FindPackageShare("lathe_rc"), "launch", "cell.launch.py"])
-
-
-def cell(name, **arguments):
-    arguments |= {"bag": name, "spindle_encoder.revolutions": "3.0", "spindle_encoder.speed_factor": "0.0"}
-    include = IncludeLaunchDescription(PythonLaunchDescriptionSource(FILE), launch_arguments=arguments.items())
-    return GroupAction([PushRosNamespace("shop"), include])
-
-
-def generate_launch_description():
-    return LaunchDescription([cell("plain"), cell("deeper", namespace="left")])
-"""
-
-
 def test_two_included_cells_are_in_the_namespaces_that_are_pushed_and_end():
-    Path("two.launch.py").write_text(TWO_CELLS)
-    assert ros2("launch", "two.launch.py").count("process has finished cleanly") == 10
-    for bag, namespace in (("plain", "/shop"), ("deeper", "/shop/left")):
+    said = ros2("launch", str(Path(__file__).parents[2] / "examples" / "two_cells.launch.py"))
+    assert said.count("process has finished cleanly") == 10
+    for bag, namespace in (("right_bag", "/shop"), ("left_bag", "/shop/left")):
         recording = reader.read_bag(Path(bag))
         assert all(topic.startswith(f"{namespace}/") for topic in recording.dense)
 
