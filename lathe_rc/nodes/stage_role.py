@@ -10,6 +10,7 @@ from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import messages
 from lathe_rc.cell import events
+from lathe_rc.cell.ahead import uncompiled
 from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.parameters import Value, explain_overflow
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
@@ -53,7 +54,7 @@ class StageRole(Role):
         self.node = node
         with explain_overflow({node.get_name(): node.table}):
             self.stage = STAGES[node.kind](node.get_name(), node.table)
-        compile_kernels(self.stage)  # so that the first block takes no longer than the next
+        self._compile()
         self.begun: Checkpoint | None = None
         self.blocks = self.samples = 0
         self.started, self.angle = False, 0.0
@@ -143,7 +144,13 @@ class StageRole(Role):
             self.begun, self.samples = begun, begun.sample
             with explain_overflow({self.node.get_name(): table}):
                 self.stage = begun.stage(self.node.get_name(), table)
-            compile_kernels(self.stage)
+            self._compile()
+
+    def _compile(self) -> None:
+        """Compile the stage, so that the first block takes no longer than the next."""
+        if uncompiled([self.stage]):
+            self.node.get_logger().info("compiles its step, once on this computer: usually 2 to 20 s")
+        compile_kernels(self.stage)
 
     @property
     def past(self) -> dict[str, Signals]:
