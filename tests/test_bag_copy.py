@@ -19,9 +19,10 @@ from lathe_rc.bag.writing.writer import BagWriter
 
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory):
-    """Bag of two revolutions."""
+    """Bag of two revolutions and an event."""
     path = tmp_path_factory.mktemp("bags") / "turned"
-    harness.run(config("piston", "spindle_encoder.revolutions=2"), bag=path)
+    sets = ["spindle_encoder.revolutions=2", "learning_controller.events=['sample 1280: freeze']"]
+    harness.run(config("piston", *sets), bag=path)
     return path
 
 
@@ -55,6 +56,7 @@ def test_the_scenario_does_not_scroll_the_topics_away_where_it_is_not_asked_for(
     assert "ros__parameters" not in short
     assert f"scenario: {count} lines; --scenario prints them" in short
     assert short.index("/tool") < short.index("scenario:")
+    assert "event: sample 1280, /learning_controller: freeze\n" in short
 
 
 def test_a_recording_that_joined_late_or_lacks_samples_is_described(turned, tmp_path):

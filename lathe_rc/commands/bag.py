@@ -55,7 +55,7 @@ def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
 @options.as_json
 @click.pass_context
 def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, as_json: bool) -> None:
-    """Show topics, rates, time span, date, scenario and the form error of the part.
+    """Show topics, rates, time span, date, events, scenario and the form error of the part.
 
     For a damaged bag, or one that lacks samples, show the readable content and what is wrong; exit code 3.
     """
@@ -83,10 +83,14 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             "contradictions": source.contradictions,
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
+            "events": [],
             "first_sample": 0,
             "error_um": None,
         }
         try:
+            for _, _, data in source.messages({topic for topic, kind in types.items() if kind == messages.EVENT}):
+                event = messages.decode(messages.EVENT, data)
+                summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
             summary["first_sample"] = stream.first_of(source)
             summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
         except LatheError as error:
@@ -116,6 +120,8 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
+    for event in summary["events"]:
+        console.print(f"event: sample {event['sample']}, {event['node']}: {event['action']}")
     _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)
     ctx.exit(_LOSSY if source.damage else 0)
 
