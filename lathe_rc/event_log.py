@@ -20,6 +20,7 @@ UNITS = {
     "force_low": ("N", 1.0),
     **dict.fromkeys(("error", "following", "stroke", "slide"), ("µm", 1e6)),
 }
+_EFFORTS = {"coarse": "A", "fine": "V"}  # of the drives of these names, see ActuatorState.msg
 LOGGED = (messages.EVENT, messages.SAFETY_STATUS)  #: message types of the event log
 
 
@@ -59,6 +60,7 @@ def cause(message: Sparse) -> str:
     """Describe what a message of the supervisor is about, with value and limit."""
     values = message.values
     unit, scale = UNITS.get(values["monitor"], ("", 1.0))
+    unit = _EFFORTS.get(values["subject"], unit) if values["monitor"] == "effort" else unit
     sizes = [f"{values[name] * scale:.4g} {unit}".rstrip() for name in ("value", "limit")]
     found = f"{sizes[0]}, limit {sizes[1]}" if values["limit"] else ""
     return " ".join(filter(None, [values["monitor"], values["subject"], found]))

@@ -3,10 +3,12 @@
 
 import io
 import json
+import re
 import threading
 import time
 from pathlib import Path
 
+import cells
 import numpy as np
 import pytest
 import trimesh
@@ -100,6 +102,34 @@ def test_a_run_with_the_panel_has_the_digests_of_one_without(opened, tmp_path):
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == result.digest
     assert [number for number, _, _ in shown.history] == list(range(1, len(shown.history) + 1))
     assert [rms for _, rms, _ in shown.history] == pytest.approx((result.errors.rms * 1e6).tolist(), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("node", "values", "limit"),
+    [
+        (
+            "learning_controller",
+            {"learning_gain": 0.2},
+            r"falls by [\d.]+% a revolution; in tolerance after some \d+ more",
+        ),
+        (
+            "learning_controller",
+            {"learning_gain": 0.9},
+            r"^\d+% .* repeats from revolution to revolution, most at 2 waves",
+        ),
+        ("electrodynamic_actuator", {"noise_rms": 1e-6}, r"^\d+% .* changes from revolution to revolution: noise\.$"),
+        (
+            "electrodynamic_actuator",
+            {"command_velocity": 5e-3},
+            r"^electrodynamic_actuator is at the limits of its command",
+        ),
+    ],
+)
+def test_the_panel_says_what_limits_the_form_error(opened, node, values, limit):
+    """Learning, Q, noise and the limits of a command, in four variants of one cell."""
+    shown = opened(cells.scenario(spindle_encoder={"revolutions": 30.2}, tool={"tolerance": 1e-9}, **{node: values}))
+    shown.ask("start")
+    assert re.search(limit, shown.until(lambda now: now["state"] == "ended")["limits"][0])
 
 
 def test_events_of_the_panel_repeat_its_run(opened, tmp_path):

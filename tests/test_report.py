@@ -196,7 +196,7 @@ class TestVerdict:
         )
         assert told.verdict.mood == "bad"
         assert re.search(r"falls by [\d.]+% a revolution; in tolerance after some \d+ more", told.limits[0].text)
-        assert "repeats from revolution to revolution, most at 2 UPR" in told.limits[1].text
+        assert "repeats from revolution to revolution, most at 2 waves a turn" in told.limits[1].text
 
     def test_noise_changes_from_revolution_to_revolution(self, head):
         noise = {"noise_rms": 1e-6}

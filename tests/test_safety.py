@@ -289,6 +289,10 @@ def test_an_alarm_is_told_in_words_whatever_a_bag_says():
     assert said == "error tool 25 µm, limit 20 µm: retracting, retract"
     strange = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, values | {"state": 200, "limit": 0.0}))
     assert strange == "error tool: ?, retract"
+    for drive, unit in (("coarse", "A"), ("fine", "V"), ("own", "A or V")):
+        effort = values | {"monitor": "effort", "subject": drive, "value": 0.9, "limit": 0.8}
+        said = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, effort))
+        assert said.startswith(f"effort {drive} 0.9 {unit}, limit 0.8 {unit}: ")
     bare = values | {"monitor": "reset refused", "subject": "", "limit": 0.0}
     said = event_log.text(Sparse("safety/status", messages.SAFETY_STATUS, 7, bare))
     assert said == "reset refused: retracting, retract"

@@ -170,7 +170,8 @@ class VariedLoop:
             cell, refused = self._checked(varied)
         except InputError as error:
             return LoopState(str(error))
-        return LoopState(refused, cell.margins, cell.drive_margins, loop_curves(cell))
+        curves = loop_curves(cell)
+        return LoopState(refused, cell.margins, {curve.node: curve.margin for curve in curves}, curves)
 
     def _checked(self, varied: Scenario) -> tuple[Cell, str]:
         """Return the cell after its checks and why it is refused; a refused one is checked without convergence."""

@@ -95,7 +95,8 @@ def attach(scenario: Scenario, namespace: str, port: int, say: Callable[[str], o
     cell = Cell(scenario.nodes)
     with standalone_node("panel", PanelParameters, {}, words, signals=SignalHandlerOptions.NO) as (node, _):
         asking, live = _Asking(rclpy.create_node("panel_commands")), LivePanel()
-        site = panel.attached_site(live.view, outlook(scenario), cell, asking.act)
+        live.view.outlook = outlook(scenario)
+        site = panel.attached_site(live.view, cell, asking.act)
         listener = Listener(node, live)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, listener.stop)

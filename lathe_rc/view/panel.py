@@ -13,7 +13,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 from lathe_rc.safety import faults
 from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
-from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, View, news
@@ -31,7 +30,7 @@ def page() -> Page:
 def site(driver: Driver, cell: LiveCell, loop: Site | None = None) -> Site:
     """Return the panel of an offline cell, with the page of its loops, if given, as a tab."""
     tabs, answers = ({"loop": loop.pages[""]}, loop.answers) if loop else ({}, {})
-    own = {**_watching(cell.view, lambda: outlook(cell.scenario)), **_playing(driver), **_commands(driver, cell)}
+    own = {**_watching(cell.view), **_playing(driver), **_commands(driver, cell)}
     return Site({"": page(), **tabs}, {**answers, **own})
 
 
@@ -55,17 +54,16 @@ def player_site(driver: Driver, player: Player) -> Site:
         driver.call(moved)
         return {}
 
-    about = {**player.outlook, "can": ["run", "seek"], "nodes": [], "faults": {}, "parameters": []}
+    about = {**player.view.outlook, "can": ["run", "seek"], "nodes": [], "faults": {}, "parameters": []}
     answers = {"about": lambda _: about, "seek": seek, "start": start}
-    return Site({"": page()}, {**_watching(player.view, lambda: player.outlook), **_playing(driver), **answers})
+    return Site({"": page()}, {**_watching(player.view), **_playing(driver), **answers})
 
 
-def attached_site(view: View, outlook: Mapping[str, Any], cell: Cell, act: Callable[[str, str], str]) -> Site:
+def attached_site(view: View, cell: Cell, act: Callable[[str, str], str]) -> Site:
     """Return the panel of a cell that runs elsewhere.
 
     Args:
         view: its view.
-        outlook: `outlook` of its scenario.
         cell: the cell of its scenario, for the choice of commands.
         act: asks a node for an event, and returns it as in a scenario.
     """
@@ -74,17 +72,12 @@ def attached_site(view: View, outlook: Mapping[str, Any], cell: Cell, act: Calla
         return {"text": act(_text(question, "node"), _text(question, "action"))}
 
     nodes = [_node(stage) for stage in cell.stages.values()]
-    about = {**outlook, "can": ["command"], "nodes": nodes, "faults": _faults(), "parameters": []}
-    return Site({"": page()}, {**_watching(view, lambda: outlook), "about": lambda _: about, "act": acting})
+    about = {**view.outlook, "can": ["command"], "nodes": nodes, "faults": _faults(), "parameters": []}
+    return Site({"": page()}, {**_watching(view), "about": lambda _: about, "act": acting})
 
 
-def _watching(view: View, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str, Answer]:
-    """Return the answers that every run has: news, and the part as a file.
-
-    Args:
-        view: view of the run.
-        outlooks: returns the `outlook` of its scenario.
-    """
+def _watching(view: View) -> dict[str, Answer]:
+    """Return the answers that every run has: news, and the part as a file."""
 
     def frame(question: Mapping[str, Any]) -> object:
         have = Have.of(question)
@@ -96,7 +89,7 @@ def _watching(view: View, outlooks: Callable[[], Mapping[str, Any]]) -> dict[str
         ending, enlarged = _text(question, "format"), _number(question, "enlarged")
         if not 0.0 < enlarged <= 1000.0:
             raise InputError(f"enlarged = {enlarged:g}; allowed: above 0, up to 1000")
-        outlook = outlooks()
+        outlook = view.outlook
         limit = outlook["tolerance"] * 2e-6 or 10e-6
         mesh = panel_part.body(view.revolutions, outlook["radius"] * 1e-3, enlarged, limit)
         name = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in outlook["name"])
@@ -170,13 +163,12 @@ def _number(question: Mapping[str, Any], name: str) -> float:
 
 def about(cell: LiveCell) -> dict[str, Any]:
     """Return what does not change while a cell runs: its nodes, their events, knobs and faults, its parameters."""
-    scenario = cell.scenario
     return {
-        **outlook(scenario),
+        **cell.view.outlook,
         "can": ["run", "command", "change"],
         "nodes": [_node(stage) for stage in cell.cell.stages.values()],
         "faults": _faults(),
-        "parameters": [f"{node}.{name}" for node, table in scenario.nodes.items() for name in table.rows()],
+        "parameters": [f"{node}.{name}" for node, table in cell.scenario.nodes.items() for name in table.rows()],
     }
 
 

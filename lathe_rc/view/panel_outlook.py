@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+from lathe_rc.cell.budget import changing
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
@@ -17,8 +18,10 @@ Parameters = TypeVar("Parameters", bound=NodeParameters)
 
 def outlook(scenario: Scenario) -> dict[str, Any]:
     """Return the name, tolerance and shape of a scenario, for the drawings of the page; lengths in µm and mm."""
-    shared = scenario.shared
-    return _outlook(scenario.name, shared.step, shared.nominal_rpm, list(scenario.nodes.values()))
+    shared, tables = scenario.shared, list(scenario.nodes.values())
+    causes = changing({name: table.model_dump() for name, table in scenario.nodes.items()})
+    causes += ["cut"] if _first(CuttingProcessParameters, tables) else []
+    return {**_outlook(scenario.name, shared.step, shared.nominal_rpm, tables), "changing": causes}
 
 
 def plain_outlook(name: str, step: float) -> dict[str, Any]:

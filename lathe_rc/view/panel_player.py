@@ -32,7 +32,6 @@ class Player:
         samples: index after the last sample.
         step: sampling step [s].
         block: samples between two commands.
-        outlook: see `lathe_rc.view.panel_outlook`.
 
     Raises:
         InputError: not a bag of a cell.
@@ -60,10 +59,10 @@ class Player:
         with Source(bag) as source, tempfile.TemporaryDirectory() as folder:
             about, name = source.about, name_of(bag)
             try:
-                self.outlook = {**outlook(provenance.scenario_of(about, Path(folder))), "name": name}
+                self.view.outlook = {**outlook(provenance.scenario_of(about, Path(folder))), "name": name}
             except LatheError as error:
                 self.view.say(self.first, "panel", f"the scenario is not known: {error}")
-                self.outlook = plain_outlook(name, self.step)
+                self.view.outlook = plain_outlook(name, self.step)
 
     def advance(self, end: int) -> None:
         """Show samples up to ``end``."""

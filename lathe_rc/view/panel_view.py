@@ -17,11 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import event_log, messages
+from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.safety.state_machine import State
 from lathe_rc.view import machine_state
+from lathe_rc.view.form_limits import form_limits, varying_speed
 from lathe_rc.view.rerun_part import Outlook, Scale
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
 
@@ -128,6 +131,9 @@ class View:
         types: message type by topic.
         step_ns: sampling step [ns].
         margin: stability margin before the first cycle; None: unknown.
+
+    Attributes:
+        outlook: see `lathe_rc.view.panel_outlook`; empty: unknown.
     """
 
     def __init__(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -135,6 +141,7 @@ class View:
         self._due = 0.0
         self.run = 0
         self.latest: Snapshot | None = None
+        self.outlook: Mapping[str, Any] = {}
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -163,6 +170,9 @@ class View:
         self._epoch, self._every = 0, 1
         self._rows: list[Row] = []
         self._newest: list[Row] = []
+        self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
+        self._limited: set[str] = set()  # nodes that limit the command now
+        self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._log: list[dict[str, Any]] = []
         self._history: list[tuple[int, float, float]] = []
 
@@ -188,6 +198,8 @@ class View:
         self._now["time"] = (first + samples) * self._step_ns * 1e-9
         encoder, tool, cut = (named.get(topic) for topic in (self.topics.encoder, self.topics.tool, self.topics.cut))
         if encoder:
+            slowest, fastest = float(encoder["speed_true"].min()), float(encoder["speed_true"].max())
+            self._speeds = (min(self._speeds[0], slowest), max(self._speeds[1], fastest))
             self._now |= {"angle": float(encoder["angle_true"][-1]), "rpm": float(encoder["speed"][-1]) * _RPM}
         if cut:
             self._now |= {name: float(cut[name][-1]) for name in ("force", "measured_force")}
@@ -237,6 +249,7 @@ class View:
             self._now["margin"] = float(message.values["stability_margin"])
         if message.type in event_log.LOGGED:
             self.say(message.index, topic.strip("/"), event_log.text(message))
+            self._limit(topic.strip("/").removesuffix("/events"), message)
         if message.type == messages.SAFETY_STATUS:
             self._safety(message)
 
@@ -252,6 +265,27 @@ class View:
             if out != was_out:
                 self._out = (message.index, math.inf) if out else (self._out[0], message.index)
         self._now["safety"] = {**before, "state": name, "alarm": event_log.text(message)}
+
+    def _limit(self, node: str, message: Sparse) -> None:
+        action = str(message.values.get("action", ""))
+        if action.startswith(LIMITED):
+            self._limited.add(node)
+        elif action.startswith(f"{FREE}:"):
+            self._limited.discard(node)
+
+    def _limiting(self) -> list[str]:
+        """Return what limits the form error, in sentences; nothing while the supervisor holds the tool out."""
+        rows = self._newest[-LAST:]
+        if self._limits[0] != len(self._history) and rows:
+            tolerance = self.outlook.get("tolerance")
+            found = form_limits(
+                np.array([row.revolution.error for row in rows]) * _UM,
+                excess=rows[-1].revolution.largest * _UM / tolerance if tolerance else 0.0,
+                learning=messages.LEARNING in self._types.values(),
+                causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
+            )
+            self._limits = len(self._history), [] if any(row.out for row in rows) else [each.text for each in found]
+        return [*(f"{node} is at the limits of its command." for node in sorted(self._limited)), *self._limits[1]]
 
     def say(self, sample: int, source: str, text: str) -> None:
         """Add a line to the log."""
@@ -269,7 +303,8 @@ class View:
             return
         self._due = now + PERIOD
         number = self.latest.number + 1 if self.latest else 1
-        current = {**self._now, **told, "exaggeration": self._scale.deviation / 1e3 if self._scale else 1.0}
+        scale = self._scale.deviation / 1e3 if self._scale else 1.0
+        current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting()}
         latest = Snapshot(
             number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
         )

@@ -5,7 +5,6 @@ A single pass over the bag yields the data: the final form error, its repeatable
 of the nodes. Only a budget gives the share of each cause.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -15,25 +14,14 @@ from lathe_rc import messages
 from lathe_rc.analysis.budget import Budget
 from lathe_rc.cell.budget import changing
 from lathe_rc.cell.stages.command_limits import LIMITED
+from lathe_rc.view.form_limits import WARN, Finding, form_limits, varying_speed
 from lathe_rc.view.report_figures import um
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import EventKind, Gathered
 
-GOOD, BAD, WARN = "good", "bad", "warn"
+GOOD, BAD = "good", "bad"
 
-_FEWEST = 4  # smallest number of revolutions for a trend
-_CHANGE = 0.05  # change of the form error over the last revolutions below which it counts as constant
-_VARIES = 0.005  # smallest relative deviation at which a speed counts as varying
-_SOME = 0.1  # smallest share of the power that is reported
 _MOST = 6  # largest number of kinds of incidents
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Finding of the report: a sentence, and whether it is good or bad news."""
-
-    text: str
-    mood: str = ""
 
 
 @dataclass(frozen=True)
@@ -129,53 +117,14 @@ def _incidents(data: Gathered) -> Iterator[str]:
 
 def _form(data: Gathered, form: Form) -> Iterator[Finding]:
     """Yield findings on the final form error and on its repeatable and variable parts."""
-    profiles = um(np.array(form.newest))
-    if len(profiles) < _FEWEST:
-        return
-    rms = np.sqrt(np.mean(profiles**2, axis=-1))
-    power = float(np.mean(profiles**2))
-    if not power:
-        return
-    yield from _trend(rms, form)
-    count = len(profiles)
-    # The mean of count revolutions still contains 1/count of the variable power; the factor corrects this.
-    mean = profiles.mean(axis=0)
-    share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
-    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
-    order = int(np.argmax(amplitude[1:])) + 1
-    left = ": what learning and its Q filter leave" if data.has(messages.LEARNING) else ""
-    causes = [*changing(data.nodes), *(["cut"] if data.has(messages.CUT) else []), *_speed(data)]
-    parts = [
-        (1.0 - share, f"repeats from revolution to revolution, most at {order} UPR ({amplitude[order]:.3g} µm){left}"),
-        (share, f"changes from revolution to revolution{': ' if causes else ''}{', '.join(causes)}"),
-    ]
-    for part, text in sorted(parts, reverse=True):
-        if part >= _SOME:
-            yield Finding(f"{part:.0%} of the form error's power in the last {count} revolutions {text}.")
-
-
-def _trend(rms: messages.Samples, form: Form) -> Iterator[Finding]:
-    """Yield a finding on the trend of the form error, if the error clearly falls or grows in the last revolutions."""
-    half = len(rms) // 2
-    before, after = rms[:half], rms[-half:]
-    factor = float(after.mean() / before.mean()) if before.mean() else 1.0
-    each = float(np.median(rms[1:] / rms[:-1])) if rms.all() else 1.0  # a step is not a trend
-    if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
-        more = ""
-        if form.verdict and not form.verdict.in_tolerance:
-            turns = math.ceil(math.log(form.tolerance / form.verdict.largest) / math.log(each))
-            more = f"; in tolerance after some {turns} more, if it goes on like this"
-        yield Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
-    elif after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
-        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
-
-
-def _speed(data: Gathered) -> Iterator[str]:
-    """Yield the variation of the spindle speed, if it is large enough."""
-    for (_, name), series in data.curves.signals.items():
-        low, high = series.extremes
-        if name == "speed_true" and low > 0.0 and math.isfinite(high):
-            deviation = (high - low) / (high + low)
-            if deviation >= _VARIES:
-                yield f"speed (which varies by ±{deviation:.1%})"
-            return
+    speeds = (series.extremes for (_, name), series in data.curves.signals.items() if name == "speed_true")
+    yield from form_limits(
+        um(np.array(form.newest)),
+        excess=form.verdict.largest / form.tolerance if form.verdict else 0.0,
+        learning=data.has(messages.LEARNING),
+        causes=[
+            *changing(data.nodes),
+            *(["cut"] if data.has(messages.CUT) else []),
+            *varying_speed(*next(speeds, (0.0, 0.0))),
+        ],
+    )

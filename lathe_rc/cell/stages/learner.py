@@ -156,8 +156,15 @@ class Learner(Obedient):
 
     def scaled_factors(self, drive: Response, speed: float, waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
         """Return the `factors` for the drive scaled by each of some numbers."""
+        known: dict[bytes, Complex] = {}  # responses, which take the most time
+
+        def once(frequency: Array) -> Complex:
+            if (key := frequency.tobytes()) not in known:
+                known[key] = drive(frequency)
+            return known[key]
+
         return [
-            self._known(lambda frequency, scale=scale: np.asarray(scale * drive(frequency)), waves, speed)  # type: ignore[misc]
+            self._known(lambda frequency, scale=scale: np.asarray(scale * once(frequency)), waves, speed)  # type: ignore[misc]
             for scale in scales
         ]
 

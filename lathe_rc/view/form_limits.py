@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Causes that limit a form error, judged by its last revolutions: learning that goes on, what repeats, what changes.
+
+Only a budget (`lathe_rc.cell.budget`) gives the share of each cause.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lathe_rc.messages import Samples
+
+WARN = "warn"
+
+_FEWEST = 4  # smallest number of revolutions for a trend
+_CHANGE = 0.05  # change of the form error over the last revolutions below which it counts as constant
+_VARIES = 0.005  # smallest relative deviation at which a speed counts as varying
+_SOME = 0.1  # smallest share of the power that is reported
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Sentence about a run, and whether it is good or bad news."""
+
+    text: str
+    mood: str = ""
+
+
+def form_limits(
+    profiles: Samples, *, excess: float = 0.0, learning: bool = False, causes: Iterable[str] = ()
+) -> Iterator[Finding]:
+    """Yield findings on the form error and on its repeatable and variable parts; none for fewer than 4 revolutions.
+
+    Args:
+        profiles: form errors of the last revolutions at uniformly spaced angles [µm], shape (revolutions, points).
+        excess: largest error over the tolerance; up to 1: in tolerance, or there is no tolerance.
+        learning: whether the cell has a learning controller.
+        causes: names of the causes that make one revolution differ from the next.
+    """
+    count = len(profiles)
+    power = float(np.mean(profiles**2)) if count >= _FEWEST else 0.0
+    if not power:
+        return
+    yield from _trend(np.sqrt(np.mean(profiles**2, axis=-1)), excess)
+    # The mean of count revolutions still contains 1/count of the variable power; the factor corrects this.
+    mean = profiles.mean(axis=0)
+    share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
+    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
+    order = int(np.argmax(amplitude[1:])) + 1
+    left = ": what learning and its Q filter leave" if learning else ""
+    named = ", ".join(causes)
+    parts = [
+        (
+            1.0 - share,
+            f"repeats from revolution to revolution, most at {order} waves a turn ({amplitude[order]:.3g} µm){left}",
+        ),
+        (share, f"changes from revolution to revolution{': ' if named else ''}{named}"),
+    ]
+    for part, text in sorted(parts, reverse=True):
+        if part >= _SOME:
+            yield Finding(f"{part:.0%} of the form error's power in the last {count} revolutions {text}.")
+
+
+def _trend(rms: Samples, excess: float) -> Iterator[Finding]:
+    """Yield a finding on the trend of the form error, if the error clearly falls or grows in the last revolutions."""
+    half = len(rms) // 2
+    before, after = rms[:half], rms[-half:]
+    factor = float(after.mean() / before.mean()) if before.mean() else 1.0
+    each = float(np.median(rms[1:] / rms[:-1])) if rms.all() else 1.0  # a step is not a trend
+    if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
+        turns = math.ceil(math.log(1.0 / excess) / math.log(each)) if excess > 1.0 else 0
+        more = f"; in tolerance after some {turns} more, if it goes on like this" if turns else ""
+        yield Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
+    elif after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
+        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
+
+
+def varying_speed(low: float, high: float) -> list[str]:
+    """Return the variation of a spindle speed between two extremes, in words, if it is large enough."""
+    deviation = (high - low) / (high + low) if low > 0.0 and math.isfinite(high) else 0.0
+    return [f"speed (which varies by ±{deviation:.1%})"] if deviation >= _VARIES else []
