@@ -15,7 +15,6 @@ from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import FormParameters
-from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleParameters
@@ -186,11 +185,9 @@ def _model(scenario: Scenario) -> dict[str, Cause]:
 def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     """Return the cause ``Q floor``: Q is below 1. Off: each Q is 1 as far as its channel then converges."""
     off: dict[str, Value] = {}
-    low, high = cell.speed_range
     for stage in cell.stages.values():
         if isinstance(stage, LearningController):
-            responses = [response for response, _ in stage.learned(cell.stages.values())]
-            loop = Loop(stage, responses, stage.checked_speeds(low, high))
+            loop = stage.checked_loop(cell)
             flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
             if flat is None:
                 left_out["Q floor"] = f"{stage.name} converges with no flat Q"

@@ -83,10 +83,9 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
 
 
 def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, Found]:
-    responses = [response for response, _ in stage.learned(cell.stages.values())]
-    if not responses:
+    loop = stage.checked_loop(cell)
+    if not loop.responses:
         return {}
-    loop = Loop(stage, responses, stage.checked_speeds(*cell.master.speed_range()))
     gain = 1.0 if "learning_gain" in free else stage.parameters.learning_gain
     if stage.parameters.q_filter == "fir":
         return _flat(loop, free, gain, margin)
@@ -98,7 +97,7 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
     found: dict[str, Found] = {}
     lead, q_time = stage.parameters.lead_time, stage.parameters.q_time
     if "lead_time" in free:
-        lag = max(map(drive_lag, responses))
+        lag = max(map(drive_lag, loop.responses))
         if "q_time" not in free:
             lead = _least(lambda each: factor(each, q_time), _FAR * lag)
             found["lead_time"] = Found(lead, "T0 with the least sup|Q - γZ|")

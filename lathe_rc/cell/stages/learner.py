@@ -230,7 +230,7 @@ class Learner(Obedient):
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
         self._check_delay(cell, high)
-        self._check_convergence(cell, self.checked_speeds(low, high), cures=cures)
+        self._check_convergence(cell, cures=cures)
         encoder = cell.master.parameters
         cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
@@ -245,6 +245,11 @@ class Learner(Obedient):
             for topic, response in responses.items()
             if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
         ]
+
+    def checked_loop(self, cell: WiredCell) -> "Loop":
+        """Return the controller with the drives that it commands, at the speeds that the checks evaluate."""
+        responses = [response for response, _ in self.learned(cell.stages.values())]
+        return Loop(self, responses, self.checked_speeds(*cell.speed_range))
 
     def _check_delay(self, cell: WiredCell, speed: float) -> None:
         encoder = cell.master.parameters
@@ -266,14 +271,14 @@ class Learner(Obedient):
                 f"{max(largest, 0)}; allowed: {allowed}"
             )
 
-    def _check_convergence(self, cell: WiredCell, speeds: Collection[float], *, cures: bool) -> None:
+    def _check_convergence(self, cell: WiredCell, *, cures: bool) -> None:
         command = remapped(self.shared, self.outputs[0].topic)
         # A member without samples of its own, such as a recorder, is no drive.
         unknown = [name for name in cell.unknown if name in cell.reader_names(command) and cell.unknown[name].dense]
         for name in unknown:
             cell.leave_open(f"whether {self.name} converges with {name}", name)
-        learned, untold = self.learned(cell.stages.values()), list[str]()
-        loop = Loop(self, [response for response, _ in learned], speeds)
+        learned, untold, loop = self.learned(cell.stages.values()), list[str](), self.checked_loop(cell)
+        speeds = loop.speeds
         cell.loops.setdefault(self.name, []).append(loop)
         for response, drive in learned:
             self._check_reach(drive)
