@@ -2,6 +2,7 @@
 """Design of the learning law for a measured drive: margins, errors, and the scenario that is written."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,25 @@ def test_an_fir_inverse_is_that_of_the_response_it_is_given():
         assert np.abs(np.angle(inverted(others, band, measured=measured))).max() > 1.5
     of_model, of_points = (np.abs(inverted(np.ones_like, beyond, measured=each)).max() for each in (False, True))
     assert (of_points < 1.0, of_model > 10.0) == (True, True)
+
+
+def test_notches_stop_the_resonances_without_a_phase_and_raise_the_margin():
+    asked = Design(config("piston", *FAST), [DRIVE], 0.3)
+    (drive,) = asked._responses(asked.drives)
+    known, lead = design.Known(drive, 0.2e-3, None, DRIVE["mode_frequency"]), 1.5e-3
+    found = known.notched(lead)
+    leads = found["lead_time"] - found["correction_interval"] * np.arange(len(found["correction_taps"]))
+    beside = np.array([300.0, 1000.0, *DRIVE["mode_frequency"]])
+    response = np.exp(1j * np.outer(beside, leads)) @ found["correction_taps"] * np.exp(-1j * beside * lead)
+    np.testing.assert_allclose(response, [1.0, 1.0, 0.0, 0.0], atol=0.1)
+    laws = (design.LAWS["lead, flat Q"], design.LAWS["notch, flat Q"])
+    wide = [replace(law, filters=[{"q_pass": 3433.0, "q_stop": 8582.0}]) for law in laws]
+    settings = [next(law.settings(known)) for law in wide]
+    without, notched = (
+        max(asked._margin_of(law, values, [drive]) for values in alike)
+        for law, alike in zip(wide, settings, strict=True)
+    )
+    assert notched > without + 0.2
 
 
 def test_an_fir_inverse_that_the_cycle_is_too_short_for_is_refused():

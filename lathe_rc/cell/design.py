@@ -21,7 +21,7 @@ from lathe_rc.analysis.cycle_weights import of_gaussian_process
 from lathe_rc.analysis.fir_inverse import fir_inverse
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.frequency_response import FrequencyResponse
-from lathe_rc.analysis.learning import DriveMargin, Response
+from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import SharedParameters, Value
@@ -44,6 +44,7 @@ _LEARNING, _OBSERVERS = (1000.0, 3000.0, 8000.0), (0.0, 500.0, 2000.0, 4000.0)  
 _PENALTIES = (1e-4, 1e-3, 1e-2)  # ρ of an FIR inverse
 _TAPS, _AHEAD, _DENSE = 64, 2.0, 1024  # its length, its lead and its interval in lags of the drive, points of a model
 _PER_LAG = 16
+_NOTCH, _NARROW = 100.0, 0.2  # ρ of a notch in its middle, and its half width over the frequency
 _ORDERS, _WEIGHTS = (6, 8, 12, 16, 24), (0.01, 0.1, 1.0)  # of the norm-optimal law
 _RUNS = 12  # settings of a law that are run
 #: parameters of the replaced controller that its law keeps
@@ -58,14 +59,15 @@ class Law:
         kind: kind of the controller.
         fixed: parameters that distinguish the law.
         filters: parameters of its filter, each a choice between robustness and error.
-        lead: what its lead compensates: the lag of the drive, the delay that a second-order inverse leaves, or the
-            response of the nominal drive or as measured, by an FIR inverse; empty for a law without lead and gain.
+        lead: what its lead compensates: the lag of the drive, without or with notches at its resonances, the delay that
+            a second-order inverse leaves, or the response of the nominal drive or as measured, by an FIR inverse; empty
+            for a law without lead and gain.
     """
 
     kind: str
     fixed: Values
     filters: Sequence[Values]
-    lead: Literal["", "lag", "delay", "model", "measured"] = "lag"
+    lead: Literal["", "lag", "notch", "delay", "model", "measured"] = "lag"
 
     def settings(self, drive: "Known") -> Iterator[Sequence[Values]]:
         """Yield settings that differ in the lead alone, for a drive."""
@@ -73,6 +75,8 @@ class Law:
         if self.lead in ("lag", "delay"):
             time = drive.lag if self.lead == "lag" else max(drive.delay, 0.1 * drive.lag)
             leads = [{"lead_time": lead} for lead in (_LEADS * time).tolist()]
+        elif self.lead == "notch":
+            leads = [drive.notched(lead) for lead in (_LEADS * drive.lag).tolist()]
         elif self.lead:
             leads = [drive.inverse(penalty, measured=self.lead == "measured") for penalty in _PENALTIES]
         gains: Sequence[Values] = [{"learning_gain": gain} for gain in _GAINS] if self.lead else [{}]
@@ -87,21 +91,34 @@ class Known(NamedTuple):
         response: response of its position to its command.
         delay: its delay [s]; 0 if unknown.
         measured: points of its measured response; None if unknown.
+        resonances: frequencies of its modes [rad/s].
     """
 
     response: Response
     delay: float
     measured: FrequencyResponse | None
+    resonances: Sequence[float] = ()
 
     @property
     def lag(self) -> float:
         """Lag at low frequencies [s]."""
         return lag(self.response)
 
+    @property
+    def _frequency(self) -> Array:
+        """Frequencies of the taps [rad/s]."""
+        return np.linspace(1.0, _DENSE, _DENSE) * np.pi * _PER_LAG / self.lag / _DENSE
+
+    def notched(self, lead: float) -> Values:
+        """Return an FIR filter with a lead [s] and zero-phase notches at the resonances."""
+        frequency, floor = self._frequency, np.zeros(_DENSE)
+        for mode in self.resonances:
+            floor += _NOTCH * np.exp(-((frequency / mode - 1.0) ** 2) / _NARROW**2)
+        return self._taps(np.exp(-1j * frequency * lead), floor)
+
     def inverse(self, penalty: float, *, measured: bool) -> Values:
         """Return an FIR inverse of the response of the model, or as ``measured`` and 0 beyond."""
-        interval = self.lag / _PER_LAG
-        frequency = np.linspace(np.pi / interval / _DENSE, np.pi / interval, _DENSE)
+        frequency = self._frequency
         value, floor = np.asarray(self.response(frequency)), np.full(_DENSE, penalty)
         if measured and (points := self.measured) is not None:
             value, noise = np.where(frequency > points.frequency[-1], 0.0, value), np.zeros(_DENSE)
@@ -111,8 +128,11 @@ class Known(NamedTuple):
                 deviation = points.deviation * np.abs(points.value)
                 noise[inside] = 2.0 * np.interp(frequency[inside], points.frequency, deviation) ** 2
             floor += noise
-        lead_time = _AHEAD * self.lag
-        taps = fir_inverse(frequency, value, floor, lead_time=lead_time, interval=interval, taps=_TAPS)
+        return self._taps(value, floor)
+
+    def _taps(self, response: Complex, floor: Array) -> Values:
+        lead_time, interval = _AHEAD * self.lag, self.lag / _PER_LAG
+        taps = fir_inverse(self._frequency, response, floor, lead_time=lead_time, interval=interval, taps=_TAPS)
         return {"lead_time": lead_time, "correction_interval": interval, "correction_taps": taps.tolist()}
 
 
@@ -130,6 +150,7 @@ LAWS: Mapping[str, Law] = {
     "lead, exponential Q": Law("learning_controller", {"q_filter": "exponential"}, _SMOOTH),
     "lead, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian"}, _SMOOTH),
     "lead, flat Q": Law("learning_controller", {"q_filter": "fir"}, _FLAT),
+    "notch, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "notch"),
     "inverse, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, "delay"),
     "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, "delay"),
     "zero phase, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "model"),
@@ -282,9 +303,12 @@ class Design:
         }
         self._scenario = scenario
         fields = type(self._drive.shared).model_fields
-        prefix = f"{self._drive.name}.{'coarse_' if 'coarse_damping' in fields else ''}"
-        self.drives: list[Values] = [{prefix + name: value for name, value in each.items()} for each in drives]
+        prefix = "coarse_" if "coarse_damping" in fields else ""
+        self.drives: list[Values] = [
+            {f"{self._drive.name}.{prefix}{name}": value for name, value in each.items()} for each in drives
+        ]
         self._nominal = scenario.varied(self.drives[0])
+        self._resonances = getattr(self._nominal.nodes[self._drive.name], f"{prefix}mode_frequency", ())
 
     def candidates(self, watch: Callable[[str], None] = lambda _: None) -> list[Candidate]:
         """Return each law with its best settings, the best law first; ``watch`` is called with the name of each.
@@ -294,7 +318,7 @@ class Design:
         """
         found = []
         for name, law in LAWS.items():
-            if law.lead != "measured" or self._measured:
+            if {"measured": self._measured, "notch": self._resonances}.get(law.lead, True):
                 watch(name)
                 found.append(self._candidate(name))
         return sorted(found, key=_rank)
@@ -308,13 +332,7 @@ class Design:
         return base.with_node(self.node, table.read(self.node, {**kept, "stage": law.kind, **law.fixed, **values}))
 
     def _responses(self, drives: Sequence[Values]) -> list[Response]:
-        found: list[Response] = []
-        for values in drives:
-            stages = Cell(self._scenario.varied(values).nodes).stages
-            learner = stages[self.node]
-            assert isinstance(learner, Learner), "as before"
-            found += [response for response, _ in learner.learned(stages.values())]
-        return found
+        return [found for values in drives for found in self._loop(self._scenario.varied(values)).responses]
 
     def _candidate(self, name: str) -> Candidate:
         law = LAWS[name]
@@ -325,7 +343,7 @@ class Design:
         whole = self._responses(self.drives)
         for k in order:
             values, scenario = runs[k]
-            margin = self._loop(scenario, whole).drive_margin()
+            margin = self._loop(scenario)._replace(responses=whole).drive_margin()
             if margin is not None and margin.error >= self._margin:
                 # The law keeps the model of the nominal drive.
                 fixed = scenario.with_models_given()
@@ -342,7 +360,7 @@ class Design:
         known = self._nominal.nodes[self._drive.name].drive_models().values()
         delay = next((value for each in known if isinstance(value := each.get("delay"), float)), 0.0)
         kept: list[Values] = []
-        for alike in law.settings(Known(responses[0], delay, self._measured)):
+        for alike in law.settings(Known(responses[0], delay, self._measured, self._resonances)):
             tried = [(self._margin_of(law, values, responses), values) for values in alike]
             margin, best = max(tried, key=lambda pair: pair[0])
             kept += [best] if margin >= self._margin else []
@@ -351,17 +369,18 @@ class Design:
 
     def _margin_of(self, law: Law, values: Values, responses: Collection[Response]) -> float:
         try:
-            margin = self._loop(self._with(self._nominal, law, values), responses).drive_margin()
+            loop = self._loop(self._with(self._nominal, law, values))
+            margin = loop._replace(responses=responses).drive_margin()
         except InputError as error:  # the filter does not fit into the memory
             self.refused = self.refused or error
             return 0.0
         return margin.error if margin else 0.0
 
-    def _loop(self, scenario: Scenario, responses: Collection[Response]) -> Loop:
+    def _loop(self, scenario: Scenario) -> Loop:
         cell = Cell(scenario.nodes)
         stage = cell.stages[self.node]
-        assert isinstance(stage, Learner), "a law has taken its place"
-        return Loop(stage, responses, stage.checked_speeds(*cell.speed_range))
+        assert isinstance(stage, Learner), "as before, or a law has taken its place"
+        return stage.checked_loop(cell)
 
     def _run(self, scenarios: Sequence[Scenario]) -> list[Found]:
         found = []
