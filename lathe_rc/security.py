@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lathe_rc import harness
-from lathe_rc.cell.beside import MACHINE_STATE, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
+from lathe_rc.cell.beside import MACHINE_STATE, PANEL, PANEL_COMMANDS, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -133,6 +133,18 @@ class _Maker:
         """Return the profile of the Rerun bridge, which reads the signals shown in a scene."""
         return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
 
+    def panel(self) -> Profile:
+        """Return the profile of an attached panel, which reads the same signals as the Rerun bridge."""
+        return replace(self.rerun_bridge(), node=PANEL, reply=frozenset(f"{PANEL}/{each}" for each in _PARAMETERS))
+
+    def panel_commands(self) -> Profile:
+        """Return the profile of its second node, which asks for events, pace and pause."""
+        (master,) = self._scenario.masters
+        asked = {f"{name}/schedule" for name in self._cell.stages} | {f"{master}/set_parameters"}
+        if self._cell.master.shared.simulation_services:
+            asked.add("set_simulation_state")
+        return replace(self._node(PANEL_COMMANDS), request=frozenset(asked))
+
     def machine_state(self) -> Profile:
         """Return the profile of the publisher of standard messages, which reads joints and force of the machine."""
         heard = [topic for topic, origin in self._signals.items() if machine_source(topic, origin.type)]
@@ -163,12 +175,13 @@ class _Maker:
         return frozenset(topic for profile in self.members for topic in profile.publish)
 
 
-_BESIDE: Mapping[str, Callable[[_Maker], Profile]] = {
-    OPERATOR: _Maker.operator,
-    REPLAYER: _Maker.replayer,
-    RERUN_BRIDGE: _Maker.rerun_bridge,
-    TOPIC_RECORDER: _Maker.topic_recorder,
-    MACHINE_STATE: _Maker.machine_state,
+_BESIDE: Mapping[str, Sequence[Callable[[_Maker], Profile]]] = {
+    OPERATOR: [_Maker.operator],
+    REPLAYER: [_Maker.replayer],
+    RERUN_BRIDGE: [_Maker.rerun_bridge],
+    PANEL: [_Maker.panel, _Maker.panel_commands],
+    TOPIC_RECORDER: [_Maker.topic_recorder],
+    MACHINE_STATE: [_Maker.machine_state],
 }
 BESIDE = tuple(_BESIDE)  #: tools that can be given permissions in addition to the members of a cell
 
@@ -202,7 +215,7 @@ def policy(
         absolute(namespace, group[0]): [maker.member(name, group) for name in group]
         for group in complete.processes(groups)
     }
-    return made | {absolute(namespace, kind): [_BESIDE[kind](maker)] for kind in dict.fromkeys(beside)}
+    return made | {absolute(namespace, kind): [make(maker) for make in _BESIDE[kind]] for kind in dict.fromkeys(beside)}
 
 
 def to_xml(made: Policy, title: str) -> str:

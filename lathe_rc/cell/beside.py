@@ -9,6 +9,7 @@ from lathe_rc.cell.parameters import NonNegative, Table, parameter
 
 REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER = "replayer", "rerun_bridge", "topic_recorder"  #: kinds of node
 MACHINE_STATE = "machine_state"  #: kind of node
+PANEL, PANEL_COMMANDS = "panel", "panel_commands"  #: nodes of a panel that is attached to a cell
 REPLAYED_FILES = "lathe-replay-"  #: prefix of the temporary folder that contains the files of a replayed bag
 RERUN_RATE = 2000.0  #: points of a curve per second
 RERUN_PORT = 9090  #: port of the web page

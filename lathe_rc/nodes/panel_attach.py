@@ -2,15 +2,23 @@
 """The panel of a cell that runs in this ROS domain: it listens to the cell, and asks its nodes for events."""
 
 import signal
+import subprocess
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import rclpy
 from lathe_rc_msgs.srv import Schedule
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from lathe_rc import allowed_code
+from lathe_rc.bag.writing.writer import refuse_existing
+from lathe_rc.cell.beside import PANEL, PANEL_COMMANDS
 from lathe_rc.cell.parameters import Table
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
@@ -31,10 +39,23 @@ class PanelParameters(Table):
 
 
 class _Asking:
-    """Events by the services of the nodes of a cell; the answers arrive in a thread of their own."""
+    """Commands to a cell by the services of its nodes (implements `lathe_rc.view.panel.Attached`).
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    The answers arrive in a thread of their own.
+
+    Args:
+        node: node that asks.
+        cell: the cell of the scenario.
+        live: what is shown of the cell.
+    """
+
+    def __init__(self, node: Node, cell: Cell, live: LivePanel) -> None:
+        self._node, self._live, self._master = node, live, cell.master.name
+        self._recorder: subprocess.Popen[str] | None = None
+        self._bag = ""
+        self.cannot: Mapping[str, str] = {"step": "a cell of nodes steps by blocks: ros2 service call step_simulation"}
+        if not cell.master.shared.simulation_services:
+            self.cannot |= {"go": f"the cell pauses only with {self._master}.simulation_services = playing or paused"}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._over = threading.Event()
@@ -45,32 +66,83 @@ class _Asking:
         while not self._over.is_set():
             self._executor.spin_once(timeout_sec=_TURN)
 
-    def act(self, name: str, action: str) -> str:
+    def _ask(self, kind: Any, name: str, request: Any) -> Any:
+        """Return the answer of a service, by its name in the cell's namespace.
+
+        Raises:
+            InputError: there is no such service.
+            LatheError: it does not answer.
+        """
+        service = f"{self._node.get_namespace().rstrip('/')}/{name}"
+        client = self._node.create_client(kind, service)
+        try:
+            if not client.wait_for_service(_PATIENCE):
+                raise InputError(f"no service {service}; allowed: a node of the running cell")
+            answered = threading.Event()
+            future = client.call_async(request)
+            future.add_done_callback(lambda _: answered.set())
+            if not answered.wait(_PATIENCE):
+                raise LatheError(f"{service} does not answer; has the cell ended?")
+            return future.result()
+        finally:
+            self._node.destroy_client(client)
+
+    def act(self, node: str, action: str) -> str:
         """Ask a node for an event at the first sample that it has not computed, and return it as in a scenario.
 
         Raises:
             InputError: the node does not exist, or refuses.
             LatheError: it does not answer.
         """
-        service = f"{self._node.get_namespace().rstrip('/')}/{name}/schedule"
-        client = self._node.create_client(Schedule, service)
-        try:
-            if not client.wait_for_service(_PATIENCE):
-                raise InputError(f"no service {service}; allowed: a node of the running cell")
-            answered = threading.Event()
-            future = client.call_async(Schedule.Request(action=action, not_before=0))
-            future.add_done_callback(lambda _: answered.set())
-            if not answered.wait(_PATIENCE):
-                raise LatheError(f"{service} does not answer; has the cell ended?")
-            answer = future.result()
-            if not answer.accepted:
-                raise InputError(str(answer.message))
-            return f"sample {answer.sample_index}: {action}"
-        finally:
-            self._node.destroy_client(client)
+        answer = self._ask(Schedule, f"{node}/schedule", Schedule.Request(action=action, not_before=0))
+        if not answer.accepted:
+            raise InputError(str(answer.message))
+        return f"sample {answer.sample_index}: {action}"
+
+    def hold(self, *, held: bool) -> None:
+        """Pause the run, or let it go on (errors as for `act`)."""
+        from simulation_interfaces.msg import SimulationState
+        from simulation_interfaces.srv import SetSimulationState
+
+        state = SimulationState(state=SimulationState.STATE_PAUSED if held else SimulationState.STATE_PLAYING)
+        answer = self._ask(SetSimulationState, "set_simulation_state", SetSimulationState.Request(state=state))
+        if answer.result.result not in (answer.result.RESULT_OK, SetSimulationState.Response.ALREADY_IN_TARGET_STATE):
+            raise InputError(str(answer.result.error_message))
+        self._live.know(held=held)
+
+    def pace(self, factor: float) -> None:
+        """Set the time master's ``speed_factor`` (errors as for `act`)."""
+        value = Parameter("speed_factor", value=factor).to_parameter_msg()
+        answer = self._ask(SetParameters, f"{self._master}/set_parameters", SetParameters.Request(parameters=[value]))
+        if not answer.results[0].successful:
+            raise InputError(str(answer.results[0].reason))
+        self._live.know(pace=factor)
+
+    def record(self, bag: str) -> None:
+        """Begin ``lathe record``; an empty text ends it.
+
+        Raises:
+            InputError: no name, or one of something that exists.
+        """
+        if bag:
+            refuse_existing(Path(bag))
+            words = [*allowed_code.interpreter("lathe_rc"), "record", bag]
+            self._recorder, self._bag = subprocess.Popen(words, stderr=subprocess.PIPE, text=True), bag
+            self._live.know(bag=bag)
+        elif self._recorder is None:
+            raise InputError("bag = ''; allowed: a name, for the folder of the bag")
+        else:
+            recorder, self._recorder = self._recorder, None
+            recorder.send_signal(signal.SIGINT)
+            _, said = recorder.communicate()
+            told = said.strip().rpartition("\n")[2] if recorder.returncode else f"recorded {self._bag}"
+            self._live.view.say(self._live.view.reached, "panel", told)
+            self._live.know(bag="")
 
     def close(self) -> None:
-        """End the thread and the node, without which the process would hang as it ends."""
+        """End the recording, the thread and the node, without which the process would hang as it ends."""
+        if self._recorder:
+            self.record("")
         self._over.set()
         self._thread.join()
         self._executor.shutdown()
@@ -93,10 +165,11 @@ def attach(scenario: Scenario, namespace: str, port: int, say: Callable[[str], o
     """
     words = ["--ros-args", "-r", f"__ns:={checked_namespace(namespace)}"]
     cell = Cell(scenario.nodes)
-    with standalone_node("panel", PanelParameters, {}, words, signals=SignalHandlerOptions.NO) as (node, _):
-        asking, live = _Asking(rclpy.create_node("panel_commands")), LivePanel()
+    with standalone_node(PANEL, PanelParameters, {}, words, signals=SignalHandlerOptions.NO) as (node, _):
+        live = LivePanel()
+        asking = _Asking(rclpy.create_node(PANEL_COMMANDS), cell, live)
         live.view.outlook = outlook(scenario)
-        site = panel.attached_site(live.view, cell, asking.act)
+        site = panel.attached_site(live.view, cell, asking)
         listener = Listener(node, live)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, listener.stop)

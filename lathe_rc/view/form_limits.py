@@ -50,11 +50,11 @@ def form_limits(
     amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
     order = int(np.argmax(amplitude[1:])) + 1
     left = ": what learning and its Q filter leave" if learning else ""
-    named = ", ".join(causes)
+    named, waves = ", ".join(causes), "wave" if order == 1 else "waves"
     parts = [
         (
             1.0 - share,
-            f"repeats from revolution to revolution, most at {order} waves a turn ({amplitude[order]:.3g} µm){left}",
+            f"repeats from revolution to revolution, most at {order} {waves} a turn ({amplitude[order]:.3g} µm){left}",
         ),
         (share, f"changes from revolution to revolution{': ' if named else ''}{named}"),
     ]

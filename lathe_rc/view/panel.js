@@ -10,6 +10,7 @@ const SAID = { safe: "safe (stopped, tool retracted)" };
 const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
+const cannot = () => ABOUT.cannot || {}; // why a button is of no use
 const escaped = text => String(text).replace(/[&<>"]/g, letter => `&#${letter.charCodeAt(0)};`);
 const digits = (value, count = 4) => Number.isFinite(value) ? String(Number(value.toPrecision(count))).replace("-", "−") : "–";
 const newton = (force, count) => digits(Math.abs(force) < 1e-3 ? 0 : force, count);
@@ -77,14 +78,14 @@ function draw(changed, moving = true) {
   $("state").textContent = `${now.state}, revolution ${revolution.toFixed(2)}${ABOUT.revolutions ? ` of ${digits(ABOUT.revolutions, 6)}` : ""}, ${(now.time || 0).toFixed(3)} s, sample ${now.sample || 0}` + (now.samples ? ` of ${now.samples}` : "")
     + (now.factor ? `, ${digits(now.factor, 2)} × real time` : "") + (now.bag ? `, recording ${now.bag}` : "");
   $("go").textContent = now.state == "running" ? "pause" : "start";
-  $("go").disabled = $("step").disabled = ["ended", "failed"].includes(now.state) && can("change");
+  for (const id of ["go", "step"]) $(id).disabled = id in cannot() || ["ended", "failed"].includes(now.state) && can("change");
   if (document.activeElement != $("pace")) $("pace").value = String(now.pace);
   if ($("seek").max != now.samples) $("seek").max = now.samples;
   if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
   drawSafety(now.safety);
-  $("limits").textContent = (now.limits || []).join(" ");
+  $("limits").textContent = (now.limits || []).join("\n");
   for (const place of document.querySelectorAll("[data-learning]")) {
     const found = JSON.parse(place.dataset.learning).map(topic => (now.learning || {})[topic]).filter(value => value !== undefined);
     place.textContent = [...new Set(found)].map(value => value ? "learning" : "frozen").join(", ");
@@ -387,7 +388,9 @@ function describe() { // fills the commands from what the cell tells of itself
   document.title = `${ABOUT.name}: panel`;
   $("name").textContent = ABOUT.name;
   $("commands").hidden = !can("command");
-  for (const id of ["change", "record", "repeat", "restart"]) $(id).hidden = !can("change");
+  for (const id of ["change", "repeat", "restart"]) $(id).hidden = !can("change");
+  $("record").hidden = !can("record");
+  for (const [id, why] of Object.entries(cannot())) $(id).title = why;
   for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
   $("seeking").hidden = !can("seek");
   for (const place of document.querySelectorAll(".of-part")) place.hidden = !ABOUT.part;

@@ -3,7 +3,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from lathe_rc import messages
 from lathe_rc.cell import ros_yaml
@@ -59,21 +59,55 @@ def player_site(driver: Driver, player: Player) -> Site:
     return Site({"": page()}, {**_watching(player.view), **_playing(driver), **answers})
 
 
-def attached_site(view: View, cell: Cell, act: Callable[[str, str], str]) -> Site:
+class Attached(Protocol):
+    """Commands to a cell that runs elsewhere.
+
+    Attributes:
+        cannot: why a button of the page is of no use, by its id.
+    """
+
+    cannot: Mapping[str, str]
+
+    def act(self, node: str, action: str) -> str:
+        """Ask a node for an event, and return it as in a scenario."""
+
+    def hold(self, *, held: bool) -> None:
+        """Pause the run, or let it go on."""
+
+    def pace(self, factor: float) -> None:
+        """Set the simulated seconds in a second; 0: as fast as possible."""
+
+    def record(self, bag: str) -> None:
+        """Begin to record into a bag; an empty text ends the recording."""
+
+
+def attached_site(view: View, cell: Cell, commands: Attached) -> Site:
     """Return the panel of a cell that runs elsewhere.
 
     Args:
         view: its view.
         cell: the cell of its scenario, for the choice of commands.
-        act: asks a node for an event, and returns it as in a scenario.
+        commands: commands to its nodes.
     """
 
     def acting(question: Mapping[str, Any]) -> object:
-        return {"text": act(_text(question, "node"), _text(question, "action"))}
+        return {"text": commands.act(_text(question, "node"), _text(question, "action"))}
+
+    def done(command: Callable[[Mapping[str, Any]], object]) -> Answer:
+        return lambda question: command(question) or {}
 
     nodes = [_node(stage) for stage in cell.stages.values()]
-    about = {**view.outlook, "can": ["command"], "nodes": nodes, "faults": _faults(), "parameters": []}
-    return Site({"": page()}, {**_watching(view), "about": lambda _: about, "act": acting})
+    can = {"can": ["run", "command", "record"], "cannot": commands.cannot}
+    about = {**view.outlook, **can, "nodes": nodes, "faults": _faults(), "parameters": []}
+    answers: dict[str, Answer] = {
+        "about": lambda _: about,
+        "act": acting,
+        "start": done(lambda _: commands.hold(held=False)),
+        "pause": done(lambda _: commands.hold(held=True)),
+        "pace": done(lambda question: commands.pace(_number(question, "factor"))),
+        "record": done(lambda question: commands.record(_text(question, "bag").strip())),
+    }
+    return Site({"": page()}, {**_watching(view), **answers})
 
 
 def _watching(view: View) -> dict[str, Answer]:
@@ -165,7 +199,7 @@ def about(cell: LiveCell) -> dict[str, Any]:
     """Return what does not change while a cell runs: its nodes, their events, knobs and faults, its parameters."""
     return {
         **cell.view.outlook,
-        "can": ["run", "command", "change"],
+        "can": ["run", "command", "change", "record"],
         "nodes": [_node(stage) for stage in cell.cell.stages.values()],
         "faults": _faults(),
         "parameters": [f"{node}.{name}" for node, table in cell.scenario.nodes.items() for name in table.rows()],

@@ -77,10 +77,23 @@ class LivePanel(LiveRuns):
     """
 
     def __init__(self) -> None:
-        super().__init__(lambda block, types: _Heard(self.view, block, types, self._status))
+        self._state, self._held = "waiting", False
+        self._known: dict[str, Any] = {"pace": None, "bag": ""}
+        super().__init__(self._heard)
         self.view = View({}, 0)
-        self.view.publish(self._status("waiting"))
+        self.know()
+
+    def _heard(self, block: Block, types: Mapping[str, str]) -> _Heard:
+        self._held, self._known["pace"] = False, None
+        return _Heard(self.view, block, types, self._status)
+
+    def know(self, *, held: bool | None = None, **known: float | str) -> None:
+        """Show what the messages of a run do not tell: whether it is ``held``, its ``pace``, the ``bag``."""
+        self._held = self._held if held is None else held
+        self._known |= known
+        self.view.publish(self._status(self._state), at_once=True)
 
     def _status(self, state: str) -> Mapping[str, Any]:
-        told = {"failure": "", "pace": 1.0, "factor": 0.0, "samples": 0, "bag": "", "events": "", "begun": 0}
-        return {"state": state, **told, "version": self.view.run}
+        self._state = state
+        told = {"failure": "", "factor": 0.0, "samples": 0, "events": "", "begun": 0, **self._known}
+        return {"state": "paused" if self._held and state == "running" else state, **told, "version": self.view.run}

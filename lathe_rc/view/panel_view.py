@@ -182,6 +182,11 @@ class View:
         return [row.revolution for row in self._rows]
 
     @property
+    def reached(self) -> int:
+        """Sample after the newest."""
+        return int(self._now.get("sample", 0))
+
+    @property
     def turns(self) -> float:
         """Spindle angle of the newest sample [revolution]."""
         return float(self._now.get("angle", 0.0)) / (2.0 * np.pi)
@@ -274,7 +279,7 @@ class View:
             self._limited.discard(node)
 
     def _limiting(self) -> list[str]:
-        """Return what limits the form error, in sentences; nothing while the supervisor holds the tool out."""
+        """Return what limits the form error, in sentences."""
         rows = self._newest[-LAST:]
         if self._limits[0] != len(self._history) and rows:
             tolerance = self.outlook.get("tolerance")
@@ -284,7 +289,8 @@ class View:
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
-            self._limits = len(self._history), [] if any(row.out for row in rows) else [each.text for each in found]
+            out = ["The supervisor held the tool out of the part in the last revolutions."]
+            self._limits = len(self._history), out if any(row.out for row in rows) else [each.text for each in found]
         return [*(f"{node} is at the limits of its command." for node in sorted(self._limited)), *self._limits[1]]
 
     def say(self, sample: int, source: str, text: str) -> None:
@@ -302,14 +308,13 @@ class View:
         if not at_once and now < self._due:
             return
         self._due = now + PERIOD
-        number = self.latest.number + 1 if self.latest else 1
-        scale = self._scale.deviation / 1e3 if self._scale else 1.0
-        current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting()}
-        latest = Snapshot(
-            number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
-        )
         with self._news:
-            self.latest = latest
+            number = self.latest.number + 1 if self.latest else 1
+            scale = self._scale.deviation / 1e3 if self._scale else 1.0
+            current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting()}
+            self.latest = Snapshot(
+                number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
+            )
             self._news.notify_all()
 
     # ---- readers ------------------------------------------------------------------------------------

@@ -14,11 +14,13 @@ from urllib.parse import urlsplit
 
 import pytest
 
+import lathe_rc
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
 from lathe_rc.view.page_server import TOKEN
 from lathe_rc.view.panel_view import Have
 
+HELD = ["spindle_encoder.simulation_services=playing"]
 SUPERVISED = Path(__file__).parents[2] / "config" / "supervised.yaml"
 
 
@@ -47,7 +49,7 @@ class Asked:
 
 @pytest.fixture
 def attached(domain):
-    words = [sys.executable, "-m", "lathe_rc", "panel", "supervised", "--attach", "--no-browser"]
+    words = [sys.executable, "-m", "lathe_rc", "panel", "supervised", "--attach", "--no-browser", "--set", *HELD]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         yield Asked(process.stdout.readline())
         process.send_signal(signal.SIGINT)
@@ -74,3 +76,33 @@ def test_a_running_cell_is_shown_and_broken_from_the_page(attached, domain):
     assert len(last["history"]) > 20
     again = load(SUPERVISED, ["spindle_encoder.revolutions=60", f"spindle_encoder.events={json.dumps([told['text']])}"])
     assert found[0].digest == harness.run(again).digest
+
+
+@pytest.mark.system
+def test_a_running_cell_is_paced_paused_and_recorded_from_the_page(attached, domain, tmp_path):
+    """While it is held, no sample is computed; pace and pause change no digest."""
+    given = ["spindle_encoder.revolutions=40", "spindle_encoder.speed_factor=0.2", *HELD]
+    found = []
+    running = threading.Thread(
+        target=lambda: found.append(harness.run(load(SUPERVISED, given), mode="composed", domain=domain)), daemon=True
+    )
+    running.start()
+    attached.until(lambda told: told["now"].get("angle", 0.0) > 20.0)
+    assert "step" in attached.ask("about")[1]["cannot"]
+    assert attached.ask("record", bag=str(tmp_path / "bag"))[0] == 200
+    assert attached.ask("pause") == (200, {})
+    attached.until(lambda told: told["now"]["state"] == "paused")
+    event = {"node": "learning_controller", "action": "learn"}
+    _, told = attached.ask("act", **event)
+    assert attached.ask("pace", factor=-1.0)[0] == 400
+    assert attached.ask("pace", factor=0.5) == (200, {})
+    assert attached.until(lambda told: told["now"]["pace"] == 0.5)["now"]["state"] == "paused"
+    assert attached.ask("act", **event) == (200, told)  # the first sample not computed is the same
+    assert attached.ask("start") == (200, {})
+    attached.until(lambda told: told["now"].get("angle", 0.0) > 180.0)
+    assert attached.ask("record", bag="") == (200, {})
+    running.join()
+    attached.until(lambda told: told["now"]["state"] == "ended")
+    events = f"learning_controller.events={json.dumps(2 * [told['text']])}"
+    assert found[0].digest == harness.run(load(SUPERVISED, [*given, events])).digest
+    assert lathe_rc.read_bag(tmp_path / "bag").dense["/tool"]["error"].size > 0
