@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from lathe_papers import marks
 from lathe_papers.formulas.responses import Response, in_series
 from lathe_papers.formulas.structures import limit_frequency, uncompensated
 from lathe_papers.formulas.tuning import FREQUENCIES, START
@@ -98,10 +99,9 @@ for amplitude in (1 / 10, 1 / 3, 1.0):
 figure = Figure(figsize=(11, 3.6), layout="constrained")
 by_frequency, by_band = figure.subplots(1, 2)
 frequency = np.geomspace(10.0, 4000.0, 800)
-colours = ("#1f6f8b", "#c0392b", "#8e7cc3")
-for (name, response), colour in zip(compensators.items(), colours, strict=True):
-    by_frequency.loglog(frequency, np.abs(uncompensated(response(frequency * HERTZ))), color=colour, label=name)
-    by_band.loglog(frequency, [reduction(response, band * HERTZ) for band in frequency], color=colour, label=name)
+for k, (name, response) in enumerate(compensators.items()):
+    by_frequency.loglog(frequency, np.abs(uncompensated(response(frequency * HERTZ))), label=name, **marks.curve(k))
+    by_band.loglog(frequency, [reduction(response, band * HERTZ) for band in frequency], label=name, **marks.curve(k))
 by_frequency.loglog(frequency, np.abs(uncompensated(mounted(frequency * HERTZ))), color="#999999", label="m/M = 0.1")
 by_frequency.axhline(1.0, color="black", lw=0.6)
 by_frequency.set(xlabel="frequency [Hz]", ylabel="|1 − Wpk|", ylim=(1e-3, 5))

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_papers import cells, sweeps
-from lathe_papers.speed_deviation import COLOURS, SpeedDeviationParameters, settings
+from lathe_papers import cells, marks, sweeps
+from lathe_papers.speed_deviation import LAWS, SpeedDeviationParameters, settings
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -150,22 +150,24 @@ class BestLawResult:
             for law in self.rivals:
                 here = of & (best == law)
                 if here.any():
-                    name = law.replace("_", " ")
+                    mark = marks.point(LAWS.index(law))
                     upper[place].scatter(
-                        self.frequency[here], self.amplitude[here] * 100.0, s=9, color=COLOURS[law], label=name
+                        self.frequency[here], self.amplitude[here] * 100.0, s=12, label=law.replace("_", " "), **mark
                     )
             upper[place].set(xscale="log", xlabel="frequency of the deviation [rad/s]", ylabel="deviation [%]")
             upper[place].set_title(f"the best law, {counts:,} counts", fontsize=10)
             upper[place].set_ylim(0.0, 135.0 * self.parameters.largest_deviation)  # room for the legend
             upper[place].legend(fontsize=6, loc="upper left")
-            shown = lower[place].scatter(
-                self.noise[of], 100.0 * (self.model[of] - 1.0), c=np.clip(ratio[of], -1.5, 1.5), s=9, cmap="RdYlGn",
-                vmin=-1.5, vmax=1.5,
-            )  # fmt: skip
+            for better, marker in ((True, "^"), (False, "v")):
+                here = of & ((ratio > 0.0) == better)
+                shown = lower[place].scatter(
+                    self.noise[here], 100.0 * (self.model[here] - 1.0), c=np.clip(ratio[here], -1.5, 1.5), s=14,
+                    marker=marker, cmap="RdBu", vmin=-1.5, vmax=1.5, edgecolors="0.4", linewidths=0.3,
+                )  # fmt: skip
             lower[place].set(xscale="log", xlabel="noise [nm]", ylabel="error of the model's ωn [%]")
             lower[place].set_title("adaptive inverse against variable lead", fontsize=10)
         bar = figure.colorbar(shown, ax=lower.tolist(), ticks=[-1, 0, 1], shrink=0.9)
-        bar.ax.set_yticklabels(["10 times worse", "equal", "10 times better"], fontsize=7)
+        bar.ax.set_yticklabels(["▼ 10 times worse", "equal", "▲ 10 times better"], fontsize=7)
 
 
 def _base() -> Scenario:

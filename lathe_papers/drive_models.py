@@ -15,6 +15,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
+from lathe_papers import marks
 from lathe_papers.formulas.responses import smoothing
 from lathe_papers.formulas.step_fit import (
     Delay,
@@ -173,15 +174,13 @@ class DriveModelsResult:
     def draw(self, figure: "Figure") -> None:
         """Draw Fig. 4 of the paper with the fits, and Q - Z of each model."""
         steps, learning = figure.subplots(1, 2)
-        steps.plot(self.measured.time * 1e3, self.measured.response, color="k", lw=2.5, label="measured")
-        colours = ("#c0392b", "#e08e0b", "#7b5ea7", "#1f6f8b")
-        fits = [candidate for candidate in self.candidates if candidate.fitted]
-        for candidate, colour in zip(fits, colours, strict=True):
+        steps.plot(self.measured.time * 1e3, self.measured.response, color="0.7", lw=3.5, label="measured")
+        for k, candidate in enumerate(candidate for candidate in self.candidates if candidate.fitted):
             label = f"{candidate.name}: {candidate.words()}"
             response = candidate.model.step(self.measured.time)
-            steps.plot(self.measured.time * 1e3, response, color=colour, lw=1.2, label=label)
+            steps.plot(self.measured.time * 1e3, response, lw=1.2, label=label, **marks.curve(k))
             worst = f"{candidate.name}: sup {candidate.supremum:.3g}"
-            learning.semilogx(self.frequency, candidate.factor, color=colour, label=worst)
+            learning.semilogx(self.frequency, candidate.factor, label=worst, **marks.curve(k))
         steps.set(xlabel="time since the step [ms]", ylabel="step response")
         learning.axhline(1.0, color="k", lw=0.8)
         learning.axvline(self.harmonic, color="k", lw=0.8, ls=":")

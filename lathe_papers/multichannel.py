@@ -13,7 +13,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_papers import cells
+from lathe_papers import cells, marks
 from lathe_papers.formulas.structures import contraction, direct_compensation, iterative, supremum
 from lathe_papers.formulas.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, Tuning
 from lathe_rc import messages
@@ -31,7 +31,6 @@ SCENARIOS = ("one_channel", "direct_compensation", "two_coarse", "two_channel") 
 _TUNINGS = {"none": PLAIN, "lead_lag": LEAD_LAG}
 _SLOWEST = 500.0  # [rad/s] approximate spindle speed: the frequencies of the table are its first four harmonics
 _AMPLITUDE = 10e-6  # [m], within the stroke of the piezo
-_COLOURS = ("#c0392b", "#e08e0b", "#7d3c98", "#1f6f8b")
 
 
 class MultichannelParameters(StudyParameters):
@@ -111,10 +110,10 @@ class MultichannelResult:
         frequency = np.geomspace(min(self.parameters.omega) / 2, max(self.parameters.omega) * 2, 400)
         smooth = np.abs(analytic(_TUNINGS[self.parameters.correction], frequency))
         for row, name in enumerate(ROWS):
-            colour = _COLOURS[row]
-            axes.loglog(frequency, smooth[row], color=colour, lw=1.2, label=f"{name}: formula")
-            axes.loglog(self.parameters.omega, self.simulated[row], "o", color=colour, ms=5, label="  simulated")
-            axes.loglog(self.parameters.omega, self.printed[row], "x", color="black", ms=7)
+            mark = marks.point(row)
+            axes.loglog(frequency, smooth[row], color=mark["color"], lw=1.2, label=f"{name}: formula")
+            axes.loglog(self.parameters.omega, self.simulated[row], ls="", ms=6, label="  simulated", **mark)
+            axes.loglog(self.parameters.omega, self.printed[row], "x", color="black", ms=9)
         axes.plot([], [], "x", color="black", label="printed in paper 001")
         axes.set(xlabel="frequency of the profile [rad/s]", ylabel="steady error of a unit harmonic")
         axes.grid(visible=True, which="both", alpha=0.25)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from lathe_papers import marks
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import Measures
 from lathe_papers.sampled_servo_numbers import DESIRED, numbers, stable
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 _SHOWN = 1.2  # time span of the step responses [s]
-_COLOURS = ("#1f6f8b", "#e08e0b", "#c0392b", "#4a8f3c")
 
 
 def _line(found: Sequence[Measures | None]) -> Array:
@@ -48,31 +48,31 @@ def _middle(result: "SampledServoNumbers") -> int:
 
 def _draw_steps(result: "SampledServoNumbers", axes: "Axes") -> None:
     axes.plot(*result.analog, ":", color="black", label="analog")
-    for (name, rows), colour in zip(result.all_links(), _COLOURS[1:], strict=True):
+    for k, (name, rows) in enumerate(result.all_links(), start=1):
         step = rows[_middle(result)].step
         if step is not None:
-            axes.plot(step.time, step.motor, color=colour, label=f"link: {name}")
-            axes.plot(*step.at_samples, "o", ms=4, color=colour)
+            axes.plot(step.time, step.motor, color=marks.COLOURS[k])
+            axes.plot(*step.at_samples, ls="", ms=4, label=f"link: {name}", **marks.point(k))
     axes.set(xlim=(0.0, _SHOWN), xlabel="time [s]", ylabel="position / step")
     period = result.parameters.t[_middle(result)]
-    axes.set_title(f"Fig. 2: step responses, T = {period:g} s; dots at the samples", fontsize=10)
+    axes.set_title(f"Fig. 2: step responses, T = {period:g} s; marks at the samples", fontsize=10)
 
 
 def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> None:
     design = result.uncorrected[_middle(result)].design
     frequency = design.frequency
     drive = design.drive
-    curves = [("Lp, no link", sampled_loop.pseudo_frequency(drive).response(frequency), "black")]
-    for number, (function, colour) in enumerate(zip(DESIRED, _COLOURS, strict=False), start=1):
+    curves = [("Lp, no link", sampled_loop.pseudo_frequency(drive).response(frequency))]
+    for number, function in enumerate(DESIRED, start=1):
         note = "" if stable(function) else " (unstable)"
-        curves.append((f"Lж{number}, T = 0.16 s{note}", function.response(frequency), colour))
+        curves.append((f"Lж{number}, T = 0.16 s{note}", function.response(frequency)))
     ripple_free_loop = sampled_loop.open_loop(drive, ripple_free(drive))
-    curves.append(("ripple-free link", np.asarray(ripple_free_loop(1j * frequency)), _COLOURS[3]))
-    for label, response, colour in curves:
+    curves.append(("ripple-free link", np.asarray(ripple_free_loop(1j * frequency))))
+    for k, (label, response) in enumerate(curves):
         # Each phase starts at -90° because of the integrator.
         angle = np.degrees(np.unwrap(np.angle(1j * response))) - 90.0
-        gain.semilogx(frequency, 20.0 * np.log10(np.abs(response)), color=colour, label=label)
-        phase.semilogx(frequency, angle, color=colour, label=label)
+        gain.semilogx(frequency, 20.0 * np.log10(np.abs(response)), label=label, **marks.curve(k))
+        phase.semilogx(frequency, angle, label=label, **marks.curve(k))
     gain.axhline(0.0, color="black", lw=0.6)
     phase.axhline(-180.0, color="black", lw=0.6)
     gain.set(xlabel="pseudo-frequency λ [rad/s]", ylabel="open loop [dB]")
@@ -82,7 +82,7 @@ def _draw_bode(result: "SampledServoNumbers", gain: "Axes", phase: "Axes") -> No
 
 
 def _draw_table(result: "SampledServoNumbers", overshoot: "Axes", settling: "Axes") -> None:
-    for half, colour in zip(sorted({row.half_period for row in result.rows}), _COLOURS * 10, strict=False):
+    for half, colour in zip(sorted({row.half_period for row in result.rows}), marks.COLOURS * 10, strict=False):
         rows = [row for row in result.rows if row.half_period == half]
         ratios = [row.ratio for row in rows]
         for place, axes in ((0, overshoot), (1, settling)):
@@ -103,7 +103,8 @@ def _draw_table(result: "SampledServoNumbers", overshoot: "Axes", settling: "Axe
 
 
 def _draw_gap(result: "SampledServoNumbers", axes: "Axes") -> None:
-    for (name, label), colour in zip((("paper", "paper's"), ("ripple_free", "ripple-free")), _COLOURS[2:], strict=True):
+    links = (("paper", "paper's"), ("ripple_free", "ripple-free"))
+    for (name, label), colour in zip(links, marks.COLOURS[2:], strict=False):
         row = result.links[name][_middle(result)]
         for step, style, place in ((row.load, "-", "load"), (row.motor, "--", "motor")):
             if step is not None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
-from lathe_papers import cells
+from lathe_papers import cells, marks
 from lathe_rc import messages
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -29,19 +29,18 @@ Overrides = Mapping[str, object]
 _CYCLES = 50  # learning cycles at constant speed
 _SHOWN = 1.0  # [s] duration of the deviation, at least 1.5 periods
 _DYNAMIC = "second_order_inverse_dynamic"
-COLOURS = {
-    "time_periodic": "#7f7f7f",
-    "constant_lead": "#c0392b",
-    "variable_lead": "#e08e0b",
-    "variable_lead_second_order": "#6e2c00",
-    "second_order_inverse": "#7d3c98",
-    "second_order_inverse_dynamic": "#2874a6",
-    "exact_preview": "#148f77",
-    "exact_invariance": "#73c6b6",
-    "adaptive_inverse": "#111111",
-    "disturbance_controller": "#1e8449",
-}
-LAWS = tuple(COLOURS)
+LAWS = (
+    "time_periodic",
+    "constant_lead",
+    "variable_lead",
+    "variable_lead_second_order",
+    "second_order_inverse",
+    "second_order_inverse_dynamic",
+    "exact_preview",
+    "exact_invariance",
+    "adaptive_inverse",
+    "disturbance_controller",
+)
 OURS = "disturbance_controller"  #: last of the laws, a separate stage in a separate cell
 _TRACES = ("constant_lead", "variable_lead", "adaptive_inverse", OURS)
 
@@ -125,20 +124,20 @@ class SpeedDeviationResult:
         for axes, (place, wd) in zip(panels, shown, strict=True):
             for law in _TRACES:
                 turns, error = self.traces[law][place]
-                axes.plot(turns, error, color=COLOURS[law], lw=0.8, label=law.replace("_", " "))
+                axes.plot(turns, error, lw=0.8, color=marks.COLOURS[LAWS.index(law)])
             axes.set(xlabel="revolutions since the deviation began", ylabel="form error [µm]")
             axes.set_title(f"deviation at {wd:g} rad/s", fontsize=10)
         order = np.argsort(given.wd)
-        for law in LAWS:
+        for number, law in enumerate(LAWS):
             overview.loglog(
-                np.array(given.wd)[order], np.array(self.largest[law])[order], ".-", color=COLOURS[law],
-                label=law.replace("_", " "), lw=1.0,
+                np.array(given.wd)[order], np.array(self.largest[law])[order], lw=1.0, ms=4, **marks.point(number),
+                label=law.replace("_", " "),
             )  # fmt: skip
         overview.set(xlabel="frequency of the deviation [rad/s]", ylabel="largest form error [µm]")
         overview.set_title(f"all laws, {given.protocol}", fontsize=10)
         for axes in (*panels, overview):
             axes.grid(visible=True, alpha=0.3)
-            axes.legend(fontsize=6)
+        figure.legend(*overview.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
 
 
 def _figure(value: float) -> str:

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import termios
+from pathlib import Path
 
 import pytest
 from cells import run
@@ -101,6 +102,18 @@ def test_the_tolerance_is_drawn_on_its_side_of_a_power_of_ten(tolerance, above):
     label = next(k for k, line in enumerate(lines) if line.lstrip().startswith("1┤"))
     assert (drawn < label) == above
     assert drawn != label
+
+
+def test_a_pipe_cuts_no_column_of_any_command(monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    names = ["first" * 12, "second" * 12]
+    table = tables.table(*names)
+    table.add_row(*names)
+    tables.console().print(table)
+    told = capsys.readouterr().out
+    assert [told.count(name) for name in names] == [2, 2]
+    others = [path.name for path in Path(tables.__file__).parent.glob("*.py") if "Console()" in path.read_text()]
+    assert not others, "each command prints with tables.console"
 
 
 def test_headings_that_do_not_fit_break_after_dots_and_underscores():

@@ -29,7 +29,7 @@ from lathe_rc.commands.report import report
 from lathe_rc.errors import InputError
 from lathe_rc.view import charts
 from lathe_rc.view import report as reporting
-from lathe_rc.view.report_figures import colour_range, spectrum_range, timing
+from lathe_rc.view.report_figures import against_time, colour_range, spectrum_range, timing
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS, Host
@@ -114,6 +114,12 @@ class TestPage:
         assert page.count(command) == 1
         assert page.count("See docs/") >= page.count("<figure>") + page.count("<table>")
         assert page.count("docs/metrology.md") >= 5
+
+    def test_the_axis_of_a_constant_signal_has_several_ticks(self):
+        constant = Envelope()
+        constant.add(np.full(8, 1000.0))
+        spec = against_time(SimpleNamespace(at=np.asarray), {"/encoder": constant}, "speed", 1.0)
+        assert spec["encoding"]["y"]["scale"]["domain"] == [500.0, 1500.0]
 
     def test_a_constant_signal_is_a_sentence(self, turned):
         """As a figure it was a line along an axis with a single number."""

@@ -73,10 +73,8 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
 
 
 def _show(shown: Demo, revolutions: float, folder: Path) -> None:
-    from rich.console import Console
-
     from lathe_rc import harness
-    from lathe_rc.commands import outcome, picture, plot, running
+    from lathe_rc.commands import outcome, picture, plot, running, tables
     from lathe_rc.commands import scenario as scenarios
 
     number = 1
@@ -85,8 +83,8 @@ def _show(shown: Demo, revolutions: float, folder: Path) -> None:
     place = folder / f"demo-{number}"
     length = f"spindle_encoder.revolutions={revolutions!r}"
     scenario = scenarios.load(shown.scenario, [*shown.overrides, length])
-    console = Console()
-    console.print(shown.announcement, highlight=False)
+    console = tables.console(soft_wrap=False)
+    console.print(shown.announcement)
     folder.mkdir(parents=True, exist_ok=True)
     result = running.watched(scenario, mode="processes", bag=place)
     beside = None
@@ -98,8 +96,8 @@ def _show(shown: Demo, revolutions: float, folder: Path) -> None:
     console.print(outcome.table(result))
     plot.show(result, console)
     if beside:
-        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}", highlight=False)
+        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}")
     for fact in outcome.facts(result):
-        console.print(fact, highlight=False)
+        console.print(fact)
     ends = {"bag": place, "figure": drawn, "page": f"lathe report {place}", "view": f"lathe view {place}"}
-    console.print("\n".join(f"{name + ':':8}{end}" for name, end in ends.items()), highlight=False, soft_wrap=True)
+    console.print("\n".join(f"{name + ':':8}{end}" for name, end in ends.items()), soft_wrap=True)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from lathe_rc import part
@@ -108,10 +107,10 @@ def measure(
         }
         click.echo(json.dumps(summary))
         return
-    console = Console()
+    console = tables.console(soft_wrap=False)
     console.print(table(found, chosen))
     if surface:
         text = part.along_in_words(surface) if isinstance(surface, Lay) else surface
-        console.print(text, highlight=False, soft_wrap=True)
+        console.print(text, soft_wrap=True)
     if profile:
-        console.print(f"profile: {profile}", highlight=False, soft_wrap=True)
+        console.print(f"profile: {profile}", soft_wrap=True)

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from itertools import groupby
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -91,15 +90,15 @@ def show_budget(found: Budget) -> None:
     whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
     for each in (*found.rows, whole):
         lines.add_row(each.name, each.percent(), f"{each.rms * 1e6:.3g}", f"{each.largest * 1e6:.3g}")
-    console = Console()
+    console = tables.console(soft_wrap=False)
     console.print(lines)
     for name, why in found.left_out.items():
-        console.print(f"not switched off: {name}: {why}", highlight=False)
+        console.print(f"not switched off: {name}: {why}")
 
 
 def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "", budget: Budget | None = None) -> None:
     """Print the result of a run: part, events, facts, budget and files; ``note``: an additional line."""
-    console = Console()
+    console = tables.console(soft_wrap=False)
     if result.errors.rms.size:
         console.print(table(result))
         plot.show(result, console)
@@ -109,10 +108,10 @@ def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "",
     if result.event_log:
         console.print(_events(result))
     for fact in [*facts(result), *filter(None, [note])]:
-        console.print(fact, highlight=False)
+        console.print(fact)
     if budget is not None:
         show_budget(budget)
     files = [("bag", result.bag), *(("snapshot", path) for path in result.snapshots), *further.items()]
     for name, path in files:
         if path:
-            console.print(f"{name}: {path}", highlight=False, soft_wrap=True)
+            console.print(f"{name}: {path}", soft_wrap=True)

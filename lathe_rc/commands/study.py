@@ -14,7 +14,7 @@ from rich.progress import Progress
 from lathe_rc import allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
-from lathe_rc.commands import completers, options, picture
+from lathe_rc.commands import completers, options, picture, tables
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 from lathe_rc.study import STUDIES, Result, Study, StudyParameters
@@ -112,9 +112,9 @@ class _StudyCommand(click.Command):
         if as_json:
             click.echo(json.dumps({**result.to_json(), "figure": str(figure)}, allow_nan=False))
             return
-        out = Console()
+        out = tables.console(soft_wrap=False)
         out.print(result.table())
-        out.print(f"figure: {figure}", highlight=False, soft_wrap=True)
+        out.print(f"figure: {figure}", soft_wrap=True)
 
 
 class _Studies(click.Group):

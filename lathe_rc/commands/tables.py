@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables and text lines for the terminal."""
 
+import os
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -11,11 +12,21 @@ from rich.table import Table
 from rich.text import Text
 
 _HEADING = 13  # characters of a line of a broken heading
+_UNBOUNDED = 10_000  # [characters] width of an output that is no terminal
 
 
-def console() -> Console:
-    """Return a console for standard output, without highlighting, markup or line wrapping, which would split paths."""
-    return Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
+def console(*, soft_wrap: bool = True) -> Console:
+    """Return a console for standard output, without highlighting, markup or line wrapping, which would split paths.
+
+    A pipe or a file has no width, unless COLUMNS gives one: no column is cut there, and no line broken.
+
+    Args:
+        soft_wrap: leave the wrapping of lines of text to the terminal; otherwise they are wrapped between words.
+    """
+    out = Console(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
+    if not out.file.isatty() and "COLUMNS" not in os.environ:
+        out.width = _UNBOUNDED
+    return out
 
 
 def spread(whole: int, count: int = 10) -> list[int]:

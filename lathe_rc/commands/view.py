@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.beside import RERUN_PORT, RERUN_RATE, RerunOutput
@@ -84,6 +83,6 @@ def view(
     elif output:
         write(bag, output, rate=rate)
         size = output.stat().st_size
-        Console().print(f"view: {output} ({size / 1e6:.1f} MB)", highlight=False, soft_wrap=True)
+        click.echo(f"view: {output} ({size / 1e6:.1f} MB)")
     else:
         _show(bag, rate, viewer("serve" if web else "spawn", port))

@@ -353,6 +353,12 @@ def _lines(
             {"data": data_, "mark": rule, "encoding": {"x": {"value": 0}, "x2": end, **where}},
             {"data": data_, "mark": text, "encoding": {"x": end, "text": {"field": "t"}, **where}},
         ]
+    values = [row[end] for row in data for end in "ab" if row[end] is not None]
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    ends: tuple[float, ...] = ()
+    if almost_equal(low, high):  # an axis from one number to the same would have a single tick
+        margin = 0.5 * (abs(low) or 1.0)
+        ends = (low - margin, high + margin)
     axis = {"format": ".4~g", "tickCount": 5}
     places = {label: colour for label, (_, colour, _) in curves.items()}
     return figure(
@@ -361,7 +367,7 @@ def _lines(
         transform=[{"calculate": "sqrt(datum.a * datum.b)" if log else "(datum.a + datum.b) / 2", "as": "m"}],
         encoding={
             "x": quantity("u", across, scale=axis_scale(), axis={"grid": False, "format": "~r", "tickCount": 12}),
-            "y": {"type": "quantitative", "title": up, "scale": axis_scale(log=log), "axis": axis},
+            "y": {"type": "quantitative", "title": up, "scale": axis_scale(log=log, ends=ends), "axis": axis},
             "color": colours(places, legend=len(places) > 1),
         },
         layer=layer,

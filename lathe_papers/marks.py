@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marks of the figures that compare several things: each has a marker beside its colour; laws in words.
+
+The colours are those of Okabe and Ito, which most colour-blind people can distinguish; yellow is replaced by brown.
+"""
+
+from typing import Any
+
+COLOURS = (
+    "#0072b2", "#d55e00", "#000000", "#e69f00", "#56b4e9", "#009e73", "#cc79a7", "#6e2c00", "#9467bd", "#7f7f7f",
+)  # fmt: skip
+_MARKERS = "osD^v<>PX*"
+
+#: laws of the comparisons by their names in the tables
+LAWS = {
+    "000": "000: lead and Q of paper 000",
+    "001": "001: lead and Q of paper 001",
+    "lead": "lead: lead and flat Q for this part",
+    "adapt.": "adapt.: adaptive inverse",
+    "comp.": "comp.: feed-forward and PID",
+    "told": "told: comp. that knows each drive",
+    "AFC": "AFC: resonators over the angle",
+    "DOB": "DOB: disturbance observer only",
+    "ADRC": "ADRC: extended state observer",
+    "norm.": "norm.: norm-optimal learning",
+    "ours": "ours: disturbance_controller",
+}
+
+
+def point(number: int) -> dict[str, Any]:
+    """Return colour and marker of the points of one of several things, counted from 0."""
+    return {"color": COLOURS[number % len(COLOURS)], "marker": _MARKERS[number % len(_MARKERS)]}
+
+
+def curve(number: int) -> dict[str, Any]:
+    """Return colour and marker of a curve; the markers are spread over its length, those of neighbours apart."""
+    return {**point(number), "ms": 4, "markevery": (0.02 + 0.03 * (number % 4), 0.12)}
