@@ -9,11 +9,13 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 
 from lathe_rc import harness, messages
@@ -26,8 +28,17 @@ from lathe_rc.cell.wiring import Cell, Unknown
 Values = Mapping[str, Any]
 
 SCENARIOS = sorted((Path(__file__).parents[1] / "config").glob("*.yaml"))  #: that come with lathe_rc
+#: those that together have every kind of node and of signal that the others have
+EVERY_KIND = ("gauged", "loaded_cutting", "periodic", "piston", "series", "supervised_full_cell", "vibration")
 STEP = 15_625  #: [ns] of the smallest whole cell
 NODES = ("spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool")
+PATIENCE = 120.0  #: [s] with which a test waits, also on a busy machine whose kernels are not compiled yet
+
+
+def every_scenario() -> list[Any]:
+    """Parameters of a test of all scenarios; those that add no kind of node or of signal are marked `system`."""
+    more = pytest.mark.system
+    return [pytest.param(path, id=path.stem, marks=() if path.stem in EVERY_KIND else more) for path in SCENARIOS]
 
 
 def scenario(shared: Values | None = None, **nodes: Values) -> Scenario:
@@ -79,6 +90,15 @@ def assert_resimulated(bag: Path) -> None:
     """A re-simulation of a bag gives all of its signals to the bit."""
     found = resimulate(bag)
     assert (found.changed, found.different, found.missing) == (False, [], [])
+
+
+def until(what: Callable[[], Any], look: Callable[[], object] = lambda: time.sleep(0.01)) -> Any:
+    """Wait until ``what()`` is true, and return it; ``look()`` is called in between, as what spins a node."""
+    deadline = time.monotonic() + PATIENCE
+    while not (found := what()):
+        assert time.monotonic() < deadline, f"waited for {PATIENCE:g} s in vain"
+        look()
+    return found
 
 
 def told_until_all_have_ended(processes: harness.Processes) -> list[harness.Event]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings that all tests share."""
 
+import faulthandler
 import gc
 import signal
 import sys
@@ -8,11 +9,15 @@ from collections import Counter
 
 import pytest
 import rclpy
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import HealthCheck, settings
 
 import slow_tests
 from lathe_rc import allowed_code, harness, process_launcher
 from lathe_rc.nodes import dds
+
+# Jsonschema, which Altair imports, would compile a grammar with it for 2 s in each worker.
+sys.modules["rfc3987_syntax"] = None
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
 settings.register_profile(
@@ -57,6 +62,21 @@ def pytest_runtest_makereport(item, call):
         _started.clear()
 
 
+def _bounded(item):
+    """End a worker that hangs beyond the timeout of its test, where no signal gets through or in what cleans up."""
+    marked = item.get_closest_marker("timeout")
+    seconds = float(marked.args[0] if marked else item.config.getini("timeout"))
+    faulthandler.dump_traceback_later(seconds + 120.0, file=item.config.stash[fault_handler_stderr_fd_key], exit=True)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+# Again before the clean-up: pytest cancels it when a test fails.
+pytest_runtest_protocol = pytest_runtest_teardown = pytest.hookimpl(wrapper=True)(_bounded)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
     """The collected tests stay to the end: freeze them, so that the garbage collector skips them."""
@@ -68,11 +88,25 @@ def pytest_collection():
         gc.enable()
 
 
+_ended_a_worker = []  # tests; the worker in its place would run them again
+
+
+def pytest_handlecrashitem(crashitem):
+    _ended_a_worker.append(crashitem)
+
+
+def pytest_configure_node(node):
+    node.workerinput["skipped"] = list(_ended_a_worker)
+
+
 def pytest_collection_modifyitems(config, items):
     """On a worker, files that take long come first: else one of them would be the last, with nothing beside it."""
     if hasattr(config, "workerinput"):
         shares = slow_tests.shares()
         items.sort(key=lambda item: -shares.get(item.path.stem, 0.0))
+        for item in items:
+            if item.nodeid in config.workerinput["skipped"]:
+                item.add_marker(pytest.mark.skip("it has ended a worker"))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from cells import Seen, held, scenario
+from cells import Seen, held, scenario, until
 
 pytest.importorskip("rclpy")
 
@@ -63,6 +63,7 @@ def refuses(event, text):
     return event["event"] == "foreign_message" and event["message"].startswith(text)
 
 
+@pytest.mark.system
 def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_path):
     """Listeners, deaf ones too, a default publisher, a namesake, a late recorder and a second spindle change no bit.
 
@@ -78,8 +79,7 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
     with held(recorded, domain) as (processes, begin), subprocess.Popen(deaf, stdout=subprocess.PIPE) as listener:
         manager.processes, seen = processes, Seen(processes)
         assert listener.stdout.readline() == b"matched\n"
-        while not ear.get_publisher_count():
-            pass
+        until(ear.get_publisher_count)
         assert not manager.change("electrodynamic_actuator", Transition.TRANSITION_ACTIVATE), "from now on it answers"
         begin()
         seen.until(lambda events: any(each.get("samples", 0) > full for each in events if each["event"] == "progress"))
@@ -99,8 +99,8 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
         ghost.create_subscription(SafetyStatus, "/safety/status", lambda told: heard.update(alarm=told), latched_qos(1))
         executor = SingleThreadedExecutor()
         executor.add_node(ghost)
-        while not (blocks and heard.keys() >= {"state", "alarm", *(f"/{name}" for name in recorded.nodes)}):
-            executor.spin_once(timeout_sec=1.0)
+        late = {"state", "alarm", *(f"/{name}" for name in recorded.nodes)}
+        until(lambda: blocks and heard.keys() >= late, lambda: executor.spin_once(timeout_sec=1.0))
         executor.shutdown()
         assert manager.change("electrodynamic_actuator", Transition.TRANSITION_ACTIVATE)
         processes.wait_for_end()

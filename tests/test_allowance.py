@@ -3,9 +3,6 @@
 
 import numpy as np
 import pytest
-from cells import cuts
-from hypothesis import given
-from hypothesis import strategies as st
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose
 
@@ -63,13 +60,6 @@ def test_run_out_turns_with_the_spindle_and_adds_to_the_walk():
     run_out = 30e-6 * np.sin(angle + 0.4) + 5e-6 * np.sin(3 * angle - 1.0)
     assert_allclose(draw(make(STILL, *orders), angle), run_out, atol=1e-18)
     assert_allclose(draw(make(walk, *orders), angle), draw(make(walk), angle) + run_out)
-
-
-@given(cuts, st.integers(0, 2**31))
-def test_cuts_change_nothing(lengths, seed):
-    angle = np.arange(sum(lengths)) * 1e-3
-    one, other = (make(mean_reverting(1e-5, 0.1, STEP), [1], [1e-5], [0.3], seed=seed) for _ in range(2))
-    assert np.array_equal(draw(one, angle, lengths), draw(other, angle))
 
 
 @refusals(

@@ -71,10 +71,9 @@ def test_what_is_read_of_a_member_that_nobody_knows_cuts_a_chain(unknown, here, 
     ("split", "chains"),
     [
         (None, [LAWS + LOOPS + CUT]),
-        ([LAWS, [*LOOPS, *CUT, "recorder"]], [LAWS, LOOPS + CUT]),
         ([[*LAWS, "tool"], [*LOOPS, "cutting_process", "recorder"]], [LAWS, LOOPS]),
     ],
-    ids=["composed", "two processes", "two processes that wait for each other in each block"],
+    ids=["composed", "two processes that wait for each other in each block"],
 )
 def test_chains_give_the_digests_of_the_offline_run(split, chains):
     """With an event, a fault, and a block that divides neither the run nor the feedback."""

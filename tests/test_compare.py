@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bags import lathe
-from cells import scenario
+from cells import config, scenario
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
@@ -79,10 +79,11 @@ def test_the_strip_tells_the_verdict_of_any_tolerance(compared, tolerance):
 
 def test_a_scenario_runs_first(compared, tmp_path):
     page = tmp_path / "page.html"
-    done = lathe("compare", "piston", compared.folder / "fast", "-o", page)
+    (tmp_path / "short.yaml").write_text(config("piston", "spindle_encoder.revolutions=5").to_yaml())
+    done = lathe("compare", tmp_path / "short.yaml", compared.folder / "fast", "-o", page)
     assert done.exit_code == 0, done.output
     rows = ShownPage(page.read_text(encoding="utf-8")).rows("")
-    assert [row[:2] for row in rows] == [["piston", "200"], ["fast", "9"]]
+    assert [row[:2] for row in rows] == [["short", "5"], ["fast", "9"]]
 
 
 @pytest.mark.parametrize(

@@ -1,50 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each scenario of config/ runs, and gives the same bits in one process of nodes as offline."""
 
-from collections import Counter
-
 import pytest
-from cells import SCENARIOS
+from cells import EVERY_KIND, SCENARIOS, every_scenario
 
 from lathe_rc import harness
 from lathe_rc.cell import scenario
 from lathe_rc.cell.wiring import Cell
 
-#: scenarios that differ from another by numbers alone: the same topics, and the same compiled steps
-LIKE = {
-    "adaptive_inverse": "piston",
-    "exact_invariance": "piston",
-    "one_channel": "piston",
-    "speed_deviation": "piston",
-    "interrupted_cut": "force_turning",
-    "lead_lag": "two_channel",
-}
-BY_NAME = {path.stem: path for path in SCENARIOS}
+
+@pytest.mark.parametrize("path", every_scenario())
+def test_composed_nodes_and_blocks_of_another_length_give_the_digests_of_the_offline_run(path):
+    short = ["spindle_encoder.revolutions=3.0"]
+    offline = harness.run(scenario.load(path, short))
+    size = min(17, offline.scenario.shared.block_size - 1)
+    other = scenario.load(path, [*short, f"block_size={size}"])
+    assert harness.run(other, mode="composed").digest == offline.digest
 
 
-@pytest.mark.parametrize("name", [name for name in BY_NAME if name not in LIKE])
-def test_composed_nodes_give_the_digests_of_the_offline_run(name):
-    loaded = scenario.load(BY_NAME[name], ["spindle_encoder.revolutions=3.0"])
-    assert harness.run(loaded, mode="composed").digest == harness.run(loaded).digest
-
-
-def form(name):
-    """Kind, topics and compiled step of each node of a scenario, in any order."""
-    loaded = scenario.load(BY_NAME[name])
-    return Counter(
-        (
-            loaded.kind(node),
-            *(tuple(port.topic for port in ports) for ports in (stage.inputs, stage.outputs)),
-            stage.native().name if stage.is_compiled else "",
-        )
-        for node, stage in Cell(loaded.nodes).stages.items()
-    )
-
-
-@pytest.mark.parametrize(("name", "other"), LIKE.items())
-def test_a_scenario_that_does_not_run_composed_differs_from_one_that_does_by_numbers_alone(name, other):
-    assert other not in LIKE
-    assert form(name) == form(other)
+def test_the_scenarios_of_the_ordinary_tests_have_every_kind_of_node_and_signal():
+    """The other scenarios run with ``--system``."""
+    found = {
+        path.stem: {
+            (loaded.kind(node), port.type)
+            for loaded in [scenario.load(path)]
+            for node, stage in Cell(loaded.nodes).stages.items()
+            for port in stage.outputs
+        }
+        for path in SCENARIOS
+    }
+    assert set.union(*found.values()) == set.union(*(found[name] for name in EVERY_KIND))
 
 
 WITH_A_TOOL = [path for path in SCENARIOS if "\n/tool:" in path.read_text(encoding="utf-8")]

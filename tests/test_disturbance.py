@@ -9,7 +9,7 @@ from cells import config, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import harness, messages
+from lathe_rc import messages
 from lathe_rc.cell import batch
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stages.law import Law
@@ -223,11 +223,6 @@ def test_frozen_it_keeps_what_it_has_learned_and_clear_forgets_that():
     revolution = encoder["angle_true"] / TURN
     assert error[(revolution > 13) & (revolution < 17)].max() < 2.0
     assert error[revolution > 18.5].max() > 5.0
-
-
-def test_blocks_change_no_bit():
-    sizes = [config("robust_cutting", "spindle_encoder.revolutions=3.0", f"block_size={size}") for size in (1, 7, 16)]
-    assert len({harness.run(cell).digest["/tool"] for cell in sizes}) == 1
 
 
 def test_what_is_refused_does_diverge():

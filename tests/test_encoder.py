@@ -75,11 +75,6 @@ def test_measured_speed_lags_by_half_its_window():
     assert_allclose(signals["speed"][window:], ramp.at(middle)[1], rtol=1e-6)
 
 
-@given(laws, st.one_of(st.just(0), counts), st.integers(1, 400), cuts)
-def test_cuts_change_nothing(law, counts, window, lengths):
-    assert same(measure(law, counts, window, lengths), measure(law, counts, window, [sum(lengths)]))
-
-
 # --- errors of the disc and the signals
 
 EVEN = speed.constant(TURN / (3840 * STEP))  # 3840 samples a revolution

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from cells import until
 from test_counts import COUNTS, TURN, follower, write_counts, write_edges
 
 from lathe_rc import harness
@@ -101,8 +102,7 @@ def test_a_topic_leads_a_cell(tmp_path, ghost, domain):
 
     def publish():
         begun.wait()
-        while not publisher.get_subscription_count():
-            pass
+        until(publisher.get_subscription_count)
         for time, count in readings(path):
             publisher.publish(JointState(name=["gripper"], position=[0.01]))
             publisher.publish(JointState(name=["x", "spindle"], position=[0.0], velocity=[0.0, 104.7]))

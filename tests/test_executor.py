@@ -4,6 +4,7 @@
 from functools import partial
 
 import pytest
+from cells import until
 
 pytest.importorskip("rclpy")
 
@@ -36,22 +37,21 @@ def test_an_event_of_what_has_been_discarded_is_dropped(ghost, watcher):
             return
         watcher.discarded.append(partial(watcher.destroy_subscription, watched))
         ghost.destroy_publisher(publisher)
-        while watched.get_publisher_count():  # from then on the event is on its way
-            pass
+        until(lambda: not watched.get_publisher_count())  # from then on the event is on its way
         discarded.append(True)
 
     watcher.create_subscription(Empty, "/go", discard, 1)
     events = Events([watcher])
-    while not matched:
-        events.spin(0.1)
-    while not discarded:
+    until(lambda: matched, lambda: events.spin(0.1))
+
+    def call():
         go.publish(Empty())
         events.spin(0.1)
+
+    until(lambda: discarded, call)
     heard = []
     watcher.create_subscription(Empty, "/go", heard.append, 1)
-    while not heard:  # then the event has had its turn as well
-        go.publish(Empty())
-        events.spin(0.1)
+    until(lambda: heard, call)  # then the event has had its turn as well
     assert len(matched) == 1
     assert not watcher.discarded
 
@@ -68,18 +68,19 @@ def test_what_nobody_has_announced_is_handed_over_once(ghost, raw):
     writer = ghost.create_publisher(String, "told", 10)
     executor = EventsExecutor()
     executor.add_node(ghost)
-    while not (reader.get_publisher_count() and writer.get_subscription_count()):
-        executor.spin_once(timeout_sec=0.01)
+    until(
+        lambda: reader.get_publisher_count() and writer.get_subscription_count(),
+        lambda: executor.spin_once(timeout_sec=0.01),
+    )
     for word in ("one", "two"):
         writer.publish(String(data=word))
-    while len(heard) < 2:  # before the executor has looked, though it has been told
-        drain_missed_messages(ghost)
+    # Before the executor has looked, though it has been told
+    until(lambda: len(heard) >= 2, lambda: drain_missed_messages(ghost))
     assert [bytes(each)[8:11] if raw else each.data.encode() for each in heard] == [b"one", b"two"]
     for _ in range(10):
         executor.spin_once(timeout_sec=0.0)
     writer.publish(String(data="end"))
-    while len(heard) < 3:
-        executor.spin_once(timeout_sec=0.1)
+    until(lambda: len(heard) >= 3, lambda: executor.spin_once(timeout_sec=0.1))
     assert len(heard) == 3
     executor.shutdown()
 
@@ -90,8 +91,11 @@ def test_a_request_that_nobody_has_announced_is_answered(ghost):
     client = other.create_client(Trigger, "ask")
     assert client.wait_for_service(60.0)
     answer = client.call_async(Trigger.Request())
-    while not answer.done():
+
+    def look():
         drain_missed_messages(ghost)  # nobody spins the one that answers
         rclpy.spin_once(other, timeout_sec=0.01)
+
+    until(answer.done, look)
     assert answer.result().message == "here"
     other.destroy_node()

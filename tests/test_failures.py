@@ -52,7 +52,7 @@ class Killer:
             self.number = 0
 
 
-@pytest.mark.parametrize("node", ["spindle_encoder", "recorder"])
+@pytest.mark.parametrize("node", [pytest.param("spindle_encoder", marks=pytest.mark.system), "recorder"])
 def test_a_killed_node_is_named_and_the_bag_is_readable(node, tmp_path):
     bag = tmp_path / "bag"
     killer = Killer(node, signal.SIGKILL)
@@ -91,7 +91,7 @@ sys.meta_path.insert(0, Finder())
 RUN = ["spindle_encoder.revolutions=1000.0", "spindle_encoder.safe_time=0.1", "recorder.chunk_size=65536"]
 
 
-@pytest.mark.parametrize("node", ["electrodynamic_actuator", "supervisor"])
+@pytest.mark.parametrize("node", [pytest.param("electrodynamic_actuator", marks=pytest.mark.system), "supervisor"])
 def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     """When a member dies, all others go on to the end that the time master declares; the drive retracts by itself."""
     bag, events = tmp_path / "bag", []
@@ -133,7 +133,7 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     ("mode", "groups"),
     [
         ("processes", [["spindle_encoder", "tool"], ["learning_controller", "recorder"]]),
-        ("composed", None),
+        pytest.param("composed", None, marks=pytest.mark.system),
     ],
 )
 def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tmp_path):
@@ -158,16 +158,6 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     assert not check(bag).wrong
 
 
-def test_a_member_that_is_ended_by_sigterm_in_the_middle_of_a_run_makes_the_cell_safe(tmp_path):
-    """It says so itself: it has not just died."""
-    groups = [[name for name in NODES if name != "tool"]]
-    why = r"tool was ended by SIGTERM in the middle of a run: safe state from sample \d+ on$"
-    killer = Killer("tool", signal.SIGTERM)
-    with pytest.raises(LatheError, match=why):
-        harness.run(load(PISTON, RUN), mode="processes", groups=groups, bag=tmp_path / "bag", watch=killer)
-    assert check(tmp_path / "bag").exit_code == 3, "what the tool published is held"
-
-
 def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tmp_path):
     """Without the harness the members end when their time master has died.
 
@@ -188,7 +178,7 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
     assert not check(tmp_path / "bag").wrong
 
 
-@pytest.mark.parametrize("mode", ["composed", "processes"])
+@pytest.mark.parametrize("mode", [pytest.param("composed", marks=pytest.mark.system), "processes"])
 def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, monkeypatch):
     """A bag that cannot be closed is a failure in every host, also when all others have ended well."""
     (tmp_path / "sitecustomize.py").write_text(FULL_AT_THE_END, encoding="utf-8")
@@ -199,7 +189,10 @@ def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, 
         harness.run(piston, mode=mode, groups=groups, bag=tmp_path / "bag", start="spawn")
 
 
-@pytest.mark.parametrize(("number", "mode"), [(signal.SIGINT, "processes"), (signal.SIGTERM, "composed")])
+@pytest.mark.parametrize(
+    ("number", "mode"),
+    [(signal.SIGINT, "processes"), pytest.param(signal.SIGTERM, "composed", marks=pytest.mark.system)],
+)
 def test_the_command_closes_its_bag_on_a_signal(number, mode, tmp_path):
     bag = tmp_path / "bag"
     command = [sys.executable, "-m", "lathe_rc", "run", str(PISTON), "--mode", mode, "--bag", str(bag)]
@@ -306,7 +299,7 @@ def wait_readable(descriptor: int) -> bool:
     return bool(select.select([descriptor], [], [], 30)[0])
 
 
-@pytest.mark.parametrize("mode", ["offline", "composed", "processes"])
+@pytest.mark.parametrize("mode", ["offline", "composed", pytest.param("processes", marks=pytest.mark.system)])
 def test_a_number_that_is_not_finite_ends_the_run_in_every_host_and_is_named(tmp_path, mode, recwarn):
     """A number that is not finite ends the run in every host, with the name of its source.
 

@@ -226,8 +226,7 @@ def test_the_end_of_a_fault_is_not_the_end_of_another_of_the_same_target():
     assert_array_equal(measured(result)[3000:4600], good[3000:4600])
 
 
-@pytest.mark.parametrize("mode", ["offline", "composed"])
-def test_a_repair_of_what_is_not_broken_says_so_and_a_re_simulation_too(mode, tmp_path):
+def test_a_repair_of_what_is_not_broken_says_so_and_a_re_simulation_too(tmp_path):
     """And what the run was too short for is reported, but not that a fault lasts."""
     repair, nothing = f"repair {MEASURED}", f"nothing to repair: {MEASURED}"
     drive = {
@@ -238,7 +237,7 @@ def test_a_repair_of_what_is_not_broken_says_so_and_a_re_simulation_too(mode, tm
         ],
     }  # fmt: skip
     cell = scenario(ALLOWED, electrodynamic_actuator=drive, spindle_encoder={"events": ["sample 1500: repair encoder"]})
-    result = harness.run(cell, mode=mode, bag=tmp_path / "bag")
+    result = harness.run(cell, bag=tmp_path / "bag")
     told = result.recording.sparse["/electrodynamic_actuator/events"].values["action"]
     assert told[:6] == [repair, nothing, f"fault {MEASURED} off", repair, repair, nothing]
     assert result.not_reached == {"electrodynamic_actuator": [f"second 100: fault {MEASURED} stuck"]}
@@ -319,8 +318,7 @@ def with_every_fault():
 def test_all_faults_are_the_same_in_every_host_and_in_a_re_simulation(tmp_path):
     offline = harness.run(with_every_fault(), bag=tmp_path / "bag")
     assert len(offline.recording.sparse["/spindle_encoder/events"].stamps) == 6
-    for mode in ("composed", "processes"):
-        assert harness.run(with_every_fault(), mode=mode).digest == offline.digest, mode
+    assert harness.run(with_every_fault(), mode="processes").digest == offline.digest
     assert_resimulated(tmp_path / "bag")
 
 

@@ -129,11 +129,6 @@ class TestPeriodicLaw:
         values = scaled.recording.sparse["/cross/periodic"].values
         assert_allclose(values["max_error"], status["max_error"][:2], rtol=1e-2)
 
-    def test_status_does_not_depend_on_the_blocks(self, status):
-        one = run("periodic", "block_size=1", "spindle_encoder.revolutions=50.0")
-        values = one.recording.sparse["/cross/periodic"].values
-        assert values == {name: column[:2] for name, column in status.items()}
-
 
 class TestFullCell:
     SHORT = ("spindle_encoder.revolutions=4.0",)
@@ -157,9 +152,6 @@ class TestFullCell:
         inside = [name for name in longer.scenario.nodes if name not in ("recorder", *loops)]
         groups = [inside, loops, ["recorder"]]
         assert harness.run(longer.scenario, mode="processes", groups=groups).digest == longer.digest
-
-    def test_blocks_change_no_bit(self, offline):
-        assert run("full_cell", *self.SHORT, "block_size=17").digest == offline.digest
 
     def test_form_force_and_edge_are_held_together(self):
         result = run("full_cell", "spindle_encoder.revolutions=100.0")

@@ -151,6 +151,7 @@ def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, tog
 ENDLESS = {"revolutions": 1000.0, "speed_factor": 1.0}
 
 
+@pytest.mark.system
 def test_the_death_of_a_foreign_member_makes_the_cell_safe(domain, tmp_path):
     foreign, together = ["learning_controller"], ["electrodynamic_actuator", "recorder"]
     with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=ENDLESS) as (processes, theirs):

@@ -3,8 +3,7 @@
 
 import numpy as np
 import pytest
-from cells import config, cuts, form_error
-from hypothesis import given
+from cells import config, form_error
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -73,17 +72,6 @@ def test_noise_resolution_dropouts_and_keyways_are_in_the_reading():
     keyway = (angle % TURN >= 1.001) & (angle % TURN < 1.499)
     assert not there[keyway].any()
     assert 1.0 - there[turned & ~keyway].mean() == pytest.approx(2.0 * 0.05 / TURN, rel=0.3)
-
-
-@given(cuts)
-def test_cuts_change_nothing_in_the_gauge(lengths):
-    values = {"noise_rms": 1e-7, "dropouts_per_revolution": 20.0, "resolution": 1e-9, "nominal_rpm": 60_000.0}
-    whole = advance(stage(**values), lobes, [sum(lengths)])
-    assert all(
-        np.array_equal(one[name], other[name])
-        for one, other in zip(whole[1:], advance(stage(**values), lobes, lengths)[1:], strict=True)
-        for name in STATE
-    )
 
 
 # --- the correction

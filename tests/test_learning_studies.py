@@ -57,7 +57,7 @@ def test_learning_that_goes_on_depends_on_the_cycle():
     assert learning["max_um"]["constant_lead"][0] < 0.3 * frozen["max_um"]["constant_lead"][place]
 
 
-@pytest.mark.parametrize("correction", ["none", "lead_lag"])
+@pytest.mark.parametrize("correction", ["none", pytest.param("lead_lag", marks=pytest.mark.system)])
 def test_table_of_paper_001(correction):
     """Formulas give the table of paper 001, and cells what the formulas say."""
     found = study("multichannel", correction=correction)
@@ -69,7 +69,10 @@ def test_table_of_paper_001(correction):
     assert max(found["sup_q_minus_z"].values()) < 1.0
 
 
-@pytest.mark.parametrize(("samples", "low", "high"), [(128, 0.05, 0.13), (512, 1e-4, 0.013), (2048, 1e-6, 7e-4)])
+@pytest.mark.parametrize(
+    ("samples", "low", "high"),
+    [(128, 0.05, 0.13), (512, 1e-4, 0.013), pytest.param(2048, 1e-6, 7e-4, marks=pytest.mark.system)],
+)
 def test_coarse_sampling_errs_as_the_spec_says(samples, low, high):
     """Coarse sampling errs by no more than 13 % at 128 samples per revolution, 1.3 % at 512, .07 % at 2048.
 

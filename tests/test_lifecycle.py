@@ -9,7 +9,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from cells import Seen, scenario
+from cells import Seen, scenario, until
 
 pytest.importorskip("rclpy")
 
@@ -62,8 +62,7 @@ class Manager:
             assert client.wait_for_service(60.0)
             # A node that has not discovered yet who asks cannot answer: ask until it does what changes nothing.
             nothing = GetState.Request() if kind is GetState else ChangeState.Request(transition=Transition(id=255))
-            while self._answer(client, nothing, 0.5) is None:
-                pass
+            until(lambda: self._answer(client, nothing, 0.5) is not None)
         answer = self._answer(self._clients[service], request, 60.0)
         assert answer is not None, f"{service} does not answer{self._place_of(service.split('/')[1])}"
         return answer
@@ -117,8 +116,7 @@ def test_the_whole_state_machine_is_walked_and_the_cell_gives_its_bits(manager, 
     with waiting(manager, domain, cell, together) as (processes, begin):
         seen = Seen(processes)
         for node in nodes:  # once its services answer, it is there
-            while manager.state(node) != "active":
-                pass
+            until(lambda node=node: manager.state(node) == "active")
             for transition, possible, then in WALK:
                 assert (manager.change(node, transition), manager.state(node)) == (possible, then)
         begin()

@@ -64,13 +64,6 @@ def test_a_spindle_that_nothing_slows_follows_its_law_to_the_bit(what):
     assert [held[topic] for topic in SAME] == [law[topic] for topic in SAME]
 
 
-@pytest.mark.parametrize("belt", [None, BELT])
-def test_the_length_of_a_block_changes_no_bit(belt):
-    force = interrupted(3000)
-    whole, pieces = turned(make(belt), force), turned(make(belt), force, [1, 64, 935, 1000, 1000])
-    assert all(np.array_equal(one, other) for one, other in zip(whole, pieces, strict=True))
-
-
 # --- balances
 
 

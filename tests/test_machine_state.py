@@ -3,7 +3,6 @@
 
 import itertools
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
-from cells import config
+from cells import config, until
 from geometry_msgs.msg import WrenchStamped
 from numpy.testing import assert_allclose
 from sensor_msgs.msg import JointState
@@ -124,8 +123,7 @@ def test_the_node_publishes_the_joints_and_the_force_of_a_running_cell(turned, g
     work.start()
     try:
         with harness.Processes(cell, [[name for name in cell.nodes if name != "recorder"]], domain=domain) as processes:
-            while sum(inlet.get_publisher_count() for inlet, _, _ in list(machine.inlets.values())) < 5:
-                time.sleep(0.01)
+            until(lambda: sum(inlet.get_publisher_count() for inlet, _, _ in list(machine.inlets.values())) >= 5)
             processes._start(["recorder"])
             processes.wait_for_end()
     finally:

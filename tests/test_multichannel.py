@@ -13,7 +13,6 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 
 CONFIG = Path(__file__).parents[1] / "config"
-STRUCTURES = ("one_channel", "direct_compensation", "two_coarse", "two_channel")
 SHORT = {"spindle_encoder": {"revolutions": 4.0}}
 
 
@@ -21,19 +20,16 @@ def error(result):
     return result.recording.dense["/tool"]["error"]
 
 
-@pytest.mark.parametrize("structure", ["direct_compensation", "two_channel", "series"])
+@pytest.mark.parametrize(
+    "structure",
+    ["direct_compensation", *(pytest.param(each, marks=pytest.mark.system) for each in ("two_channel", "series"))],
+)
 def test_processes_give_the_digests_of_the_offline_run(structure):
     """Processes give the offline bits also with a channel more, or a drive that compensates within the sample."""
     loaded = cells.load(structure, **SHORT)
     offline, processes = harness.run(loaded), harness.run(loaded, mode="processes")
     assert processes.digest == offline.digest
     assert offline.dropped == processes.dropped == 0
-
-
-@pytest.mark.parametrize("structure", STRUCTURES)
-@pytest.mark.parametrize("block_size", [17, 256])
-def test_blocks_change_no_bit(structure, block_size):
-    assert cells.run(structure, {"block_size": block_size}, **SHORT).digest == cells.run(structure, **SHORT).digest
 
 
 def test_series_drive_with_a_light_tool_is_the_two_drives():

@@ -4,7 +4,6 @@
 import io
 import json
 import re
-import threading
 import time
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from bags import lathe
+from cells import until
 
 import lathe_rc
 from lathe_rc import harness
@@ -273,9 +273,7 @@ def test_a_page_that_does_not_ask_delays_no_sample(opened, monkeypatch):
     shown.ask("step")
     shown.until(lambda now: now["state"] == "paused")
     shown.ask("start")
-    deadline = time.monotonic() + 60
-    while shown.cell.reached < shown.cell.samples and time.monotonic() < deadline:
-        threading.Event().wait(0.02)
+    until(lambda: shown.cell.reached >= shown.cell.samples)
     shown.until(lambda now: now["state"] == "ended")
     assert shown.have.epoch == 1
     assert [row["revolution"] for row in shown.rows] == list(range(1, len(shown.history) + 1, 2))

@@ -118,13 +118,6 @@ def test_end_stop_holds_the_carriage_until_it_is_driven_back():
     assert position[-1] == pytest.approx(-0.5e-3)
 
 
-@given(cuts, st.sampled_from(["foh", "tustin"]), st.floats(0.0, 1e-3))
-def test_cuts_change_nothing(lengths, method, delay):
-    command = np.random.default_rng(2).normal(scale=2e-3, size=sum(lengths))
-    whole = drive(command, delay=delay, stroke=1e-3, method=method)
-    assert np.array_equal(drive(command, lengths, delay=delay, stroke=1e-3, method=method), whole)
-
-
 # --- sensor
 
 

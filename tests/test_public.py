@@ -22,6 +22,7 @@ SHOWN_ELSEWHERE = {
 }
 EXAMPLES = {name: getattr(lathe_rc, name) for name in sorted({*lathe_rc.__all__} - SHOWN_ELSEWHERE)}
 EXAMPLES |= {"Scenario.varied": Scenario.varied, "Recording.frame": Recording.frame}
+WITH_WORKERS = {"run_sweep", "tune"}  #: start processes of Dask, of which test_sweep.py and test_tune.py have none
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("lathe_rc/templates/*/*.j2"), ROOT / "README.md"])
 
 
@@ -32,7 +33,9 @@ def test_the_public_names_are_few_and_can_be_imported():
         lathe_rc.lode  # noqa: B018 - it is not there
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.system if name in WITH_WORKERS else ()) for name in EXAMPLES]
+)
 def test_the_example_in_its_help_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder(recurse=False).find(EXAMPLES[name], name, globs={"__name__": __name__})

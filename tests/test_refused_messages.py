@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from cells import STEP, Seen, block, held, scenario
+from cells import STEP, Seen, block, held, scenario, until
 from diagnostic_msgs.msg import DiagnosticArray
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
 from mcap.reader import make_reader
@@ -108,8 +108,7 @@ def until_named(ghost, topic, readers):
     ghost.create_subscription(DiagnosticArray, "/diagnostics", heard, 100)
     executor = SingleThreadedExecutor()
     executor.add_node(ghost)
-    while left:
-        executor.spin_once(timeout_sec=1.0)
+    until(lambda: not left, lambda: executor.spin_once(timeout_sec=1.0))
     executor.shutdown()
 
 
@@ -167,6 +166,7 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     assert "/haunted/ghost" in values["publishers of /tool"]
 
 
+@pytest.mark.system
 def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain, tmp_path):
     """A cell begins in a flood that pushes its own announcements out of the readers of nodes that start."""
     sends = [(ghost.create_publisher(Member, "/members", latched_qos(10)), Member(run_id="elsewhere", name="/x"))]
@@ -202,6 +202,7 @@ def test_who_speaks_in_the_name_of_a_member_makes_the_cell_safe_and_all_publishe
         assert sum(1 for _ in found.messages()) > 100
 
 
+@pytest.mark.system
 def test_a_bad_progress_message_makes_the_cell_safe_and_not_fail(ghost, domain, tmp_path):
     cell, sent = scenario(spindle_encoder={"revolutions": 200.0, "speed_factor": 1.0}), []
     publisher = ghost.create_publisher(Progress, "/progress", latched_qos(10))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 from bags import JAZZY
-from cells import block, refusals, scenario, started
+from cells import block, refusals, scenario, started, until
 from lathe_rc_msgs.msg import ToolBlock
 from rclpy.duration import Infinite
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
@@ -113,6 +113,7 @@ def test_a_bag_of_others_is_recorded_again_as_it_was(foreign, domain, tmp_path):
         assert reader.deserialize(data, "std_msgs/msg/String").data.endswith("x0")
 
 
+@pytest.mark.system
 def test_a_bag_of_the_cell_is_recorded_again_as_it_was(domain, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     harness.run(scenario(spindle_encoder={"revolutions": 6.0}), mode="composed", bag=first)
@@ -132,8 +133,7 @@ def test_without_simulated_time_the_order_is_that_of_publication(foreign, domain
 
 
 def matched(node, publisher):
-    while not publisher.get_subscription_count():
-        rclpy.spin_once(node, timeout_sec=0.02)
+    until(publisher.get_subscription_count, lambda: rclpy.spin_once(node, timeout_sec=0.02))
 
 
 def last_word(ghost, talker, word, recording):

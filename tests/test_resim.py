@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from bags import lathe, storage_of
-from cells import SCENARIOS, scenario
+from cells import every_scenario, scenario
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
@@ -32,14 +32,14 @@ def made(**nodes):
 
 
 @pytest.fixture(scope="module")
-def processes(tmp_path_factory):
-    """A run of real processes, with events on the way."""
-    path = tmp_path_factory.mktemp("processes") / "bag"
-    return path, harness.run(made(learning_controller=EVENTS), mode="processes", bag=path)
+def nodes(tmp_path_factory):
+    """A run of nodes, with events on the way."""
+    path = tmp_path_factory.mktemp("nodes") / "bag"
+    return path, harness.run(made(learning_controller=EVENTS), mode="composed", bag=path)
 
 
-def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
-    path, result = processes
+def test_an_unchanged_run_of_nodes_comes_out_to_the_bit(nodes):
+    path, result = nodes
     found = lathe("resim", path, "--json")
     assert found.exit_code == 0
     told = json.loads(found.stdout)
@@ -48,7 +48,7 @@ def test_an_unchanged_process_run_comes_out_to_the_bit(processes):
     assert np.array_equal(told["rms_um"], result.errors.rms * 1e6)
 
 
-@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", every_scenario())
 def test_every_scenario_comes_out_to_the_bit(path, tmp_path):
     """Every scenario is simulated again to the bit, whatever its stages announce, like a channel that joins."""
     loaded = scenarios.load(path, ["spindle_encoder.revolutions=25", "spindle_encoder.speed_factor=0"])
@@ -57,8 +57,8 @@ def test_every_scenario_comes_out_to_the_bit(path, tmp_path):
     assert (found.changed, found.different, found.missing) == (False, [], [])
 
 
-def test_what_it_writes_is_the_bag_again(processes, tmp_path):
-    path, result = processes
+def test_what_it_writes_is_the_bag_again(nodes, tmp_path):
+    path, result = nodes
     assert lathe("resim", path, "-o", tmp_path / "again").exit_code == 0
     assert reader.read_bag(tmp_path / "again").digests() == result.digest
     signals = {topic for topic, kind in result.recording.types.items()}
@@ -66,8 +66,8 @@ def test_what_it_writes_is_the_bag_again(processes, tmp_path):
         assert list(old.messages(signals)) == list(new.messages())
 
 
-def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(processes):
-    path, _ = processes
+def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(nodes):
+    path, _ = nodes
     change = "learning_controller.lead_time=1.2e-3"
     found = resimulate(path, [change])
     expected = harness.run(made(learning_controller={"lead_time": 1.2e-3, **EVENTS}))
@@ -83,8 +83,8 @@ def test_a_changed_lead_shows_the_change_of_a_run_with_that_lead(processes):
     assert "different from the recording: /coarse/command" in shown.stdout
 
 
-def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(processes, tmp_path):
-    path, result = processes
+def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(nodes, tmp_path):
+    path, result = nodes
     file = tmp_path / "mine.yaml"
     text = "/learning_controller: {ros__parameters: {feedback_delay: 2048, learning_gain: 0.5}}"
     file.write_text(text)
@@ -95,7 +95,7 @@ def test_a_controller_from_a_file_takes_the_place_of_the_recorded_one(processes,
     assert "no node 'another' in the bag's scenario" in lathe("resim", path, "--controller", file).stderr
 
 
-def test_the_recorded_spindle_counts_not_the_law(processes, tmp_path):
+def test_the_recorded_spindle_counts_not_the_law(nodes, tmp_path):
     """A bag whose spindle really turned otherwise than its parameters say."""
     other = tmp_path / "other"
     slow = {"revolutions": 15.0, "deviation_amplitude": [0.05], "deviation_frequency": [7.0]}
@@ -115,8 +115,8 @@ def test_the_bag_holds_the_files_of_its_scenario(tmp_path):
     assert resimulate(bag).different == []
 
 
-def test_versions_and_identity_are_in_the_bag(processes):
-    path, result = processes
+def test_versions_and_identity_are_in_the_bag(nodes):
+    path, result = nodes
     with Source(path) as source:
         assert json.loads(source.about[provenance.VERSIONS])["numpy"] == np.__version__
         assert source.about[provenance.RUN_ID] == result.scenario.shared.run_id
@@ -132,22 +132,22 @@ def test_versions_and_identity_are_in_the_bag(processes):
         ("learning_controller.lead_time=0.02", "learning diverges"),
     ],
 )
-def test_changes_that_cannot_be_are_refused(processes, change, said):
-    found = lathe("resim", processes[0], "--set", change)
+def test_changes_that_cannot_be_are_refused(nodes, change, said):
+    found = lathe("resim", nodes[0], "--set", change)
     assert found.exit_code == 2
     assert said in found.stderr
 
 
-def test_a_bag_without_a_scenario_says_what_is_missing(processes, tmp_path):
-    shutil.copy(storage_of(processes[0]), tmp_path / "alone.mcap")
+def test_a_bag_without_a_scenario_says_what_is_missing(nodes, tmp_path):
+    shutil.copy(storage_of(nodes[0]), tmp_path / "alone.mcap")
     with pytest.raises(InputError, match="the bag holds no scenario"):
         resimulate(tmp_path / "alone.mcap")
 
 
 @pytest.mark.parametrize("piece", [64, 1000, 65536])
 @pytest.mark.parametrize("together", [2, 16])
-def test_errors_by_revolution_and_the_first_and_last_are_those_of_the_whole(processes, piece, together, monkeypatch):
-    path, result = processes
+def test_errors_by_revolution_and_the_first_and_last_are_those_of_the_whole(nodes, piece, together, monkeypatch):
+    path, result = nodes
     monkeypatch.setattr(part, "_TOGETHER", together)
     ends, errors = part.FirstAndLast(result.recording.types), ErrorsByRevolution(result.recording.types)
     feed(path, [ends, errors], piece=piece)
@@ -162,12 +162,12 @@ def test_errors_by_revolution_and_the_first_and_last_are_those_of_the_whole(proc
                 assert_allclose(told[name][key], value, rtol=1e-6, atol=1e-9, err_msg=f"{name} {key}")
 
 
-def test_other_events_than_those_of_the_bag_are_refused(processes, tmp_path):
+def test_other_events_than_those_of_the_bag_are_refused(nodes, tmp_path):
     said = "events and faults come from the bag, as they took effect; leave"
     for asked in ("learning_controller.events=['revolution 5: freeze']", "electrodynamic_actuator.faults=[]"):
         with pytest.raises(InputError, match=rf"^--set .*: {said}"):
-            resimulate(processes[0], [asked])
+            resimulate(nodes[0], [asked])
     file = tmp_path / "controller.yaml"
     file.write_text("/learning_controller: {ros__parameters: {events: ['revolution 5: freeze']}}")
     with pytest.raises(InputError, match=rf"^learning_controller.events = \['revolution 5: freeze'\]: {said}"):
-        resimulate(processes[0], controller=file)
+        resimulate(nodes[0], controller=file)

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from cells import until
 
 import bootstrap
 import check
@@ -395,8 +396,7 @@ def test_interrupted_step_leaves_no_process_behind(step, monkeypatch, tmp_path):
     pid_file = tmp_path / "pid"
 
     def interrupt_when_started(_process) -> None:
-        while not pid_file.exists() or not pid_file.read_text().endswith("\n"):
-            pass
+        until(lambda: pid_file.exists() and pid_file.read_text().endswith("\n"))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(step, "_wait", interrupt_when_started)

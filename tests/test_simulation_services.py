@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A client that knows simulation_interfaces alone drives a cell in lockstep; holding a run changes no bit."""
 
-import time
-
 import pytest
-from cells import config
+from cells import config, until
 
 pytest.importorskip("rclpy")
 pytest.importorskip("simulation_interfaces")
@@ -49,8 +47,7 @@ class Client:
         return answer.result, answer.error_message
 
     def wait_until(self, state):
-        while self.state != state:
-            time.sleep(0.02)
+        until(lambda: self.state == state)
 
 
 def cell(tmp_path, *overrides):
@@ -74,8 +71,7 @@ def test_a_thousand_steps_give_the_digest_of_the_free_run(ghost, domain, tmp_pat
         client.wait_until(SimulationState.STATE_PAUSED)
         for _ in range(STEPS):
             assert client.step() == (Result.RESULT_OK, "")
-        while len(heard) < STEPS:
-            rclpy.spin_once(ghost, timeout_sec=1.0)
+        until(lambda: len(heard) >= STEPS, lambda: rclpy.spin_once(ghost, timeout_sec=1.0))
         assert client.state == SimulationState.STATE_PAUSED
         assert (len(heard), heard[-1].block.first_index) == (STEPS, (STEPS - 1) * 64)
         assert client.set(SimulationState.STATE_PLAYING) == (Result.RESULT_OK, "")

@@ -271,7 +271,7 @@ def test_service_says_why_there_is_no_snapshot(tmp_path):
     assert found.message == "recorder.mode = 'continuous'; allowed for snapshots: snapshot or both"
 
 
-@pytest.mark.parametrize("node", ["tool", "recorder"])
+@pytest.mark.parametrize("node", ["tool", pytest.param("recorder", marks=pytest.mark.system)])
 def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
     """A killed node leaves the seconds around its death, a killed recorder what had come to the disk."""
     pids = {}

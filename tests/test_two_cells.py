@@ -61,7 +61,7 @@ def test_a_cell_lives_in_the_middle_of_another(domain, tmp_path):
             harness.run, LEFT, **options, namespace="/left", bag=tmp_path / "left", watch=pause, groups=[]
         )
         concurrent.futures.wait([left, pause.stopped], return_when=concurrent.futures.FIRST_COMPLETED)
-        right = harness.run(RIGHT, **options, namespace="/shop/right", bag=tmp_path / "right", groups=[])
+        right = harness.run(RIGHT, **options, namespace="/shop/right", bag=tmp_path / "right", groups=[[*RIGHT.nodes]])
         assert not left.done()
         os.kill(pause.stopped.result(), signal.SIGCONT)
         assert left.result().digest == alone(LEFT, "/left")
@@ -70,6 +70,7 @@ def test_a_cell_lives_in_the_middle_of_another(domain, tmp_path):
     assert mixed(tmp_path / "right", "/shop/right") == set()
 
 
+@pytest.mark.system
 def test_two_composed_cells_start_at_once(domain, tmp_path):
     with concurrent.futures.ThreadPoolExecutor() as pool:
         runs = {

@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from cells import cuts
 from hypothesis import given
 from hypothesis import strategies as st
 from machines import assert_refused, refusals, run
@@ -99,13 +98,6 @@ def test_seed_and_name_make_the_vibration():
     assert np.array_equal(lines(), lines())
     assert not np.array_equal(lines(), lines(seed=1))
     assert not np.array_equal(lines(), lines(name="other"))
-
-
-@given(cuts)
-def test_cuts_change_nothing_in_the_stage(lengths):
-    values = {"noise_rms": 1e-8, "resolution": 1e-9}
-    whole, cut = advance(stage(**values), sum(lengths)), advance(stage(**values), sum(lengths), lengths)
-    assert all(np.array_equal(whole[name], cut[name]) for name in whole)
 
 
 @refusals(

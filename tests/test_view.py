@@ -2,12 +2,11 @@
 """``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
 
 import importlib.util
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import config, listening, scenario
+from cells import config, listening, scenario, until
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -476,9 +475,8 @@ def test_a_viewer_listens_on_this_computer_alone(kind, count, monkeypatch):
         shown.options.append("--headless")
     process = shown.start()
     try:
-        while len(found := listening(process.pid)) < count:
-            assert process.poll() is None
-            time.sleep(0.02)
+        until(lambda: len(listening(process.pid)) >= count or process.poll() is not None)
+        found = listening(process.pid)
     finally:
         end_viewer(process)
     assert {place.partition(":")[0] for place in found} == {"0100007F"}  # 127.0.0.1

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pyarrow.parquet
 import pytest
+from cells import until
 
 import lathe_rc
 from lathe_rc import allowed_code
@@ -110,8 +111,7 @@ def test_ctrl_c_keeps_what_is_computed_and_nothing_is_computed_twice(tmp_path):
         for line in stopped.stderr:
             if "dashboard" in line:
                 break
-        while not any((tmp_path / "rows" / "rows").glob("*.parquet")):
-            assert stopped.poll() is None
+        until(lambda: stopped.poll() is not None or any((tmp_path / "rows" / "rows").glob("*.parquet")))
         os.killpg(stopped.pid, signal.SIGINT)  # as a terminal does it
         said = stopped.stderr.read()
     assert stopped.returncode == 130

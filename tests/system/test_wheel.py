@@ -73,11 +73,9 @@ def test_sdists_hold_what_is_built_and_no_tests_and_caches(dist):
         ] == []
 
 
-def environment(dist: Path, place: Path, wanted: str) -> "Installed":
-    uv("venv", "--quiet", "--python", workplace.BASE_PYTHON, place)
+def install(dist: Path, place: Path, wanted: str) -> None:
     python = place / "bin" / "python"
     uv("pip", "install", "--quiet", "--python", python, "--find-links", dist, "--constraint", LOCK, wanted)
-    return Installed(place)
 
 
 class Installed:
@@ -107,7 +105,9 @@ class Installed:
 @pytest.fixture(scope="module")
 def alone(dist) -> Installed:
     """Without ROS and without any extra."""
-    return environment(dist, dist / "alone", "lathe_rc")
+    uv("venv", "--quiet", "--python", workplace.BASE_PYTHON, dist / "alone")
+    install(dist, dist / "alone", "lathe_rc")
+    return Installed(dist / "alone")
 
 
 def test_it_runs_without_ros(alone):
@@ -145,10 +145,9 @@ def test_a_command_without_its_extra_says_what_to_install(alone, words, extra):
 
 
 @pytest.mark.timeout(900)  # most of a minute, of which a machine that does other things makes several
-def test_with_ros_the_messages_are_built_by_the_installation(dist):
-    """One command installs ROS 2 and the messages; then the same cell runs as processes, with the same bits."""
-    ros = environment(dist, dist / "ros", "lathe_rc[ros]")
-    assert "0 lost; 5 revolutions" in ros.run(
-        "lathe", "run", "piston", "--mode", "processes", "--revolutions", "5", "--bag", "B"
-    )
-    assert ros.run("lathe", "bag", "check", "B").startswith("clean: ")
+def test_with_ros_the_messages_are_built_by_the_installation(dist, alone):
+    """The command that the refusals name adds ROS 2 and the messages; then the same cell runs as processes."""
+    install(dist, dist / "alone", "lathe_rc[ros]")
+    words = ("run", "piston", "--mode", "processes", "--revolutions", "5", "--bag", "nodes")
+    assert "0 lost; 5 revolutions" in alone.run("lathe", *words)
+    assert alone.run("lathe", "bag", "check", "nodes").startswith("clean: ")
