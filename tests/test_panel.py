@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The panel: commands, snapshots, and a run that is that of `lathe run`."""
 
+import contextlib
 import io
 import json
 import re
+import socket
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cells
 import numpy as np
@@ -18,7 +21,8 @@ import lathe_rc
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
-from lathe_rc.view import panel, panel_part, panel_view
+from lathe_rc.view import page_server, panel, panel_part, panel_view
+from lathe_rc.view.page_server import Site
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, news
@@ -266,15 +270,35 @@ def test_a_panel_whose_thread_has_ended_answers(opened, monkeypatch):
         shown.ask("pause")
 
 
-def test_a_page_that_does_not_ask_delays_no_sample(opened, monkeypatch):
-    """It then gets the newest snapshot, and the rows that it lacks, a few at a time."""
+def unread(address):
+    """A page that asks many times and reads no answer; returns its connection, whose buffers are full."""
+    parts = urlsplit(address)
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.connect((parts.hostname, parts.port))
+    body, token = json.dumps(vars(Have())), parts.query.partition("=")[2]
+    head = f"POST /ask/frame HTTP/1.1\r\nHost: {parts.netloc}\r\n{page_server.TOKEN}: {token}\r\n"
+    connection.settimeout(0.0)
+    connection.send(1000 * f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
+    return connection
+
+
+def test_pages_that_read_no_answer_delay_no_sample(opened, monkeypatch, tmp_path):
+    """A page beside them misses snapshots, and gets the newest one and the rows that it lacks, a few at a time."""
     monkeypatch.setattr(panel_view, "MOST_ROWS", 16)
     shown = opened(scenario("piston", 24))
+    shown.ask("record", bag=str(tmp_path / "bag"))
     shown.ask("step")
     shown.until(lambda now: now["state"] == "paused")
-    shown.ask("start")
-    until(lambda: shown.cell.reached >= shown.cell.samples)
-    shown.until(lambda now: now["state"] == "ended")
+    before = shown.have.number
+    with page_server.serving(Site({}, shown.answers)) as address, contextlib.ExitStack() as stuck:
+        for _ in range(4):
+            stuck.enter_context(unread(address))
+        shown.ask("start")
+        until(lambda: not shown.cell.recording)
+        assert shown.take()["number"] > before + 1
+        shown.until(lambda now: now["state"] == "ended")
+    assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(scenario("piston", 24)).digest
     assert shown.have.epoch == 1
     assert [row["revolution"] for row in shown.rows] == list(range(1, len(shown.history) + 1, 2))
     assert all(len(row["cells"]) == 180 for row in shown.rows)

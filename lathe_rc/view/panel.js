@@ -7,6 +7,10 @@ let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name
 const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const SAID = { safe: "safe (stopped, tool retracted)" };
+const DOES = { // tool tips
+  freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned",
+  retract: "takes the tool out of the part", reset: "lets a retracted tool approach the part again",
+};
 const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
@@ -189,6 +193,7 @@ function drawDials(now) {
   if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force) * 1.2), ABOUT.force]);
   if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), ABOUT.margin]);
   const ink = style("--ink"), soft = style("--soft"), line = style("--line"), good = style("--good"), bad = style("--bad");
+  const small = $("dials").getBoundingClientRect().width < 450 ? 12.5 : 10; // readable on a telephone as well
   $("dials").innerHTML = dials.map(([name, unit, value, most, wanted], k) => {
     const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
     const at = (r, share) => `${(cx + r * Math.cos(angle(share))).toFixed(1)} ${(cy - r * Math.sin(angle(share))).toFixed(1)}`;
@@ -197,9 +202,9 @@ function drawDials(now) {
     const needle = known ? `<path d="M${cx} ${cy} L${at(56, value / most)}" stroke="${value < 0 ? bad : good}" stroke-width="4" stroke-linecap="round"/>` : "";
     const words = (y, told, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(told)}</text>`;
     return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark}${needle}`
-      + words(118, known ? `${unit == "N" ? newton(value, 4) : digits(value)} ${unit}` : "unknown", 15, ink) + words(136, name, 12, soft)
-      + (name == "stability margin" ? words(152, wanted ? `limit ${digits(wanted)}; below 0: learning diverges` : "below 0: learning diverges", 10, soft) : "")
-      + `<text x="${cx + 56}" y="${cy + 40}" font-size="10" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
+      + words(118, known ? `${unit == "N" ? newton(value, 4) : digits(value)} ${unit}` : "unknown", 15, ink) + words(137, name, small + 2, soft)
+      + (name == "stability margin" ? words(153, "below 0: learning diverges", small, soft) + (wanted ? words(169, `limit ${digits(wanted)}`, small, soft) : "") : "")
+      + `<text x="${cx + 56}" y="${cy + 40}" font-size="${small}" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
   }).join("");
 }
 
@@ -406,7 +411,7 @@ function describe() { // fills the commands from what the cell tells of itself
       row.append(state);
     }
     for (const action of node.actions) {
-      const button = Object.assign(document.createElement("button"), { type: "button", textContent: action });
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: action, title: DOES[action] || "" });
       button.addEventListener("click", () => tell("act", { node: node.name, action }));
       row.append(button);
     }

@@ -98,7 +98,7 @@ def attached_site(view: View, cell: Cell, commands: Attached) -> Site:
 
     nodes = [_node(stage) for stage in cell.stages.values()]
     can = {"can": ["run", "command", "record"], "cannot": commands.cannot}
-    about = {**view.outlook, **can, "nodes": nodes, "faults": _faults(), "parameters": []}
+    about = {**view.outlook, "revolutions": 0.0, **can, "nodes": nodes, "faults": _faults(), "parameters": []}
     answers: dict[str, Answer] = {
         "about": lambda _: about,
         "act": acting,
