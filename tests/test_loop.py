@@ -107,6 +107,14 @@ class TestPage:
         written = load(tmp_path / "written.yaml")
         assert written.nodes == load("piston", [f"{LEAD}=1.4e-3"]).nodes
 
+    def test_a_strip_is_kept_for_its_own_values_alone(self, tmp_path):
+        loop = VariedLoop(load("piston"))
+        page, setting = LoopPage(loop, tmp_path / "written.yaml"), loop.settings()[0]
+        for values in ({setting.target: 0.7}, {}, {LEAD: 1.2e-3}, {LEAD: 1.2e-3, setting.target: 0.7}, {}):
+            others = {name: value for name, value in values.items() if name == LEAD}
+            strip = loop_figures.strip(loop.along(others, setting), values.get(setting.target, setting.value))
+            assert page.along({"values": values, "setting": setting.target}) == {"strip": strip}
+
     def test_a_file_that_is_no_page_is_refused_before_the_work(self, tmp_path):
         done = lathe("loop", "piston", "--html", tmp_path / "loop.pdf")
         assert done.exit_code == 2

@@ -55,12 +55,13 @@ def panel(
         return
     allowed_code.allow_own_code()
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
+    loop = LoopPage(VariedLoop(loaded), Path(f"{loaded.name}-loop.yaml")).site()
     if attach:
         from lathe_rc.nodes import panel_attach
 
-        panel_attach.attach(loaded, namespace, port, click.echo, browser=not no_browser)
+        panel_attach.attach(loaded, namespace, port, click.echo, browser=not no_browser, loop=loop)
         return
     cell = LiveCell(loaded, compiling=lambda names: click.echo(f"compiling {', '.join(names)}", err=True))
-    loop = LoopPage(VariedLoop(loaded), Path(f"{loaded.name}-loop.yaml")).site()
     with Driver(cell, pace) as driver:
-        page_server.serve(panels.site(driver, cell, loop), port, click.echo, browser=not no_browser)
+        site = panels.with_loops(panels.site(driver, cell), loop)
+        page_server.serve(site, port, click.echo, browser=not no_browser)

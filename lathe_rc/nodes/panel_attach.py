@@ -27,6 +27,7 @@ from lathe_rc.names import checked_namespace
 from lathe_rc.nodes.listener import Listener
 from lathe_rc.nodes.standalone_node import standalone_node
 from lathe_rc.view import page_server, panel
+from lathe_rc.view.page_server import Site
 from lathe_rc.view.panel_live import LivePanel
 from lathe_rc.view.panel_outlook import outlook
 
@@ -149,7 +150,9 @@ class _Asking:
         self._node.destroy_node()
 
 
-def attach(scenario: Scenario, namespace: str, port: int, say: Callable[[str], object], *, browser: bool) -> None:
+def attach(
+    scenario: Scenario, namespace: str, port: int, say: Callable[[str], object], *, browser: bool, loop: Site
+) -> None:
     """Show the cells of this ROS domain in the panel, one run after the other, until Ctrl-C or SIGTERM.
 
     Args:
@@ -158,6 +161,7 @@ def attach(scenario: Scenario, namespace: str, port: int, say: Callable[[str], o
         port: TCP port of the page; 0: a free one.
         say: called with the line for the user.
         browser: whether to open the page in the browser.
+        loop: the page of its loops.
 
     Raises:
         InputError: the port is in use, or the namespace is invalid.
@@ -169,7 +173,7 @@ def attach(scenario: Scenario, namespace: str, port: int, say: Callable[[str], o
         live = LivePanel()
         asking = _Asking(rclpy.create_node(PANEL_COMMANDS), cell, live)
         live.view.outlook = outlook(scenario)
-        site = panel.attached_site(live.view, cell, asking)
+        site = panel.with_loops(panel.attached_site(live.view, cell, asking), loop)
         listener = Listener(node, live)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, listener.stop)

@@ -12,7 +12,7 @@ import numpy as np
 from lathe_rc import __version__, files, part
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.tolerance import LAST, judge
-from lathe_rc.cell.varied_loop import LoopState, Setting, VariedLoop, chatter_charts, drive_curves
+from lathe_rc.cell.varied_loop import Along, LoopState, Setting, VariedLoop, chatter_charts, drive_curves
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
 from lathe_rc.view import block_diagram, loop_figures, report_loop
@@ -33,6 +33,7 @@ class LoopPage:
 
     def __init__(self, loop: VariedLoop, place: Path) -> None:
         self._loop, self._place, self._lock = loop, place, Lock()
+        self._strips: dict[str, tuple[dict[str, float], Along]] = {}  # newest of each setting, with the others' values
         self._settings = {each.target: each for each in loop.settings()}
         self._charts = Charts()
         self._state, self._cuts = loop.state({}), chatter_charts(loop.cell)
@@ -88,9 +89,13 @@ class LoopPage:
     def along(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """Return the margins along the range of a ``setting`` as a picture, for the ``values`` of the others."""
         values, setting = self._values(question), self._setting(question.get("setting"))
+        value = values.pop(setting.target, setting.value)
         with self._lock:
-            found = self._loop.along(values, setting)
-        return {"strip": loop_figures.strip(found, values.get(setting.target, setting.value))}
+            before, found = self._strips.get(setting.target, (None, None))
+            if found is None or before != values:
+                found = self._loop.along(values, setting)
+                self._strips[setting.target] = values, found
+        return {"strip": loop_figures.strip(found, value)}
 
     def write(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """Write the scenario with the ``values`` of a question."""

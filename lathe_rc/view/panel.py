@@ -27,11 +27,14 @@ def page() -> Page:
     return Page("panel", own_file("panel.html"), [own_file("panel.css")], [own_file("panel.js")])
 
 
-def site(driver: Driver, cell: LiveCell, loop: Site | None = None) -> Site:
-    """Return the panel of an offline cell, with the page of its loops, if given, as a tab."""
-    tabs, answers = ({"loop": loop.pages[""]}, loop.answers) if loop else ({}, {})
-    own = {**_watching(cell.view), **_playing(driver), **_commands(driver, cell)}
-    return Site({"": page(), **tabs}, {**answers, **own})
+def with_loops(panel: Site, loop: Site) -> Site:
+    """Return a panel with the page of the loops of its scenario as a tab."""
+    return Site({**panel.pages, "loop": loop.pages[""]}, {**loop.answers, **panel.answers})
+
+
+def site(driver: Driver, cell: LiveCell) -> Site:
+    """Return the panel of an offline cell."""
+    return Site({"": page()}, {**_watching(cell.view), **_playing(driver), **_commands(driver, cell)})
 
 
 def player_site(driver: Driver, player: Player) -> Site:

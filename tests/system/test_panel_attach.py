@@ -89,6 +89,7 @@ def test_a_running_cell_is_paced_paused_and_recorded_from_the_page(attached, dom
     running.start()
     attached.until(lambda told: told["now"].get("angle", 0.0) > 20.0)
     assert "step" in attached.ask("about")[1]["cannot"]
+    assert attached.ask("state", values={})[1]["answers"]  # the page of the loops is a tab
     assert attached.ask("record", bag=str(tmp_path / "bag"))[0] == 200
     assert attached.ask("pause") == (200, {})
     attached.until(lambda told: told["now"]["state"] == "paused")

@@ -31,7 +31,7 @@ def page(tmp_path):
     loop = LoopPage(VariedLoop(cell.scenario), tmp_path / "loop.yaml").site()
     with (
         Driver(cell, 0.0) as driver,
-        page_server.serving(panel.site(driver, cell, loop)) as address,
+        page_server.serving(panel.with_loops(panel.site(driver, cell), loop)) as address,
         Chromium(tmp_path) as browser,
     ):
         browser.look(1440, 1000)
