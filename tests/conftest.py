@@ -88,6 +88,9 @@ def pytest_collection():
         gc.enable()
 
 
+#: files of system tests that take a minute or more; docs/tests.md has the others' shares
+LONGEST = ("test_wheel", "test_simulation_services", "test_schedules", "test_c_libraries", "test_panel_browser")
+
 _ended_a_worker = []  # tests; the worker in its place would run them again
 
 
@@ -103,7 +106,7 @@ def pytest_collection_modifyitems(config, items):
     """On a worker, files that take long come first: else one of them would be the last, with nothing beside it."""
     if hasattr(config, "workerinput"):
         shares = slow_tests.shares()
-        items.sort(key=lambda item: -shares.get(item.path.stem, 0.0))
+        items.sort(key=lambda item: (item.path.stem not in LONGEST, -shares.get(item.path.stem, 0.0)))
         for item in items:
             if item.nodeid in config.workerinput["skipped"]:
                 item.add_marker(pytest.mark.skip("it has ended a worker"))

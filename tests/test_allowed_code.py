@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from bags import lathe
 from cells import scenario
-from click.testing import CliRunner
 
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.bag import provenance
@@ -24,7 +24,6 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
-from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import graph
 from lathe_rc.nodes.ports import message_class
@@ -32,10 +31,6 @@ from lathe_rc.protocol import Announcement
 
 NUMBERS = itertools.count()
 FORM = "angle_deg,radius_um\n0,0\n120,30\n240,-10\n"
-
-
-def lathe(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

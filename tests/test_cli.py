@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bags import lathe
 from click.testing import CliRunner
 
 from lathe_rc import extras, harness
@@ -53,10 +54,6 @@ def folder(tmp_path, monkeypatch):
     signal.signal(signal.SIGTERM, before)
 
 
-def lathe(*arguments):
-    return CliRunner().invoke(main, arguments)
-
-
 def told(*arguments):
     """Run a cell and return the JSON object that the command prints."""
     result = lathe("run", *arguments, "--json")
@@ -95,13 +92,6 @@ def test_json_of_a_run_without_a_bag_or_a_revolution(revolutions):
     summary = told("cell.yaml", "--revolutions", revolutions)
     assert (summary["bag"], summary["revolutions"]) == (None, 0)
     assert summary["error_um"] == {"first": None, "last": None, **{name: [] for name in PER_REVOLUTION}}
-
-
-def test_stdout_of_the_process_is_the_object_alone():
-    command = [sys.executable, "-m", "lathe_rc", "run", "cell.yaml", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert list(json.loads(done.stdout)) == KEYS
-    assert not re.search("Traceback|Warning", done.stderr)
 
 
 def test_people_get_a_table_and_where_they_ask_for_it_a_figure(folder):
@@ -308,10 +298,13 @@ def test_commands_are_listed_without_being_imported():
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 
 
-def test_a_run_imports_the_stages_that_its_cell_has():
-    code = "import sys; from lathe_rc.cli import main; main(sys.argv[1:], standalone_mode=False); print(*sys.modules)"
-    words = [sys.executable, "-c", code, "run", "piston", "--revolutions", "1"]
-    *_, modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+def test_a_run_prints_its_object_alone_and_imports_the_stages_that_its_cell_has():
+    code = "import sys; from lathe_rc.cli import main; main(standalone_mode=0); print(*sys.modules, file=sys.stderr)"
+    words = [sys.executable, "-c", code, "run", "piston", "--revolutions", "1", "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert list(json.loads(done.stdout)) == KEYS
+    assert not re.search("Traceback|Warning", done.stderr)
+    modules = done.stderr.splitlines()[-1]
     begin = "lathe_rc.cell.stages."
     imported = {module.removeprefix(begin) for module in modules.split() if module.startswith(begin)}
     assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "form", "tool"}

@@ -296,6 +296,7 @@ def test_a_law_that_senses_gets_the_measured_position():
 # --- the studies that judge it
 
 
+@pytest.mark.system
 def test_the_suite_has_it_within_the_tolerance_and_ahead_of_its_peer_with_everything_at_once():
     study = STUDIES["robust"]
     found = study.run(study.parameters(plants=1, revolutions=24, conditions=["all at once"])).to_json()

@@ -8,21 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from bags import lathe
 
 from lathe_rc import extensions, harness, hosts
 from lathe_rc.cell import scenario
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.cli import main
 from lathe_rc.compiled.struct_view import explain_unfit
 from lathe_rc.errors import InputError, LatheError
 
 SHORT = "spindle_encoder.revolutions=4.0"
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [*arguments])
 
 
 @pytest.fixture

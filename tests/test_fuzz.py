@@ -250,16 +250,6 @@ def test_metadata_that_nobody_can_use_are_refused(tmp_path, change, said):
         check(folder(tmp_path / "bag", change=change))
 
 
-@pytest.mark.parametrize("name", ["metadata.yaml", "digests.json", "bag.mcap"])
-@pytest.mark.parametrize("target", ["", "/dev/zero"])
-def test_what_is_no_file_is_refused_unread(tmp_path, name, target):
-    place = folder(tmp_path / "bag", word=b"digest") / name
-    place.unlink()
-    place.symlink_to(target) if target else os.mkfifo(place)
-    with refused("not a file|no file|there is no such file|a link that leads out of the bag"):
-        check(tmp_path / "bag")
-
-
 def database(path, *statements):
     bag = folder(path, word=b"SQLite format")
     with sqlite3.connect(bag / "bag.db3") as base:

@@ -29,6 +29,7 @@ def shown(notebook):
     return ["a picture" if "image/png" in each else each["text/plain"] for each in found]
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_prints_what_is_stored_in_it(path, tmp_path):
     """A notebook runs from top to bottom, prints what is stored in it and leaves nothing behind."""

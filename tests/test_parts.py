@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bags import lathe
 from cells import cuts, encoder, scenario, spans
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -27,7 +27,6 @@ from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.cli import main
 from lathe_rc.control.q_filter import Exponential, Gaussian, QFilter, Weights
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.monitors import Alarm, PlainMonitor
@@ -72,10 +71,6 @@ def refusal(node, **values):
         Cell(cell(**{node: values}).nodes).check()
     assert len(str(refused.value).splitlines()) == 1
     return str(refused.value)
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 # ---- the page

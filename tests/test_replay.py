@@ -147,18 +147,13 @@ def test_the_services_of_rosbag2_control_a_replay(strange, listener):
     assert listener.heard["/b"] == []
 
 
-def test_a_reader_that_is_there_gets_the_first_message(strange, listener):
-    with started("replay", strange, "--rate", "0") as process:
-        assert process.wait(60.0) == 0
-    listener.wait_for(lambda: sum(map(len, listener.heard.values())) == COUNT)
-
-
 def test_every_message_comes_in_order_with_the_clock(strange, listener):
-    """Every message comes in order with the clock, in each round."""
+    """Every message comes in order with the clock, in each round, the first one too."""
     with started("replay", strange, "--rate", "0", "--loop"):
         whole = {"/a": [float(n) for n in range(0, COUNT, 2)], "/b": [float(n) for n in range(1, COUNT, 2)]}
         listener.wait_for(lambda: all(len(heard) >= 3 * len(whole[topic]) for topic, heard in listener.heard.items()))
     for topic, heard in listener.heard.items():
+        assert heard[: len(whole[topic])] == whole[topic]
         start = heard.index(whole[topic][0], 1)
         assert heard[start : start + len(whole[topic])] == whole[topic]
     assert sorted(set(listener.clock)) == [5 * 10**9 + number * 10**6 for number in range(COUNT)]

@@ -308,14 +308,6 @@ def ros(enclave, *options):
 ENDLESS = ["spindle_encoder.revolutions=0.0", "spindle_encoder.speed_factor=0.05"]
 
 
-def test_the_cell_uses_what_its_file_allows_and_nothing_else(observer, tmp_path):
-    """The graph of the full cell is what its policy allows, neither less nor more; tests/system has the other cells."""
-    root = parsed((CONFIG / "security" / "full_cell.policy.xml").read_text(encoding="utf-8"))
-    with running(tmp_path, members(scenarios.load(CONFIG / "full_cell.yaml", ENDLESS), root, tmp_path)):
-        wait_for_block_0(observer)
-        compare(observer, root)
-
-
 def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_path):
     """A cell in groups and those that listen to it use what their policy allows, and nothing else."""
     rerun = [RERUN_BRIDGE] if importlib.util.find_spec("rerun") else []

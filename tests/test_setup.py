@@ -587,7 +587,7 @@ def test_system_tests_run_only_when_asked_for(checkers, monkeypatch):
     assert any("--system" in line for line in checkers.verdicts)
     checkers.ran.clear()
     assert check.main(["--system", "-k", "cell"]) == 0
-    assert checkers.pytest == ["-m", "system", "--numprocesses=2", "--dist=loadfile", "tests", "-k", "cell"]
+    assert checkers.pytest == ["-m", "system", "--numprocesses=2", *check.BY_FILE, "tests", "-k", "cell"]
     assert checkers.ran == []
 
 

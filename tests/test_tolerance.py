@@ -6,23 +6,18 @@ import re
 
 import numpy as np
 import pytest
+from bags import lathe
 from cells import config, scenario
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.bag import provenance
-from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 
 errors = st.lists(st.sampled_from([0.5, 1.0, 1.5, 3.0]), max_size=30)
 SHORT = ("run", "piston", "--revolutions", "5")
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def page_of(bag, *options):

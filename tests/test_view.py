@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bags import lathe
 from cells import config, listening, scenario, until
-from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
 rr = pytest.importorskip("rerun")
@@ -19,7 +19,6 @@ from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
 from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
-from lathe_rc.cli import main  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.view import rerun_part as parts  # noqa: E402
 from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
@@ -30,10 +29,6 @@ from lathe_rc.view.rerun_scene import Scene  # noqa: E402
 from lathe_rc.view.rerun_signals import extreme_samples  # noqa: E402
 
 STEP_NS = 15625
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def refused(*arguments, code=2):

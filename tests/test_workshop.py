@@ -5,12 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from bags import lathe
 from cells import scenario
-from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness, part
-from lathe_rc.cli import main
 from lathe_rc.signals import measured_profile
 
 ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]
@@ -23,10 +22,6 @@ def turned(tmp_path_factory):
     given = {"profile": "harmonics", "harmonic_order": ORDERS, "harmonic_amplitude": AMPLITUDES, "feed": 1e-3}
     result = harness.run(scenario(spindle_encoder={"revolutions": 6.2}, tool=given), bag=bag)
     return bag, result
-
-
-def lathe(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def test_a_bag_is_measured_as_the_run_was(turned):

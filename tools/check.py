@@ -37,7 +37,8 @@ SITE = [sys.executable, str(ROOT / "tools" / "docs.py"), "--check"]
 KERNELS = [sys.executable, str(ROOT / "tools" / "kernels.py")]
 # Tests wait for processes now and then, so three files run at once on two cores; what a file's tests share is made
 # once. Which files come first says tests/conftest.py.
-AT_ONCE = ["--numprocesses=3", "--dist=loadfile", "--no-loadscope-reorder"]
+BY_FILE = ["--dist=loadfile", "--no-loadscope-reorder"]
+AT_ONCE = ["--numprocesses=3", *BY_FILE]
 REPORTED = [f"--junitxml={slow_tests.REPORT}"]
 LOCKED_NUMPY = re.compile(r"^numpy==(\S+) ; python_full_version >=", re.MULTILINE)
 
@@ -102,7 +103,7 @@ def main(arguments: list[str]) -> int:
         if against := system.provide():
             print(f"lathe: {against}", file=sys.stderr)
             return 1
-        return int(pytest.main(["-m", "system", "--numprocesses=2", "--dist=loadfile", "tests", *arguments]))
+        return int(pytest.main(["-m", "system", "--numprocesses=2", *BY_FILE, "tests", *arguments]))
     if "--table" in arguments:
         return slow_tests.main()
     if "--promises" in arguments:
