@@ -36,6 +36,7 @@ def law(tmp_path_factory):
     return export_nodes(cell, ["learning_controller"], place, name="law")
 
 
+@pytest.mark.system
 def test_a_whole_cell_has_the_bits_of_the_engine(tmp_path):
     """Feedback, noise, a set point and a cut within the library."""
     cell = load("full_cell", ["electrodynamic_actuator.noise_rms=1e-8"])

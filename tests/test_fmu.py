@@ -96,6 +96,7 @@ def test_an_imported_second_order_drive_moves_as_ours(fmus, tmp_path, fmi):
         assert np.abs(found[field] - wanted[field]).max() < 1e-9 * np.abs(wanted[field]).max()
 
 
+@pytest.mark.system
 def test_three_fmus_have_the_same_bits_in_every_host(fmus, tmp_path):
     """Filter, drive and a slower filter, of FMI 2.0 and 3.0, in one cell in every host, and four times in a batch."""
     smooth = {"fmu_inputs": ["u = coarse/command.position"], "fmu_outputs": ["smooth/command.position = y"]}

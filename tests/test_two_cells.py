@@ -13,7 +13,6 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness, messages
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cli import main
 
 LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 20.0, "speed_factor": 1.0})  # there for 1.2 s
@@ -68,22 +67,6 @@ def test_a_cell_lives_in_the_middle_of_another(domain, tmp_path):
     assert right.digest == alone(RIGHT, "/shop/right")
     assert mixed(tmp_path / "left", "/left") == set()
     assert mixed(tmp_path / "right", "/shop/right") == set()
-
-
-@pytest.mark.system
-def test_two_composed_cells_start_at_once(domain, tmp_path):
-    with concurrent.futures.ThreadPoolExecutor() as pool:
-        runs = {
-            name: pool.submit(
-                harness.run, cell, mode="composed", domain=domain, namespace=f"/{name}", bag=tmp_path / name
-            )
-            for name, cell in (("left", LEFT), ("right", RIGHT))
-        }
-    assert runs["left"].result().digest == alone(LEFT, "/left")
-    assert runs["right"].result().digest == alone(RIGHT, "/right")
-    assert mixed(tmp_path / "left", "/left") == mixed(tmp_path / "right", "/right") == set()
-    again = resimulate(tmp_path / "right")
-    assert again.digest == again.recorded == harness.run(RIGHT).digest
 
 
 def test_a_domain_that_a_cell_was_given_is_chosen_for_no_other(monkeypatch):
