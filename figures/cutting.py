@@ -122,6 +122,7 @@ cutting = Regeneration(REALISTIC.transfer)
 frequencies = 2 * np.pi * np.concatenate((np.geomspace(53.06, 58.0, 400), np.geomspace(58.0, 400.0, 400)))
 for number in range(6):
     speed, stiffness = lobes(cutting, number, frequencies)
+    stiffness[stiffness > 3.35e6] = np.nan  # room for the legend
     chart.plot(speed * 30 / np.pi, stiffness / 1e3, color=BLUE, lw=1.2, label=None if number else "lobes")
 limit = cutting.worst()
 chart.axhline(
@@ -154,7 +155,9 @@ waves.set(xlabel="time since a kick of 0.1 µm [s]", ylabel="change of the defle
 waves.set_title("at the worst speed; loss of contact ends the growth", fontsize=10)
 for axes in (random, interrupted, chart, waves):
     axes.grid(visible=True, alpha=0.25)
-    legend = axes.legend(fontsize=8, loc="upper left" if axes in {random, waves} else "upper right", ncols=2)
+    legend = axes.legend(
+        fontsize=8, loc="upper left" if axes in {random, waves} else "upper right", ncols=4 if axes is chart else 2
+    )
     for line in legend.get_lines():
         line.set_linewidth(1.2)
 figure.savefig(PICTURES / "cutting.png", dpi=130)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of view.md: a piston's report in a browser, light, dark and narrow, and its comparison.
+"""Makes the pictures of view.md and force_position.md: reports in a browser, light, dark and narrow, a comparison.
 
 With a bag as second argument, from that bag.
 """
@@ -32,6 +32,11 @@ with tempfile.TemporaryDirectory() as folder:
     for place, dark in enumerate((False, True)):
         both.paste(shot(page, NARROW, dark=dark), (place * (NARROW[0] + 20), 0))
     save(both, "report_narrow")
+    force = Path(folder) / "force"
+    lathe_rc.run(lathe_rc.load("force_turning"), bag=force)
+    report.write_report(force, page)
+    page.write_text(page.read_text(encoding="utf-8").replace(f"{folder}/", ""), encoding="utf-8")
+    save(shot(page, (WIDE[0], 1700)), "report_force")
     slow = Path(folder) / "slow"
     lathe_rc.run(lathe_rc.load("piston", ["learning_controller.learning_gain=0.4"]), bag=slow)
     compare.write_comparison({"turned": bag, "slow": slow}, page, ["turned", "slow"])

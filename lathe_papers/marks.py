@@ -9,7 +9,7 @@ from typing import Any
 COLOURS = (
     "#0072b2", "#d55e00", "#000000", "#e69f00", "#56b4e9", "#009e73", "#cc79a7", "#6e2c00", "#9467bd", "#7f7f7f",
 )  # fmt: skip
-_MARKERS = "osD^v<>PX*"
+MARKERS = "osD^v<>Px*"
 
 #: laws of the comparisons by their names in the tables
 LAWS = {
@@ -29,7 +29,7 @@ LAWS = {
 
 def point(number: int) -> dict[str, Any]:
     """Return colour and marker of the points of one of several things, counted from 0."""
-    return {"color": COLOURS[number % len(COLOURS)], "marker": _MARKERS[number % len(_MARKERS)]}
+    return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
 def curve(number: int) -> dict[str, Any]:

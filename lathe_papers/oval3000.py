@@ -18,7 +18,7 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
-from lathe_papers import cells, robust
+from lathe_papers import cells, marks, robust
 from lathe_papers.judge import Array, Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import ros_yaml
@@ -41,7 +41,6 @@ _LARGEST = 2**31  # fresh seeds are below
 _LOOP, _MODE, _LOSS = 0.2, 0.1, 0.5  # relative spreads of the drives, see `Oval3000Parameters.drives`
 _DRIVE = "loaded_drive.coarse_"
 _NODE = "controller"
-_MARKERS = "osD^v<>Px"  # of the laws in the figure
 _DELAY = 16  # [sample] of the position that the laws see
 
 CONDITIONS: dict[str, Values] = {
@@ -185,7 +184,7 @@ class Oval3000Result:
         for k, (axes, condition) in enumerate(zip(panels, self.conditions, strict=True)):
             for n, law in enumerate(self.laws):
                 for s, style in enumerate(("-", "--")):
-                    mark = {"marker": _MARKERS[n % len(_MARKERS)], "ms": 4, "markevery": (n, 12), "color": f"C{n}"}
+                    mark = {**marks.point(n), "ms": 4, "markevery": (n, 12), "color": f"C{n}"}
                     label = law if s == 0 else None
                     axes.semilogx(np.sort(self.largest[s, k, n]), shares, style, lw=1.2, label=label, **mark)
             axes.axvline(self.tolerance, color="black", lw=0.8, ls=":")

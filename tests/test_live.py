@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip("rerun")
 
-from test_view import View, refused
+from test_view import View, lathe, refused
 
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
@@ -25,6 +25,7 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import dds
+from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.live_runs import Backlog, RunOrder
 from lathe_rc.view.rerun_live import Live
 from lathe_rc.view.rerun_output import Output
@@ -88,10 +89,10 @@ def turned(tmp_path_factory):
 class Watched:
     """A live view to files."""
 
-    def __init__(self, folder, types):
+    def __init__(self, folder, types, known=None):
         self.said = []
         output = Output("save", file=folder / "live.rrd", url="", port=0)
-        self.live = Live(output.open, rate=2000.0, say=self.said.append)
+        self.live = Live(output.open, rate=2000.0, say=self.said.append, scenario=known)
         self.live.present = types
 
     def hear(self, heard):
@@ -116,6 +117,21 @@ def test_a_run_and_its_repetition_are_a_recording_each(turned, tmp_path):
     assert view.column("/events", "TextLog:text") == [["learning_controller/events: freeze"]]
     assert view.scalars("/learning/coarse/learning")[1].tolist() == recording.sparse["/coarse/learning"].values["cycle"]
     assert "its end was not heard" in watched.said[2]
+
+
+def test_length_and_feed_of_a_scenario_scale_the_part(turned, tmp_path):
+    bag, heard, types = turned
+    given = load("piston", ["spindle_encoder.revolutions=12.3", "tool.feed=1e-4"])
+    assert parts.Outlook.of(given) == parts.Outlook(12.3, 12.3 * 1e-4)
+    watched = Watched(tmp_path, types, given.varied({"tool.feed": 0.0}))
+    watched.hear(heard)
+    (shown,) = watched.end()
+    assert lathe("view", bag, "-o", tmp_path / "bag.rrd").exit_code == 0
+    live, whole = (
+        View(file).column("/machine/part/surface", "Mesh3D:vertex_positions")
+        for file in (shown.file, tmp_path / "bag.rrd")
+    )
+    assert_allclose(np.array(live), np.array(whole), rtol=1e-3, atol=1e-3)
 
 
 def test_topics_that_nobody_knew_of_are_taken_in(turned, tmp_path):
@@ -177,7 +193,7 @@ def test_broken_bytes_are_named(turned, tmp_path):
         (["--live", "--connect", "localhost:9876"], "url = 'localhost:9876'; allowed: rerun+http://HOST:PORT/proxy"),
         (["--live", "a_bag"], "a BAG with --live; allowed: one of them"),
         (["-o", "x.rrd"], "no BAG; name one, or --live"),
-        (["a_bag", "--once"], "--connect, --once and --json are for --live"),
+        (["a_bag", "--once"], "--connect, --scenario, --once and --json are for --live"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(options, said, tmp_path, monkeypatch):

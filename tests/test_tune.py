@@ -3,6 +3,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -434,6 +435,7 @@ def test_the_command_shows_and_writes_what_it_found(tmp_path, command):
     assert (folder / "history.png").read_bytes().startswith(b"\x89PNG")
     page = (folder / "history.html").read_text(encoding="utf-8")
     assert "https://cdn" not in page
+    assert re.search(r"format\(datum.value, .{1,7}~s", page), "pm, nm or µm at the ticks"
     assert "prefers-color-scheme: dark" in page
     assert f">{LEAD}</td><td>0.0009</td>" in page, "the parameters, of the start and of the best"
     told = json.loads(command(*asked, "--json").stdout)

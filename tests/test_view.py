@@ -2,6 +2,7 @@
 """``lathe view`` and the scene behind it: what Rerun is given is what was recorded."""
 
 import importlib.util
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from bags import lathe
 from cells import config, listening, scenario, until
 from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image
 
 rr = pytest.importorskip("rerun")
 rrb = pytest.importorskip("rerun.blueprint")
@@ -133,12 +135,13 @@ def test_the_rate_of_points_is_what_was_asked_for(turned, tmp_path):
 
 def test_the_last_map_holds_all_revolutions(turned, shown):
     angle, error = form(turned[1])
-    last = shown.column("/form_error/map", "Tensor:data")[-1][0]
-    assert (last["shape"], last["names"]) == ([12, ANGLES], ["revolution", "angle / 1°"])
-    rows = np.array(last["buffer"]).reshape(12, ANGLES)
+    file = shown.column("/form_error/map", "EncodedImage:blob")[-1][0]
+    rows = np.asarray(Image.open(io.BytesIO(bytes(file))))[:: 140 // 12]
+    assert rows.shape == (12, ANGLES, 3)
     for k in (0, 11):
         inside = (angle >= 2 * np.pi * (k + 40 / 360)) & (angle < 2 * np.pi * (k + 41 / 360))
-        assert rows[k, 40] == pytest.approx(np.log10(np.abs(error[inside].mean()) * 1e6), abs=2e-3)
+        assert_allclose(rows[k, 40], parts.colours(-error[inside].mean(keepdims=True))[0, :3], atol=1)
+    assert parts.colours(parts.SCALE)[[0, 3, 6], :3].tolist() == [[8, 48, 107], [244, 244, 244], [103, 0, 31]]
 
 
 def test_the_surface_grows_by_a_strip_a_revolution(shown):
@@ -178,7 +181,13 @@ def test_every_curve_and_picture_has_a_view(turned, shown):
 
     layout = contents(blueprint(turned[1].types).root_container)
     trees = tuple(line.removesuffix("**") for line in layout if line.endswith("**"))
-    for component in ("TextLog:text", "Scalars:scalars", "Mesh3D:vertex_positions", "Tensor:data", "BarChart:values"):
+    for component in (
+        "TextLog:text",
+        "Scalars:scalars",
+        "Mesh3D:vertex_positions",
+        "EncodedImage:blob",
+        "BarChart:values",
+    ):
         entities = shown.entities(component)
         assert entities
         assert all(entity in layout or f"{entity}/".startswith(trees) for entity in entities)
@@ -221,11 +230,14 @@ def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
     assert view.column("/states/electrodynamic_actuator/fault", "time") == [begun * STEP_NS, over * STEP_NS]
 
 
-def test_where_nothing_has_happened_there_are_neither_bands_nor_events(turned):
-    types = turned[1].types
-    silent = [topic for topic, kind in types.items() if kind == messages.EVENT]
-    for given, expected in (([], True), (silent, False)):
-        rows = beside_the_part(types, silent=given)
+def test_without_a_state_there_is_no_view_of_states(turned, tmp_path, monkeypatch):
+    """The event of the bag is none; the supervisor of another is in a state from the beginning."""
+    sent = []
+    monkeypatch.setattr(rr.RecordingStream, "send_blueprint", lambda _, given: sent.append(given.root_container))
+    harness.run(load("supervised", ["spindle_encoder.revolutions=1"]), bag=tmp_path / "bag")
+    for bag, expected in ((turned[0], False), (tmp_path / "bag", True)):
+        assert lathe("view", bag, "-o", tmp_path / f"{expected}.rrd").exit_code == 0
+        rows = sent[-1].contents[-1].contents[-1].contents
         assert any(isinstance(row, rrb.StateTimelineView) for row in rows) == expected
 
 

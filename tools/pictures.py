@@ -86,6 +86,7 @@ TABLE = {
     "compare.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_dark.png": _photograph("report_screenshot", "view.md", " chromium turned"),
+    "report_force.png": _photograph("report_screenshot", "force_position.md", " chromium turned"),
     "report_narrow.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "site.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),
     "site-narrow.png": _photograph("site_screenshots", "../CONTRIBUTING.md"),

@@ -53,6 +53,9 @@ class RerunBridgeParameters(Table):
     rate: Annotated[float, Ge(1)] = parameter(
         RERUN_RATE, "points of a curve, at most: smallest and largest values", "1/s"
     )
+    scenario: str = parameter(
+        "", "of the cell, a file or a name: its length and feed scale the part; empty: revolutions lie 0.5 mm apart"
+    )
     once: bool = parameter(default=False, doc="end when the first run is over")
 
 

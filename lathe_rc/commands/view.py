@@ -53,6 +53,7 @@ def _live(values: Mapping[str, object], *, as_json: bool) -> None:
 )
 @click.option("--live", is_flag=True, help="no BAG: what runs in this ROS domain, one run after the other")
 @click.option("--connect", metavar="URL", help="live: in a viewer that runs already, rerun+http://HOST:PORT/proxy")
+@click.option("--scenario", metavar="SCENARIO", help="live: of the cell; its length and feed scale the part")
 @click.option("--once", is_flag=True, help="live: end with the first run")
 @click.option("--json", "as_json", is_flag=True, help="live: print one JSON object at the end")
 def view(
@@ -61,6 +62,7 @@ def view(
     port: int,
     rate: float,
     connect: str | None,
+    scenario: str | None,
     *,
     web: bool,
     live: bool,
@@ -73,13 +75,13 @@ def view(
         raise InputError(f"{' with '.join(given)}; allowed: one of them")
     if (bag is None) != live:
         raise InputError("a BAG with --live; allowed: one of them" if bag else "no BAG; name one, or --live")
-    if not live and (connect or once or as_json):
-        raise InputError("--connect, --once and --json are for --live")
+    if not live and (connect or scenario or once or as_json):
+        raise InputError("--connect, --scenario, --once and --json are for --live")
     require()
     if bag is None:
         where: RerunOutput = "save" if output else "serve" if web else "connect" if connect else "spawn"
         values = {"output": where, "file": str(output or ""), "url": connect or "", "port": port, "rate": rate}
-        _live({**values, "once": once}, as_json=as_json)
+        _live({**values, "scenario": scenario or "", "once": once}, as_json=as_json)
     elif output:
         write(bag, output, rate=rate)
         size = output.stat().st_size

@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from rclpy.signals import SignalHandlerOptions
 
+from lathe_rc.cell import scenario
 from lathe_rc.cell.beside import RERUN_BRIDGE as KIND
 from lathe_rc.cell.beside import RerunBridgeParameters
 from lathe_rc.nodes import arguments
@@ -34,9 +35,10 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
     require()
     signals = SignalHandlerOptions.NO
     with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
+        known = scenario.load(parameters.scenario) if parameters.scenario else None
         output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
-            live = Live(output.open, rate=parameters.rate, say=node.get_logger().info)
+            live = Live(output.open, rate=parameters.rate, say=node.get_logger().info, scenario=known)
             bridge = Listener(node, live, lambda: output.ended or bool(parameters.once and live.shown))
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, bridge.stop)

@@ -19,10 +19,18 @@ _KINDS = ("start", "meets all subjects", "does not")
 _SHAPES = ["diamond", "circle", "cross"]
 
 
+def _unit(tuning: Tuning, column: str) -> tuple[float, str, str]:
+    """Return the factor from SI units, the unit in a title, and the expression of a tick; lengths have SI prefixes."""
+    factor, name = unit(column, tuning.folder.scenario)
+    if name == "µm":
+        return 1.0, "", "datum.label && replace(format(datum.value, '~s'), regexp('[^0-9]?$'), ' $&m')"
+    return factor, f" [{name}]" if name else "", "datum.label"
+
+
 def _title(tuning: Tuning, column: str) -> str:
-    percentile, name = tuning.objectives.percentile, unit(column, tuning.folder.scenario)[1]
+    percentile, name = tuning.objectives.percentile, _unit(tuning, column)[1]
     over = "" if tuning.cells == 1 else ", worst" if percentile == 100.0 else f", {percentile:g}th percentile"
-    return f"{column}{over}{f' [{name}]' if name else ''}"
+    return f"{column}{over}{name}"
 
 
 def chart(tuning: Tuning) -> alt.LayerChart:
@@ -32,7 +40,8 @@ def chart(tuning: Tuning) -> alt.LayerChart:
     against the first.
     """
     columns = [goal.column for goal in tuning.objectives.goals]
-    factors = {column: unit(column, tuning.folder.scenario)[0] for column in columns}
+    factors = {column: _unit(tuning, column)[0] for column in columns}
+    axes = [alt.Axis(labelExpr=_unit(tuning, column)[2]) for column in columns]
     front = {trial.number for trial in tuning.front}
     improvements = {trial.number for trial in tuning.improvements}
     rows: list[dict[str, Any]] = []
@@ -54,18 +63,18 @@ def chart(tuning: Tuning) -> alt.LayerChart:
     base = alt.Chart(alt.InlineData(values=rows))
     scale = _scale(rows, "first")
     if len(columns) > 1:
-        across = alt.X("first:Q", title=_title(tuning, columns[0]), scale=scale)
-        up = alt.Y("second:Q", title=_title(tuning, columns[-1]), scale=_scale(rows, "second"))
+        across = alt.X("first:Q", title=_title(tuning, columns[0]), scale=scale, axis=axes[0])
+        up = alt.Y("second:Q", title=_title(tuning, columns[-1]), scale=_scale(rows, "second"), axis=axes[-1])
         line = base.transform_filter("datum.front").mark_line(color=_BEST).encode(across, up)
         tip = "second:Q"
     else:
         across = alt.X("trial:Q", title="trial")
-        up = alt.Y("first:Q", title=_title(tuning, columns[0]), scale=scale)
+        up = alt.Y("first:Q", title=_title(tuning, columns[0]), scale=scale, axis=axes[0])
         line = base.mark_line(color=_BEST, interpolate="step-after").encode(across, alt.Y("best:Q", scale=scale))
         tip = "kind:N"
     shape = alt.Shape("kind:N", title=None, scale=alt.Scale(domain=_KINDS, range=_SHAPES), legend=legend)
     dots = base.mark_point(size=60, filled=True, opacity=1.0).encode(
-        across, up, colour, shape, tooltip=["trial:Q", "first:Q", tip]
+        across, up, colour, shape, tooltip=["trial:Q", alt.Tooltip("first:Q", format=".4~s"), tip]
     )
     text = f"Tuning of {tuning.folder.scenario.name}: {len(tuning.trials)} trials"
     without = sum(not all(map(math.isfinite, trial.score.costs)) for trial in tuning.trials)

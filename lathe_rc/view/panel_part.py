@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The turned part as a closed body, for STL and GLB files; the colours show the form error."""
 
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -10,7 +9,7 @@ import numpy.typing as npt
 import trimesh
 
 from lathe_rc.errors import InputError
-from lathe_rc.view.page_server import own_file
+from lathe_rc.view.diverging import colours
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
 Array = npt.NDArray[np.float64]
@@ -48,9 +47,9 @@ def body(revolutions: Sequence[Revolution], radius: float, enlarged: float, limi
     rings = np.stack([radii * np.cos(angle), radii * np.sin(angle), z], axis=-1).reshape(-1, 3)
     ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, z[-1, 0]]])
     errors = np.stack([revolutions[k].error for k in further]).ravel()
-    colours = np.concatenate([_colours(-errors / limit), np.full((2, 4), 160, np.uint8)])
+    shades = np.concatenate([colours(-errors / limit), np.full((2, 4), 160, np.uint8)])
     return trimesh.Trimesh(
-        np.concatenate([rings, ends]) * _MM, _faces(len(further)), vertex_colors=colours, process=False
+        np.concatenate([rings, ends]) * _MM, _faces(len(further)), vertex_colors=shades, process=False
     )
 
 
@@ -66,16 +65,6 @@ def _faces(rings: int) -> npt.NDArray[np.int64]:
     found.append(np.stack([np.full(ANGLES, axis), there, here], axis=1))
     found.append(np.stack([np.full(ANGLES, axis + 1), last + here, last + there], axis=1))
     return np.concatenate(found)
-
-
-def _colours(share: Array) -> npt.NDArray[np.uint8]:
-    """Return RGBA colours of -1 to 1, those of all figures (page.css, light), shape (n, 4)."""
-    told = re.search(r"--below-zero-above: ([^;]+);", own_file("page.css"))
-    assert told is not None, "page.css has the colours"
-    stops = np.array([[int(code[k : k + 2], 16) for k in (1, 3, 5)] for code in told[1].split()], dtype=np.float64)
-    place = (np.clip(share, -1.0, 1.0) + 1.0) / 2.0 * (len(stops) - 1)
-    found = np.stack([np.interp(place, np.arange(len(stops)), stops[:, k]) for k in range(3)], axis=1)
-    return np.concatenate([found.round(), np.full((share.size, 1), 255.0)], axis=1).astype(np.uint8)
 
 
 def file(mesh: trimesh.Trimesh, ending: str) -> bytes:

@@ -68,7 +68,7 @@ def _part() -> rrb.Vertical:
     return rrb.Vertical(
         rrb.Spatial3DView(
             origin="/machine",
-            name="part, colour: form error",
+            name="part; red: material left, blue: cut too deep",
             eye_controls=rrb.EyeControls3D(
                 position=(1.5 * parts.RADIUS, 3.6 * parts.RADIUS, middle + 1.8 * parts.RADIUS),
                 look_target=(-0.15 * parts.RADIUS, 0.0, middle),
@@ -78,11 +78,9 @@ def _part() -> rrb.Vertical:
             background=rrb.Background(color=(24, 27, 33)),
             time_ranges=_SO_FAR,
         ),
-        rrb.TensorView(
+        rrb.Spatial2DView(
             origin="/form_error/map",
-            name="form error over angle, a row a revolution; colours as at the part",
-            scalar_mapping=rrb.TensorScalarMapping(colormap=parts.COLOURS, mag_filter="nearest"),
-            view_fit="fill",
+            name="form error from 0° to 360°, a row a revolution, the first on top; red: material left",
         ),
         row_shares=[3, 2],
     )
@@ -102,7 +100,12 @@ def _loops(loops: Sequence[Loop]) -> list[rrb.View]:
 
 
 def blueprint(
-    types: Mapping[str, str], *, live: bool = False, silent: Collection[str] = (), loops: Sequence[Loop] = ()
+    types: Mapping[str, str],
+    *,
+    live: bool = False,
+    silent: Collection[str] = (),
+    loops: Sequence[Loop] = (),
+    bands: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout for a run with the given topics.
 
@@ -111,6 +114,7 @@ def blueprint(
         live: whether the view follows incoming data.
         silent: topics without messages.
         loops: force and position loops whose results are logged.
+        bands: whether there are states, of a supervisor, faults or limits.
     """
     kinds = set(types.values())
     said = {kind for topic, kind in types.items() if topic not in silent}
@@ -145,7 +149,7 @@ def blueprint(
         tabs.append(rrb.TextLogView(origin="/events", name="events"))
     if tabs:
         rows.append(rrb.Tabs(*tabs, active_tab=0))
-    if messages.SAFETY_STATUS in kinds or said & {*LOGGED}:
+    if bands:
         rows.append(rrb.StateTimelineView(origin=f"/{STATES}", name="states of the supervisor, faults, limits met"))
     above = [rrb.Horizontal(*top, column_shares=[3, 2, 3, 3][: len(top)])] if top else []
     right = rrb.Vertical(*rows)

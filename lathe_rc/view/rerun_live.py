@@ -7,13 +7,16 @@ Chunks that were dropped are counted and reported.
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError
+from lathe_rc.loops import loops
 from lathe_rc.messages import Signals
 from lathe_rc.view.live_runs import LiveRuns, ShownRun
+from lathe_rc.view.rerun_part import Outlook
 from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_scene import Scene
 from lathe_rc.view.rerun_signals import drawn_fields
@@ -35,17 +38,27 @@ class _RunView:
         open_recording: creates the recording of the run.
         rate: largest number of curve points per second.
         say: called with each line for the user.
+        scenario: scenario of the cell; None if unknown.
     """
 
     def __init__(
-        self, block: Block, types: Mapping[str, str], open_recording: Open, rate: float, say: Callable[[str], None]
+        self,
+        block: Block,
+        types: Mapping[str, str],
+        open_recording: Open,
+        rate: float,
+        say: Callable[[str], None],
+        scenario: Scenario | None,
     ) -> None:
         if not block.step_ns:
             raise LatheError(f"{block.source} sends a step of 0 ns")
         self._recording, file = open_recording(block.run_id or "run")
         self._step_ns = block.step_ns
         self._name, self._say = f"run {block.run_id or '(no id)'}", say
-        self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True)
+        known: dict[str, Any] = {}
+        if scenario:
+            known = {"outlook": Outlook.of(scenario), "loops": loops(scenario.nodes)}
+        self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True, **known)
         self._size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
         self._pieces = Pieces(types, self._size, self)
         self._shown = ShownRun(block.run_id, file, end=block.first_index)
@@ -110,7 +123,10 @@ class Live(LiveRuns):
         open_recording: creates a recording of a given name, and returns it with its file.
         rate: largest number of curve points per second.
         say: called with each line for the user.
+        scenario: scenario of the cell, for the extent of the part and the results of loops; None if unknown.
     """
 
-    def __init__(self, open_recording: Open, *, rate: float, say: Callable[[str], None]) -> None:
-        super().__init__(lambda block, types: _RunView(block, types, open_recording, rate, say))
+    def __init__(
+        self, open_recording: Open, *, rate: float, say: Callable[[str], None], scenario: Scenario | None = None
+    ) -> None:
+        super().__init__(lambda block, types: _RunView(block, types, open_recording, rate, say, scenario))

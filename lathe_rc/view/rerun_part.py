@@ -6,20 +6,23 @@ is drawn with a fixed radius, since a recording does not contain the true one.
 """
 
 from dataclasses import dataclass
-from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.time_master import TimeMasterParameters
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.view import diverging
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
 Array = npt.NDArray[np.float64]
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 
-COLOURS: Final = "turbo"  #: Rerun uses the same name
-LOG_RANGE = (-1.5, 2.5)  #: range of the colours, as log10 of |form error| in µm
+#: Deviations of the radius [m] on the scale beside the part; the outermost have the outermost colours.
+SCALE = 1e-6 * np.array([-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0])
+_LINEAR = 0.1e-6  # form error below which the colours are linear [m]; logarithmic beyond
 RADIUS = 50.0  #: radius of the part [mm]
 LENGTH = 110.0  #: length of the part, if the extent of the run is known [mm]
 _PITCH = 0.5  # distance between revolutions, if the extent is unknown [mm]
@@ -36,10 +39,14 @@ def log_um(error: Array) -> Array:
     return np.asarray(np.log10(np.maximum(np.abs(error), _SMALLEST) * 1e6))
 
 
-def colours(error: Array) -> npt.NDArray[np.uint8]:
-    """Return RGBA colours of form errors [m], shape (n, 4)."""
-    low, high = LOG_RANGE
-    return np.asarray(mpl.colormaps[COLOURS]((log_um(error) - low) / (high - low), bytes=True))
+def share(deviation: Array) -> Array:
+    """Return the place of deviations of the radius [m], form errors with the other sign, in the colours, -1 to 1."""
+    return np.asarray(np.sign(deviation) * np.log1p(np.abs(deviation) / _LINEAR) / np.log1p(SCALE[-1] / _LINEAR))
+
+
+def colours(deviation: Array) -> npt.NDArray[np.uint8]:
+    """Return RGBA colours of deviations of the radius [m], shape (n, 4), as in the report: red is material left."""
+    return diverging.colours(share(deviation))
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,14 @@ class Outlook:
 
     revolutions: float = 0.0
     travel: float = 0.0
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "Outlook":
+        """Return the properties of a run of a scenario; the travel of a slide is not known in advance."""
+        tables = scenario.nodes.values()
+        turns = next((table.revolutions for table in tables if isinstance(table, TimeMasterParameters)), 0.0)
+        tool = next((table for table in tables if isinstance(table, ToolParameters)), None)
+        return cls(turns, turns * tool.feed if tool and tool.height_from == "feed" else 0.0)
 
 
 @dataclass(frozen=True)
@@ -104,8 +119,9 @@ def ring(revolution: Revolution, scale: Scale) -> Ring:
     slope = (np.roll(radius, -1) - np.roll(radius, 1)) / (2.0 * (angle[1] - angle[0]))
     normals = np.stack([radius * cosine + slope * sine, radius * sine - slope * cosine, np.zeros(_VERTICES)], axis=1)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    magnitude = np.abs(revolution.error).reshape(_VERTICES, _STEP).max(axis=1)
-    return vertices.astype(np.float32), normals.astype(np.float32), colours(magnitude)
+    errors = revolution.error.reshape(_VERTICES, _STEP)
+    largest = errors[np.arange(_VERTICES), np.abs(errors).argmax(axis=1)]
+    return vertices.astype(np.float32), normals.astype(np.float32), colours(-largest)
 
 
 def _triangles() -> npt.NDArray[np.uint32]:

@@ -6,6 +6,7 @@ grow with the run, but for a hundred bytes per revolution of a force or position
 """
 
 import contextlib
+import io
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
+from PIL import Image
 
 from lathe_rc import event_log, messages
 from lathe_rc.cell.beside import RERUN_RATE
@@ -24,14 +26,24 @@ from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
-from lathe_rc.view.rerun_revolutions import ANGLES, HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
+from lathe_rc.view.rerun_revolutions import HIGHEST, Revolution, Revolutions
+from lathe_rc.view.rerun_signals import (
+    CYCLES,
+    STATE_COLOURS,
+    band,
+    curve_path,
+    curves,
+    extreme_samples,
+    supervisor,
+)
 
 _POSES = 250.0  # poses of part and tool per second
 _ROWS = 512  # rows of the map
+_TALL = 140  # about the height of the map, for a width of 360
 _LEAST = 1e-9  # smallest error of a loop that is shown, in its unit
 _BARS = np.arange(1, HIGHEST + 1) - 0.5  # left edges: Rerun draws bars to the right of their position
 _FLUSH, _EVER = 30.0, 1e9  # [s] allowed for a viewer to take the rest of a live recording, and for a file
+_LABEL: dict[str, Any] = {"colors": (255, 255, 255), "radii": 0.1, "show_labels": True}  # readable in dark and light
 _GROWTH = 8  # the map is resent when it has grown by 1/8
 # Colours of Okabe and Ito, which most colour-blind people can distinguish.
 _PALETTE = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))
@@ -76,13 +88,14 @@ class Scene:
         self._live, self._silent = live, {full(topic) for topic in silent}
         self._types: dict[str, str] = {}
         self._nominal: set[str] = set()  # supervisors whose first state is shown
+        self._bands = False  # whether there are states; without one, their view would only say so
         self._outlook = outlook or parts.Outlook()
         self.window = max(1, int(np.ceil(2e9 / (rate * step_ns))))
         self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
         self._scale: parts.Scale | None = None
         self._revolutions = Revolutions()
         self._ring: parts.Ring | None = None
-        self._rows: list[npt.NDArray[np.float16]] = []
+        self._rows: list[npt.NDArray[np.uint8]] = []
         self._every = 1  # one row and one ring per this many revolutions
         self._sent = 0  # number of rows in the map sent last
         self._newest: Revolution | None = None
@@ -104,7 +117,7 @@ class Scene:
 
     def _blueprint(self) -> rrb.Blueprint:
         shown_loops = [watch.loop for watch in self._loops]
-        return blueprint(self._types, live=self._live, silent=self._silent, loops=shown_loops)
+        return blueprint(self._types, live=self._live, silent=self._silent, loops=shown_loops, bands=self._bands)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Log consecutive samples and the messages among them.
@@ -156,9 +169,12 @@ class Scene:
                 path = curve_path(topic, field)
                 names[path] = f"{topic.strip('/')} {curve.label}"
                 plots.setdefault(curve.plot, []).append(path)
-        for paths in plots.values():
+        for plot, paths in plots.items():
             for path, colour in zip(paths, itertools.cycle(_PALETTE), strict=False):
-                line = rr.SeriesLines(names=names[path], colors=colour, widths=1.5, aggregation_policy="minmax")
+                # Rerun draws curves in the order of their paths: each is thinner than those that it could hide.
+                above = len(paths) - 1 - sorted(paths).index(path)
+                width = 1.5 if plot == "learning" else 1.3 + min(2.2 * above, 5.0)
+                line = rr.SeriesLines(names=names[path], colors=colour, widths=width, aggregation_policy="minmax")
                 self._static(path, line)
         if self._encoder and self._tool:
             self._static("machine", rr.ViewCoordinates.RIGHT_HAND_X_UP)
@@ -172,14 +188,13 @@ class Scene:
 
     def _send_legend(self) -> None:
         """Log the colour scale as dots beside the part."""
-        dots = np.linspace(*parts.LOG_RANGE, 33)
-        decade = np.isclose(dots, np.round(dots))
-        z = np.linspace(0.0, parts.LENGTH, dots.size)
-        positions = np.stack([np.full(dots.size, -1.35 * parts.RADIUS), np.zeros(dots.size), z], axis=1)
-        labels = [f"{10**dot:g} µm" if whole else "" for dot, whole in zip(dots.tolist(), decade, strict=True)]
-        radii, colours = np.where(decade, 2.6, 1.7), parts.colours(10.0**dots * 1e-6)
-        scale = rr.Points3D(positions, colors=colours, radii=radii, labels=labels, show_labels=True)
-        self._static("machine/scale", scale)
+        x = parts.RADIUS * parts.share(parts.SCALE)
+        positions = np.stack([x, np.zeros(x.size), np.full(x.size, 1.4 * parts.LENGTH)], axis=1)
+        self._static("machine/scale", rr.Points3D(positions, colors=parts.colours(parts.SCALE), radii=3.0))
+        labels = [f"{deviation * 1e6:+g} µm" for deviation in parts.SCALE.tolist()]
+        beside = positions + np.array([0.0, 0.0, 10.0])
+        names = rr.Points3D(beside, labels=labels, **_LABEL)
+        self._static("machine/scale/labels", names)
 
     def _static(self, path: str, what: rr.AsComponents) -> None:
         with _write_errors():
@@ -224,7 +239,7 @@ class Scene:
         if self._scale is None:
             self._scale = parts.Scale.of(self._outlook, reference)
             note = [-1.95 * parts.RADIUS, 0.0, parts.LENGTH / 2]
-            self._static("machine/note", rr.Points3D([note], radii=0.1, labels=self._scale.text(), show_labels=True))
+            self._static("machine/note", rr.Points3D([note], labels=self._scale.text(), **_LABEL))
         at = np.arange(-first % self._pose, angle.size, self._pose)
         if at.size:
             turns = angle[at] / (2.0 * np.pi)
@@ -266,7 +281,7 @@ class Scene:
 
     def _add_row(self, revolution: Revolution) -> None:
         """Add a row to the map; when the map is full, every second row is dropped."""
-        self._rows.append(parts.log_um(revolution.error).astype(np.float16))  # finer than the colour scale
+        self._rows.append(parts.colours(-revolution.error)[:, :3])
         # Each map is sent in full, so only after a relative growth: the total size is a multiple of the last map's.
         if len(self._rows) >= self._sent + max(1, self._sent // _GROWTH):
             self._send_map(revolution)
@@ -278,9 +293,11 @@ class Scene:
 
     def _send_map(self, revolution: Revolution) -> None:
         self._sent = len(self._rows)
-        names = ["revolution" if self._every == 1 else f"revolution / {self._every}", f"angle / {360 // ANGLES}°"]
-        tensor = rr.encodings.TensorData(array=np.stack(self._rows), dim_names=names)
-        columns = rr.Tensor.columns(data=tensor, value_range=[parts.LOG_RANGE])
+        image = np.stack(self._rows)
+        tall, wide = max(1, _TALL // len(image)), -(-len(image) // _TALL)  # Rerun shows pixels as squares
+        file = io.BytesIO()
+        Image.fromarray(image.repeat(tall, axis=0).repeat(wide, axis=1)).save(file, "png")
+        columns = rr.EncodedImage.columns(blob=[file.getvalue()], media_type=["image/png"])
         self._send("form_error/map", columns, *_times_of([revolution]))
 
     def _log_loops(self) -> None:
@@ -304,6 +321,9 @@ class Scene:
     # --- sending
 
     def _log_state(self, path: str, state: str, index: int) -> None:
+        if not self._bands:
+            self._bands = True
+            self._recording.send_blueprint(self._blueprint())
         self._send(path, rr.StateChange.columns(state=[state]), np.array([index]))
 
     def _send(
