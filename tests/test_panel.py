@@ -136,6 +136,22 @@ def test_the_panel_says_what_limits_the_form_error(opened, node, values, limit):
     assert re.search(limit, shown.until(lambda now: now["state"] == "ended")["limits"][0])
 
 
+def test_the_panel_tells_the_results_of_loops_in_the_words_of_a_run(opened, tmp_path):
+    """Also of a bag, and after a jump back in it."""
+    result = harness.run(scenario("force_turning", 40), bag=tmp_path / "bag")
+    loop = result.loops["force_controller"]
+    words = [f"force_controller: {text}." for text in (*(text for text, _ in loop.judged()), *loop.behaviour())]
+    assert len(words) == 3
+    shown = opened(scenario("force_turning", 40))
+    shown.ask("start")
+    assert shown.until(lambda now: now["state"] == "ended")["loops"] == words
+    player = Player(tmp_path / "bag")
+    for sample in (player.samples, 3 * 3840, player.samples):
+        player.seek(sample)
+    player.view.publish({})
+    assert player.view.latest.now["loops"] == words
+
+
 def test_events_of_the_panel_repeat_its_run(opened, tmp_path):
     """Fault, alarm, retraction, reset, another gain: each at a sample that the panel names."""
     shown = opened(scenario())

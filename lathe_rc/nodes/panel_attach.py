@@ -29,7 +29,6 @@ from lathe_rc.nodes.standalone_node import standalone_node
 from lathe_rc.view import page_server, panel
 from lathe_rc.view.page_server import Site
 from lathe_rc.view.panel_live import LivePanel
-from lathe_rc.view.panel_outlook import outlook
 
 _PATIENCE = 5.0  # [s] for a service to appear, and for its answer
 _TURN = 0.05  # [s] between looks whether the panel has ended
@@ -172,7 +171,7 @@ def attach(
     with standalone_node(PANEL, PanelParameters, {}, words, signals=SignalHandlerOptions.NO) as (node, _):
         live = LivePanel()
         asking = _Asking(rclpy.create_node(PANEL_COMMANDS), cell, live)
-        live.view.outlook = outlook(scenario)
+        live.view.know(scenario)
         site = panel.with_loops(panel.attached_site(live.view, cell, asking), loop)
         listener = Listener(node, live)
         for number in (signal.SIGINT, signal.SIGTERM):

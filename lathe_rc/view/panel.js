@@ -89,7 +89,7 @@ function draw(changed, moving = true) {
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
   drawSafety(now.safety);
-  $("limits").textContent = (now.limits || []).join("\n");
+  for (const id of ["limits", "loops"]) $(id).textContent = (now[id] || []).join("\n");
   for (const place of document.querySelectorAll("[data-learning]")) {
     const found = JSON.parse(place.dataset.learning).map(topic => (now.learning || {})[topic]).filter(value => value !== undefined);
     place.textContent = [...new Set(found)].map(value => value ? "learning" : "frozen").join(", ");

@@ -16,7 +16,7 @@ from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import MAX_BLOCK
-from lathe_rc.view.panel_outlook import outlook, plain_outlook
+from lathe_rc.view.panel_outlook import plain_outlook
 from lathe_rc.view.panel_view import View
 
 
@@ -59,7 +59,8 @@ class Player:
         with Source(bag) as source, tempfile.TemporaryDirectory() as folder:
             about, name = source.about, name_of(bag)
             try:
-                self.view.outlook = {**outlook(provenance.scenario_of(about, Path(folder))), "name": name}
+                self.view.know(provenance.scenario_of(about, Path(folder)))
+                self.view.outlook = {**self.view.outlook, "name": name}
             except LatheError as error:
                 self.view.say(self.first, "panel", f"the scenario is not known: {error}")
                 self.view.outlook = plain_outlook(name, self.step)

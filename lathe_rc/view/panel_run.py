@@ -30,7 +30,6 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.names import instead
-from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.panel_view import View
 
 T = TypeVar("T")
@@ -274,7 +273,7 @@ class LiveCell:
         self._version += 1
 
     def _remark(self) -> None:
-        self.view.outlook = outlook(self.scenario)
+        self.view.know(self.scenario)
         for text in [*self.cell.unchecked, *self.cell.warnings]:
             self.view.say(self.reached, "check", text)
 

@@ -18,13 +18,16 @@ import numpy.typing as npt
 
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.loops import Loop, loops, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.safety.state_machine import State
 from lathe_rc.view import machine_state
 from lathe_rc.view.form_limits import form_limits, varying_speed
+from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.rerun_part import Outlook, Scale
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
 
@@ -142,6 +145,7 @@ class View:
         self.run = 0
         self.latest: Snapshot | None = None
         self.outlook: Mapping[str, Any] = {}
+        self._loops: Sequence[Loop] = ()
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -150,6 +154,11 @@ class View:
         self._step_ns, self._margin = step_ns, margin
         self.learn(types)
         self.clear(margin)
+
+    def know(self, scenario: Scenario) -> None:
+        """Show what the samples do not tell: tolerance and shape of the scenario, results of its loops from now on."""
+        self.outlook, self._loops = outlook(scenario), loops(scenario.nodes)
+        self._watches = watches(self._loops, self._types)
 
     def learn(self, types: Mapping[str, str]) -> None:
         """Add topics."""
@@ -173,6 +182,7 @@ class View:
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
         self._limited: set[str] = set()  # nodes that limit the command now
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
+        self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
         self._history: list[tuple[int, float, float]] = []
 
@@ -218,6 +228,9 @@ class View:
             for axis, topic in self.topics.slides.items()
             if topic in named
         }
+        for watch in self._watches:
+            if named.keys() >= {*watch.topics}:  # a live view does not listen to controllers
+                watch.chunk(first, samples, named, {})
         if encoder and tool:
             self._part(first, encoder["angle_true"], tool)
 
@@ -293,6 +306,16 @@ class View:
             self._limits = len(self._history), out if any(row.out for row in rows) else [each.text for each in found]
         return [*(f"{node} is at the limits of its command." for node in sorted(self._limited)), *self._limits[1]]
 
+    def _looped(self) -> list[str]:
+        """Return verdict and behaviour of the force and position loops, in sentences."""
+        results = (watch.result() for watch in self._watches)
+        return [
+            f"{result.loop.node}: {text}."
+            for result in results
+            if result.found.errors.rms.size
+            for text in (*(told for told, _ in result.judged()), *result.behaviour())
+        ]
+
     def say(self, sample: int, source: str, text: str) -> None:
         """Add a line to the log."""
         self._log.append({"sample": sample, "source": source, "text": text[:300]})
@@ -311,7 +334,7 @@ class View:
         with self._news:
             number = self.latest.number + 1 if self.latest else 1
             scale = self._scale.deviation / 1e3 if self._scale else 1.0
-            current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting()}
+            current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting(), "loops": self._looped()}
             self.latest = Snapshot(
                 number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
             )
