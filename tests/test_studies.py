@@ -109,7 +109,7 @@ def test_help_lists_the_parameters_whose_defaults_are_allowed(name):
     assert STUDIES[name].parameters().model_dump()
 
 
-LONG = {"angle-domain", "coupling", "decoupling", "sampled-servo"}
+LONG = {"angle-domain", "coupling", "decoupling", "sampled-servo", "saturation"}
 
 
 @pytest.mark.parametrize(
@@ -377,6 +377,7 @@ def test_step_test_has_no_half_step_of_latency(drive):
     assert measured.rms(drive) < 3e-4
 
 
+@pytest.mark.system
 def test_a_delay_between_drive_and_cut_lowers_the_limit_of_chatter_and_brings_energy_in():
     """Without a delay the limit is that of `Regeneration`; the error of the edge grows with the delay from 0 on."""
     found = printed("coupling")
