@@ -159,6 +159,8 @@ class View:
         """Show what the samples do not tell: tolerance and shape of the scenario, results of its loops from now on."""
         self.outlook, self._loops = outlook(scenario), loops(scenario.nodes)
         self._watches = watches(self._loops, self._types)
+        for loop in self._loops:
+            loop.running(0).add(*np.zeros((4, loop.delay + 2)))  # compiles the kernel before the run
 
     def learn(self, types: Mapping[str, str]) -> None:
         """Add topics."""
