@@ -145,10 +145,14 @@ class Adrc(FormLaw):
         With the difference equation z = (1 - l·c)·(F·z/ζ + w·u) + l·x of the observer, ζ = e^{jωT}, and u = -k·z.
         """
         memory, back = self.start(), np.exp(-1j * frequency * self.parameters.step)
-        gains = memory.gains[:, None]
-        left = np.eye(3) - gains @ np.eye(1, 3)
-        ages = back[:, None] ** (memory.age + np.arange(3))
-        given = np.stack((ages @ (left @ memory.weights).T, np.broadcast_to(memory.gains, (back.size, 3))), axis=-1)
-        states = np.linalg.solve(np.eye(3) - (left @ memory.transition) * back[:, None, None], given)
-        fed = np.array([memory.stiffness, memory.damping, memory.forward.a2]) @ states
-        return np.asarray(1.0 + fed[:, 0]), np.asarray(drive(frequency) * fed[:, 1] * back**memory.forward.late)
+        left = np.eye(3) - memory.gains[:, None] @ np.eye(1, 3)
+        seen, polynomial = left @ memory.transition, np.polynomial.polynomial
+        # k·(1 - M/ζ)⁻¹ is a row of polynomials over det(1 - M/ζ), by the recursion of Faddeev and LeVerrier.
+        below = np.poly(seen)
+        rows = [np.array([memory.stiffness, memory.damping, memory.forward.a2])]
+        for coefficient in below[1:3]:
+            rows.append(rows[-1] @ seen + coefficient * rows[0])
+        own = back**memory.age * polynomial.polyval2d(back, back, rows @ left @ memory.weights)
+        fed = back**memory.forward.late * polynomial.polyval(back, rows @ memory.gains)
+        whole = polynomial.polyval(back, below)
+        return np.asarray(1.0 + own / whole), np.asarray(drive(frequency) * fed / whole)
