@@ -11,6 +11,7 @@ import numpy.typing as npt
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import Array, Complex, DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
@@ -226,8 +227,7 @@ def drive_curves(cell: Cell) -> list[DriveCurve]:
             found.append(DriveCurve(stage.name, label, at, np.asarray(response(at)), measured=measured))
         own = [getattr(stage.shared, f"model_{name}", 0.0) for name in ("natural_frequency", "damping", "delay")]
         if own[0]:
-            p = 1j * frequency
-            value = np.exp(-p * own[2]) / (1.0 + 2.0 * own[1] * p / own[0] + (p / own[0]) ** 2)
+            value = ModalDrive(own[0], own[1], own[2]).response(frequency)
             found.append(DriveCurve(stage.name, f"model of {stage.name}", frequency, value))
     return found
 
