@@ -392,6 +392,7 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
             "magnitude 9 at 1 Hz, the lowest frequency; .*:0.1111",
         ),
         ("time,response\n" + "".join(f"{k},{k}\n" for k in range(20)), [], "step response: ends at 19; allowed"),
+        ("time,response\n" + "".join(f"{k},1.1\n" for k in range(20)), [], "ends at 1.1; allowed: 0.95 to 1.05"),
     ],
 )
 def test_unusable_measurements_are_refused_in_one_line(tmp_path, text, options, message):
