@@ -91,13 +91,18 @@ class Oval3000Parameters(StudyParameters):
     fresh_seed: Annotated[int, Ge(0), Le(_LARGEST)] = parameter(
         0, "draws the second set, and is printed; 0: drawn at the time"
     )
+    seeds: Annotated[int, Ge(1), Le(100)] = parameter(
+        5, "of noise and speed, the drive's own and 1, 2, ..., for the worst and the median drive of a law"
+    )
     revolutions: Annotated[int, Ge(15), Le(1000)] = parameter(40, "length of a run; the last 10 are judged", "rev")
     tolerance_um: Annotated[float, Gt(0), Le(1000)] = parameter(2.0, "form tolerance, either way", "µm")
     conditions: list[Literal[tuple(CONDITIONS)]] = parameter(list(CONDITIONS), "which encoders")  # type: ignore[valid-type]
     laws: list[Literal[tuple(LAWS)]] = parameter(list(LAWS), "which laws of the benchmark")  # type: ignore[valid-type]
     law: str = parameter("", "a law that enters, PACKAGE.MODULE:CLASS or a name that a package offers; empty: none")
     law_set: str = parameter("", "its parameters, PARAM=VALUE PARAM=VALUE ...")
-    quick: bool = parameter(default=False, doc="only the first encoder, two drives in each set, 15 revolutions")
+    quick: bool = parameter(
+        default=False, doc="only the first encoder, two drives in each set, 15 revolutions, two seeds"
+    )
 
     def model_post_init(self, context: Any, /) -> None:
         """Reject parameters of a law that does not enter."""
@@ -117,6 +122,8 @@ class Oval3000Result:
         conditions, laws: names of the encoders and laws.
         tolerance: tolerance of the form error [µm].
         largest: form error of the last ten revolutions outside the keyways [µm]; NaN for a stopped run.
+        seeded: the same of the worst and the median drive, by seed of noise and speed, the drive's own seed first,
+            shape (2, sets, conditions, laws, seeds).
         settled: revolution, counted from 1, from which the error stays within the tolerance; inf if it never does.
         effort: RMS current of the drive [A].
         margin: smallest relative error of the drive's response with which learning diverges, shape (sets, laws,
@@ -128,14 +135,10 @@ class Oval3000Result:
     laws: list[str]
     tolerance: float
     largest: Array
+    seeded: Array
     settled: Array
     effort: Array
     margin: Array
-
-    @property
-    def median(self) -> Array:
-        """Median form error over the drives [µm], shape (sets, conditions, laws); a stopped run counts as infinite."""
-        return np.asarray(np.median(np.where(np.isnan(self.largest), np.inf, self.largest), axis=-1))
 
     @property
     def share(self) -> Array:
@@ -143,10 +146,11 @@ class Oval3000Result:
         return np.asarray((self.largest <= self.tolerance).mean(axis=-1))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the scores for JSON, by set, encoder and law; None for a stopped run or no value."""
+        """Return the scores for JSON, by set, encoder and law, errors by seed; None for a stopped run or no value."""
+        worst, median = self.seeded
         scores = {
-            "worst_um": worst_of(self.largest),
-            "median_um": self.median,
+            "worst_um": worst,
+            "median_um": median,
             "in_tolerance": self.share,
             "revolutions": worst_of(self.settled),
             "effort_a": worst_of(self.effort),
@@ -158,13 +162,13 @@ class Oval3000Result:
     def table(self) -> Group:
         """Return one table of scores for each encoder and set of drives."""
         columns = ("law", "worst [µm]", "median [µm]", f"in ±{self.tolerance:g} µm", "settled", "margin", "effort [A]")
-        worst, settled, effort = map(worst_of, (self.largest, self.settled, self.effort))
+        settled, effort = map(worst_of, (self.settled, self.effort))
         margin, tables = self.margin.min(axis=-1), list[RichTable | str]()
         for (k, condition), (s, seed) in product(enumerate(self.conditions), enumerate(self.seeds)):
             rows = [
                 (
                     law,
-                    *map(figure_of, (worst[s, k, n], self.median[s, k, n])),
+                    *map(_range_of, self.seeded[:, s, k, n]),
                     f"{100.0 * self.share[s, k, n]:.0f} %",
                     figure_of(settled[s, k, n]),
                     figure_of(margin[s, n]),
@@ -192,6 +196,12 @@ class Oval3000Result:
             axes.grid(visible=True, alpha=0.3)
         panels[0].set_ylabel("drives below [%]")
         panels[0].legend(fontsize=7)
+
+
+def _range_of(values: Array) -> str:
+    """Return the smallest and the largest value; - if a run was stopped."""
+    low, high = figure_of(values.min()), figure_of(values.max())
+    return low if low == high else f"{low}–{high}"
 
 
 def drives_of(base: Scenario, seed: int, count: int) -> list[Values]:
@@ -270,30 +280,47 @@ def _own(parameters: Oval3000Parameters) -> dict[str, cells.Values]:
 def run(parameters: Oval3000Parameters, track: Track = untracked) -> Oval3000Result:
     """Run every law with every encoder and drive of both sets; a missing fresh seed is drawn here, not reproducible."""
     conditions, count, revolutions = parameters.conditions, parameters.drives, parameters.revolutions
+    seeds_each = parameters.seeds
     if parameters.quick:
-        conditions, count, revolutions = conditions[:1], 2, 15
+        conditions, count, revolutions, seeds_each = conditions[:1], 2, 15, 2
     base = cells.load("oval3000", spindle_encoder={"revolutions": float(revolutions)})
     tables = {**{name: LAWS[name] for name in parameters.laws}, **_own(parameters)}
     laws = {name: entered(base, values) for name, values in tables.items()}
     seeds = [PUBLISHED, parameters.fresh_seed or 1 + secrets.randbelow(_LARGEST)]
     drives = [drives_of(base, seed, count) for seed in seeds]
-    made = [
-        law.varied({**CONDITIONS[condition], **drive})
-        for each, condition, law in product(drives, conditions, laws.values())
-        for drive in each
-    ]
-    shape = len(seeds), len(conditions), len(laws), count
-    largest, settled, effort = np.full((3, *shape), np.nan)
-    for place, judged in zip(np.ndindex(shape), cells.kept(made, Judge, track), strict=True):
-        if judged is not None:
-            largest[place] = judged.largest[:revolutions][-LAST:].max()
-            settled[place], effort[place] = judged.settled(parameters.tolerance_um), judged.effort
+    cases = list(product(drives, conditions, laws.values()))
+
+    def scores(chosen: list[list[Values]]) -> Array:
+        """Run the drives chosen for each set, encoder and law; return error, settling and effort, shape (3, ...)."""
+        made = [
+            law.varied({**CONDITIONS[condition], **drive})
+            for (_, condition, law), of_law in zip(cases, chosen, strict=True)
+            for drive in of_law
+        ]
+        found = [
+            (np.nan,) * 3
+            if judged is None
+            else (judged.largest[:revolutions][-LAST:].max(), judged.settled(parameters.tolerance_um), judged.effort)
+            for judged in cells.kept(made, Judge, track)
+        ]
+        return np.reshape(np.transpose(found), (3, len(seeds), len(conditions), len(laws), -1))
+
+    largest, settled, effort = scores([of_set for of_set, _, _ in cases])
+    # NaN, a stopped run, is the worst. Of an even number of drives the median one is the lower of the middle two.
+    places = np.argsort(largest, axis=-1)[..., [-1, (count - 1) // 2]]
+    seeded = scores(
+        [
+            [drive for k in pair for drive in (of_set[k], *({**of_set[k], "seed": n} for n in range(1, seeds_each)))]
+            for (of_set, _, _), pair in zip(cases, places.reshape(-1, 2), strict=True)
+        ]
+    )[0]
     return Oval3000Result(
         seeds=seeds,
         conditions=conditions,
         laws=list(laws),
         tolerance=parameters.tolerance_um,
         largest=largest,
+        seeded=np.moveaxis(seeded.reshape(*seeded.shape[:3], 2, -1), 3, 0),
         settled=settled,
         effort=effort,
         margin=np.array([[margins(law, each) for law in laws.values()] for each in drives]),

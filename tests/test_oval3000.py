@@ -38,6 +38,9 @@ def test_scores_of_the_second_set_are_those_of_its_seed():
         np.testing.assert_array_equal(first, second)
         np.testing.assert_array_equal(first, getattr(other, name)[0])
     assert np.all(other.largest[0] != other.largest[1])
+    # The worst and the median of two drives with their own seeds, and with another one.
+    np.testing.assert_array_equal(other.seeded[..., 0], [other.largest.max(axis=-1), other.largest.min(axis=-1)])
+    assert np.all(np.diff(other.seeded) != 0.0)
     # A law that leads the memory alone errs by what the speed varies within a revolution.
     assert np.all(same.largest[:, :, 1] < same.largest[:, :, 0])
     assert np.all(same.margin[:, 1] > 0.3)
@@ -47,7 +50,7 @@ def test_a_fresh_seed_is_drawn_and_told(monkeypatch):
     monkeypatch.setattr(oval3000.secrets, "randbelow", lambda largest: largest - 5)
     told = found("laws=ours").to_json()
     assert told["seeds"] == [oval3000.PUBLISHED, 2**31 - 4]
-    assert np.shape(told["worst_um"]) == (2, 1, 1)
+    assert np.shape(told["worst_um"]) == (2, 1, 1, 2)
 
 
 def test_drives_fill_their_ranges():
