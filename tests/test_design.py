@@ -79,8 +79,8 @@ def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
     assert run.errors.largest[-10:].max() * 1e6 == pytest.approx(found["laws"][0]["largest_um"]["nominal"], rel=1e-12)
 
 
-@pytest.mark.usefixtures("few")
 def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(design, "LAWS", {"lead, Gaussian Q": design.LAWS["lead, Gaussian Q"]})
     monkeypatch.chdir(tmp_path)
     drive = ("mode_frequency=[5e3]", "mode_damping=[0.002]", "mode_participation=[0.5]")
     words = [word for each in drive for word in ("--set", f"electrodynamic_actuator.{each}")]
@@ -147,8 +147,8 @@ def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
     assert asked._settings(design.LAWS["inverse, Gaussian Q"])
 
 
-@pytest.mark.usefixtures("few")
 def test_a_cell_that_runs_with_no_law_says_why(tmp_path, monkeypatch):
+    monkeypatch.setattr(design, "LAWS", {"lead, Gaussian Q": design.LAWS["lead, Gaussian Q"]})
     monkeypatch.chdir(tmp_path)
     late = "learning_controller.feedback_delay=4000"
     done = CliRunner().invoke(main, ["design", "piston", "--margin", "0.01", "--revolutions", "3", "--set", late])
