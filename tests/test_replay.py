@@ -38,6 +38,7 @@ except ImportError:
 COUNT = 1500
 
 
+@pytest.mark.system
 def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     form = tmp_path / "form.csv"

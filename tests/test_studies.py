@@ -278,6 +278,7 @@ def test_at_constant_speed_the_order_does_not_matter():
 # --- angle domain
 
 
+@pytest.mark.system
 def test_errors_stand_by_amplitude_and_frequency():
     found = printed("angle-domain")
     for kind in ("exact", "quasi_static", "linearised"):
@@ -304,6 +305,7 @@ def test_good_to_is_the_last_frequency_within_the_tolerance():
     assert by_key["good_to_linearised"][2] is None
 
 
+@pytest.mark.system
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("tolerance", [0.9, 1e-12])
 def test_figure_of_a_map_that_is_good_or_bad_everywhere(tolerance):
