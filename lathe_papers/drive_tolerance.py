@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
-from lathe_papers import cells, sweeps
+from lathe_papers import cells, marks, sweeps
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.drive import Drive
@@ -92,7 +92,8 @@ class DriveToleranceResult:
         shares = 100.0 * np.arange(1, self.error.shape[1] + 1) / self.error.shape[1]
         for place, tolerance in enumerate(self.parameters.tolerance):
             finite = np.isfinite(self.error[place])
-            left.semilogx(self.error[place][finite], shares[finite], label=f"{100 * tolerance:g} %", color=f"C{place}")
+            label = f"{100 * tolerance:g} %"
+            left.semilogx(self.error[place][finite], shares[finite], label=label, **marks.curve(place))
         left.axvline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
         left.set(xlabel="largest form error of the last revolution [µm]", ylabel="drives below [%]")
         left.legend(title="tolerance (1σ)", fontsize=8, title_fontsize=8)
@@ -100,9 +101,7 @@ class DriveToleranceResult:
             errors = self._at(share)
             shown = np.isfinite(errors)
             percent = 100.0 * np.array(self.parameters.tolerance)
-            right.loglog(
-                percent[shown], errors[shown], "o-", label=f"{100 * share:g} % of the drives", color=f"C{place}"
-            )
+            right.loglog(percent[shown], errors[shown], label=f"{100 * share:g} % of the drives", **marks.point(place))
         right.axhline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
         right.set(xlabel="tolerance of the drives (1σ) [%]", ylabel="form error that they stay below [µm]")
         right.legend(fontsize=8)

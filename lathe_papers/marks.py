@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marks of the figures that compare several things: each has a marker beside its colour; laws in words.
+"""Marks of the figures that compare several things: each has a marker beside its colour.
 
 The colours are those of Okabe and Ito, which most colour-blind people can distinguish; yellow is replaced by brown.
 """
@@ -10,21 +10,6 @@ COLOURS = (
     "#0072b2", "#d55e00", "#000000", "#e69f00", "#56b4e9", "#009e73", "#cc79a7", "#6e2c00", "#9467bd", "#7f7f7f",
 )  # fmt: skip
 MARKERS = "osD^v<>Px*"
-
-#: laws of the comparisons by their names in the tables
-LAWS = {
-    "000": "000: lead and Q of paper 000",
-    "001": "001: lead and Q of paper 001",
-    "lead": "lead: lead and flat Q for this part",
-    "adapt.": "adapt.: adaptive inverse",
-    "comp.": "comp.: feed-forward and PID",
-    "told": "told: comp. that knows each drive",
-    "AFC": "AFC: resonators over the angle",
-    "DOB": "DOB: disturbance observer only",
-    "ADRC": "ADRC: extended state observer",
-    "norm.": "norm.: norm-optimal learning",
-    "ours": "ours: disturbance_controller",
-}
 
 
 def point(number: int) -> dict[str, Any]:

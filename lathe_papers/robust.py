@@ -15,7 +15,7 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
-from lathe_papers import cells
+from lathe_papers import cells, marks
 from lathe_papers.judge import Array, Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell.parameters import Value, parameter
@@ -95,8 +95,17 @@ LAWS: dict[str, cells.Values] = {
     "DOB": {**_ANY, "learning_gain": 0.0, "identify": False},
     "ours": _ANY,
 }  # fmt: skip
+_WORDS = {
+    "000": "000: lead and Q of paper 000",
+    "001": "001: lead and Q of paper 001",
+    "adapt.": "adapt.: adaptive inverse",
+    "comp.": "comp.: feed-forward and PID",
+    "told": "told: comp. that knows each drive",
+    "AFC": "AFC: resonators over the angle",
+    "DOB": "DOB: disturbance observer only",
+    "ours": "ours: disturbance_controller",
+}  # in the figure
 _KNOWS = "told"  # the law with the true parameters of each drive
-_COLOURS = ("#b7950b", "#e08e0b", "#111111", "#c0392b", "#7d3c98", "#2874a6", "#148f77", "#1e8449")
 
 
 class RobustParameters(StudyParameters):
@@ -182,20 +191,22 @@ class RobustResult:
 
     def draw(self, figure: "Figure") -> None:
         """Draw the largest errors by condition, and by revolution under the last condition, for the worst drive."""
-        bars, course = figure.subplots(1, 2, width_ratios=(3, 2))
+        dots, course = figure.subplots(1, 2, width_ratios=(3, 2))
         largest, width = worst_of(self.largest), 0.8 / len(self.laws)
-        for k, (law, colour) in enumerate(zip(self.laws, _COLOURS, strict=True)):
+        for k, law in enumerate(self.laws):
             places = np.arange(len(self.conditions)) + (k - (len(self.laws) - 1) / 2) * width
-            bars.bar(places, largest[:, k], width, color=colour, label=law)
-            course.semilogy(self.curves[k], color=colour, lw=1.2, label=law)
-        bars.set(yscale="log", ylabel="largest form error [µm], worst drive")
-        bars.set_xticks(range(len(self.conditions)), self.conditions, rotation=25, ha="right", fontsize=8)
+            dots.semilogy(places, largest[:, k], ls="", ms=5, **marks.point(k))
+            course.semilogy(self.curves[k], lw=1.2, **marks.curve(k), label=_WORDS[law])
+        dots.set(ylabel="largest form error [µm], worst drive", xlim=(-0.5, len(self.conditions) - 0.5))
+        dots.set_xticks(range(len(self.conditions)), self.conditions, rotation=25, ha="right", fontsize=8)
+        for k in range(1, len(self.conditions), 2):
+            dots.axvspan(k - 0.5, k + 0.5, color="0.95", zorder=0)
         course.set(xlabel="revolution", ylabel="largest form error [µm]")
         course.set_title(f"{self.conditions[-1]}, worst drive of each law", fontsize=10)
-        for axes in (bars, course):
-            axes.axhline(self.tolerance, color="black", lw=0.8, ls="--")
+        for axes in (dots, course):
+            axes.axhline(self.tolerance, color="black", lw=0.8, ls="--", label=f"tolerance ±{self.tolerance:g} µm")
             axes.grid(visible=True, alpha=0.3)
-            axes.legend(fontsize=7, ncols=2)
+        figure.legend(*course.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
 
 
 def drives_near(count: int) -> list[tuple[float, float, float, float]]:

@@ -40,6 +40,7 @@ _GRADIENT: Spec = {
     "direction": "horizontal",
     "gradientLength": 260,
     "columns": 0,
+    "columnPadding": 3,
     "titleLimit": 300,
 }
 

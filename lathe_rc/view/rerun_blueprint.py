@@ -126,7 +126,7 @@ def blueprint(
         top.append(
             rrb.TimeSeriesView(
                 origin="/learning",
-                name="form error [10^y µm]: RMS blue, largest orange" + ", controllers green" * cycles,
+                name="form error [10^y µm]: RMS blue, largest orange" + ", controllers green" * (cycles == 1),
                 plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=cycles > 1),
             )
         )
