@@ -496,6 +496,19 @@ def test_an_operator_takes_the_tool_out_and_lets_it_approach_again():
     assert told == [("operator", State.RETRACTING), (RETRACTED, State.SAFE), (RESET, State.NOMINAL)]
 
 
+def test_a_finer_channel_learns_again_only_when_the_coarse_one_is_back():
+    """Neither the errors of the way back nor the commands of the reaction reach the memory or the identified drive."""
+    sets = ["supervisor.events=['revolution 20: retract', 'revolution 24: reset']", "spindle_encoder.revolutions=50"]
+    result = harness.run(config("supervised_two_channel", *sets))
+    assert [one[:2] for one in status(result)][-1] == (RESET, State.NOMINAL)
+    fine = result.recording.sparse["/fine/learning"].values
+    waits = np.flatnonzero(~np.array(fine["joined"]))
+    assert waits[-1] > 22
+    assert np.array(fine["max_error"])[waits[-1] + 1] < 15e-6
+    assert np.ptp(np.array(fine["stability_margin"])[8:]) < 1e-3
+    assert result.errors.rms[-1] < 1e-8
+
+
 def test_a_retraction_needs_a_drive_and_a_node_that_obeys():
     for others, message in (
         (

@@ -360,11 +360,18 @@ def _end_cycle(m: AngleMemory, sample: int) -> None:
     row = m.log[whole[LOGGED]]
     row[0], row[1], row[2] = sample, real[CYCLE_SQUARES], real[CYCLE_LARGEST]
     row[3] = whole[LEARNS] * whole[JOINED]
-    if not whole[JOINED] and real[CYCLE_LARGEST] <= m.join_below:
+    if whole[LEARNS] and not whole[JOINED] and real[CYCLE_LARGEST] <= m.join_below:
         whole[JOINED] = 1
         whole[FROM] = whole[NEXT]
     row[4] = whole[JOINED]
     whole[LOGGED] += 1
+
+
+@kernel
+def part(m: AngleMemory) -> None:
+    """Let a channel that waits for a small error before it learns wait for one again."""
+    if m.join_below < np.inf:
+        m.whole[JOINED] = 0
 
 
 @kernel

@@ -224,8 +224,9 @@ class RepetitiveController:
         }
 
     def clear(self) -> None:
-        """Clear the memory and restart learning, with the soft start if configured."""
+        """Clear the memory and restart learning, with ``join_below`` and the soft start if configured."""
         self.table.memory[:] = 0.0
+        angle_memory.part(self.table)
         self._replaced()
 
     def _replaced(self) -> None:

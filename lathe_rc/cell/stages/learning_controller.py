@@ -372,8 +372,8 @@ class LearningController(Learner):
                 "model_residual": self._model.residual,
             }
             sparse.append(Sparse(_STATUS, messages.LEARNING, cycle.sample_index, status))
-        if cycle.joined and not self._joined:
-            self._joined = True
+        joins, self._joined = cycle.joined and not self._joined, cycle.joined
+        if joins:
             sparse.append(Sparse(f"{self.name}/events", messages.EVENT, cycle.sample_index, {"action": "joined"}))
         return sparse
 

@@ -88,7 +88,9 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
         0.0, "the gain rises from 0 over so many revolutions when learning begins; 0: at once", "rev"
     )
     join_below: NonNegative = parameter(
-        0.0, "the channel learns from the first cycle on whose largest error is within this; 0: at once", "m"
+        0.0,
+        "the channel learns from the first cycle on, and the first after a reaction, within this error; 0: at once",
+        "m",
     )
     cycle_weights: list[NonNegative] = parameter(
         [1.0], "weights of the newest cycles in what the drive is sent, the newest first; only their ratios matter"

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.cell.stage import DONE, Fields, Reached
-from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, may_learn, obeyed, piece
+from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, forbidden, may_learn, obeyed, piece
 from lathe_rc.control import angle_memory
 from lathe_rc.control.angle_memory import AngleMemory
 from lathe_rc.control.identification import IdentifierTable, accumulate, command_sent
@@ -117,6 +117,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 return start, OBEY
             if who.listens:
                 control.whole[angle_memory.LEARNS] = may_learn(who)
+                if forbidden(who):
+                    angle_memory.part(control)
             state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
             if not state[_LOST]:
                 _begin(memory, first, start, stop, inputs)
@@ -132,14 +134,14 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
                 state[_LOST], state[LOST_AT] = 1, first + reached
                 _lose(memory, reached, stop, command)
                 reached, reason = stop, DONE
-            elif memory.identifies:
-                # Before `accumulate`, since a segment may be longer than the delay.
-                command_sent(memory.identifier, first, start, reached, command)
-                accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
+        apply(who, command[start:reached])
+        if memory.identifies and not state[_LOST]:
+            # What the drive is sent; before `accumulate`, since a segment may be longer than the delay.
+            command_sent(memory.identifier, first, start, reached, command)
+            accumulate(memory.identifier, first, start, reached, inputs[4 + memory.finer])
         _publish(memory, start, reached, outputs)
         if reason != DONE:
             return reached, reason
-        apply(who, command[begin:stop])
         state[_INSIDE] = 0
         start = stop
     return n, DONE

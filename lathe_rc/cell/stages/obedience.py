@@ -123,6 +123,12 @@ def may_learn(who: Listener) -> bool:
 
 
 @kernel
+def forbidden(who: Listener) -> bool:
+    """Return whether a reaction, or the return from it, forbids a listening node to learn in the next segment."""
+    return bool(who.obedience.forbidden[0] > 0.0)
+
+
+@kernel
 def obeyed(who: Listener) -> int:
     """Return the reaction in force."""
     return int(who.obedience.whole[_REACTION])
