@@ -141,7 +141,7 @@ class _Maker:
         """Return the profile of its second node, which asks for events, pace and pause."""
         (master,) = self._scenario.masters
         asked = {f"{name}/schedule" for name in self._cell.stages} | {f"{master}/set_parameters"}
-        if self._cell.master.shared.simulation_services:
+        if self._cell.master.parameters.simulation_services:
             asked.add("set_simulation_state")
         return replace(self._node(PANEL_COMMANDS), request=frozenset(asked))
 

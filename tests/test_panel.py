@@ -211,7 +211,9 @@ def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
         shown.until(lambda now: now["state"] == "paused" and now["sample"])
     shown.ask("act", node="electrodynamic_actuator", action="fault coarse/command.position wrong scale=0.99")
     shown.ask("step")
-    at = shown.until(lambda now: now["state"] == "paused" and len(shown.history) == 4)["sample"]
+    now = shown.until(lambda now: now["state"] == "paused" and len(shown.history) == 4)
+    assert now["faults"] == ["electrodynamic_actuator: coarse/command.position wrong scale=0.99"]
+    at = now["sample"]
     shown.ask("act", node="learning_controller", action="freeze")
     for name, value in (("learning_gain", "0.5"), ("lead_time", "1.3e-3")):
         shown.ask("change", values={f"learning_controller.{name}": value}, here=True)
@@ -222,6 +224,9 @@ def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
     shown.ask("step")
     shown.until(lambda _: len(shown.history) == 5)
     assert any(line["sample"] == at and line["text"] == "freeze" for line in shown.log)
+    shown.ask("act", node="electrodynamic_actuator", action="repair coarse/command.position")
+    shown.ask("step")
+    shown.until(lambda now: len(shown.history) == 6 and not now["faults"])
     assert shown.history[-1][0] > shown.history[-2][0]
     shown.ask("change", values={}, here=False)
     assert shown.until(lambda now: not now["begun"])["events"] == listed

@@ -54,7 +54,7 @@ class _Asking:
         self._recorder: subprocess.Popen[str] | None = None
         self._bag = ""
         self.cannot: Mapping[str, str] = {"step": "a cell of nodes steps by blocks: ros2 service call step_simulation"}
-        if not cell.master.shared.simulation_services:
+        if not cell.master.parameters.simulation_services:
             self.cannot |= {"go": f"the cell pauses only with {self._master}.simulation_services = playing or paused"}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)

@@ -43,7 +43,9 @@ def form_limits(
     power = float(np.mean(profiles**2)) if count >= _FEWEST else 0.0
     if not power:
         return
-    yield from _trend(np.sqrt(np.mean(profiles**2, axis=-1)), excess)
+    trend = _trend(np.sqrt(np.mean(profiles**2, axis=-1)), excess)
+    if trend:
+        yield trend
     # The mean of count revolutions still contains 1/count of the variable power; the factor corrects this.
     mean = profiles.mean(axis=0)
     share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
@@ -58,13 +60,15 @@ def form_limits(
         ),
         (share, f"changes from revolution to revolution{': ' if named else ''}{named}"),
     ]
+    if trend:
+        parts.pop()  # it contains what learning changes
     for part, text in sorted(parts, reverse=True):
         if part >= _SOME:
             yield Finding(f"{part:.0%} of the form error's power in the last {count} revolutions {text}.")
 
 
-def _trend(rms: Samples, excess: float) -> Iterator[Finding]:
-    """Yield a finding on the trend of the form error, if the error clearly falls or grows in the last revolutions."""
+def _trend(rms: Samples, excess: float) -> Finding | None:
+    """Return a finding on the trend of the form error, if the error clearly falls or grows in the last revolutions."""
     half = len(rms) // 2
     before, after = rms[:half], rms[-half:]
     factor = float(after.mean() / before.mean()) if before.mean() else 1.0
@@ -72,9 +76,10 @@ def _trend(rms: Samples, excess: float) -> Iterator[Finding]:
     if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
         turns = math.ceil(math.log(1.0 / excess) / math.log(each)) if excess > 1.0 else 0
         more = f"; in tolerance after some {turns} more, if it goes on like this" if turns else ""
-        yield Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
-    elif after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
-        yield Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
+        return Finding(f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
+    if after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
+        return Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
+    return None
 
 
 def varying_speed(low: float, high: float) -> list[str]:

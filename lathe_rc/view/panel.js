@@ -6,10 +6,10 @@ const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], force: [], 
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
 const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
-const SAID = { safe: "safe (stopped, tool retracted)" };
+const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
 const DOES = { // tool tips
   freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned",
-  retract: "takes the tool out of the part", reset: "lets a retracted tool approach the part again",
+  retract: "takes the tool out of the part", reset: "lets a retracted tool approach the part again; refused until it is out of the part, and after a stop",
 };
 const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -111,6 +111,7 @@ function drawSafety(safety) {
   const since = safety && safety.cause ? ` since ${(safety.since * (ABOUT.step || 0)).toFixed(3)} s` : "";
   $("safety").textContent = safety ? (SAID[safety.state] || safety.state) + since : "no supervisor";
   $("alarm").textContent = safety ? safety.cause : "";
+  $("in-force").textContent = (SHOWN.now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
   $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }
 
@@ -279,12 +280,12 @@ function drawMap() {
 }
 
 function drawWaterfall() {
-  const { pen, width, height, ink, soft, line, good, bad } = canvas("waterfall"), [left, top, right, bottom] = [40, 16, width - 70, height - 24];
+  const { pen, width, height, ink, soft, line, good, bad } = canvas("waterfall"), [left, top, right, bottom] = [84, 16, width - 70, height - 24];
   const rows = SHOWN.latest, tall = (bottom - top) / WATERFALL, tolerance = ABOUT.tolerance;
   angles(pen, left, right, height - 6, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
   const largest = cut(rows).map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
-  const most = nice(Math.max(largest[largest.length >> 1], tolerance, 1e-6)), scale = 0.45 * tall / most;
+  const most = nice(1.3 * Math.max(largest[largest.length >> 1], tolerance, 1e-6)), scale = 0.45 * tall / most;
   rows.forEach((row, k) => {
     const y = top + (k + 0.5 + WATERFALL - rows.length) * tall, x = column => left + (right - left) * (column + 0.5) / row.cells.length;
     if (tolerance) { pen.globalAlpha = 0.5; pen.fillStyle = line; pen.fillRect(left, y - tolerance * scale, right - left, 2 * tolerance * scale); pen.globalAlpha = 1; }
@@ -295,7 +296,8 @@ function drawWaterfall() {
       row.cells.forEach((um, column) => { if (column && wanted(um)) { pen.moveTo(x(column - 1), place(row.cells[column - 1])); pen.lineTo(x(column), place(um)); } });
       pen.stroke();
     }
-    label(pen, String(row.revolution), left - 5, y + 4, soft, "right");
+    const far = Math.max(...row.cells.map(Math.abs)); // beyond its strip, where the curve is cut off
+    label(pen, row.revolution + (far > most ? `: to ${digits(far, 2)}` : ""), left - 5, y + 4, soft, "right");
   });
   Object.assign(pen, { strokeStyle: ink, lineWidth: 1 });
   pen.strokeRect(right + 8, bottom - tall, 0, most * scale * 2);
@@ -368,7 +370,9 @@ function drawForce() {
 
 async function tell(name, question) {
   try {
-    return await ask(name, question);
+    const answer = await ask(name, question);
+    if ($("refusal")) $("refusal").remove();
+    return answer;
   } catch (error) {
     refuse(error.message);
     return null;

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell.events import FAULT, REPAIR
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED
@@ -174,7 +175,7 @@ class View:
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
         if messages.SAFETY_STATUS in self._types.values():
             self._now["safety"] = {"state": State.NOMINAL.name.lower(), "since": 0, "cause": "", "alarm": ""}
-        self._now["learning"] = {}
+        self._now |= {"learning": {}, "faults": []}
         self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
         self._end = 0  # sample after the last complete revolution
         self._scale: Scale | None = None
@@ -208,9 +209,8 @@ class View:
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Take consecutive samples, as a sink of the engine."""
         named = {full(topic): signals for topic, signals in dense.items()}
-        for topic, found in sparse.items():
-            for message in found:
-                self._message(full(topic), message)
+        for message in sorted((each for found in sparse.values() for each in found), key=lambda each: each.index):
+            self._message(full(message.topic), message)
         self._now["sample"] = first + samples
         self._now["time"] = (first + samples) * self._step_ns * 1e-9
         encoder, tool, cut = (named.get(topic) for topic in (self.topics.encoder, self.topics.tool, self.topics.cut))
@@ -269,7 +269,7 @@ class View:
             self._now["margin"] = float(message.values["stability_margin"])
         if message.type in event_log.LOGGED:
             self.say(message.index, topic.strip("/"), event_log.text(message))
-            self._limit(topic.strip("/").removesuffix("/events"), message)
+            self._event(topic.strip("/").removesuffix("/events"), message)
         if message.type == messages.SAFETY_STATUS:
             self._safety(message)
 
@@ -286,9 +286,15 @@ class View:
                 self._out = (message.index, math.inf) if out else (self._out[0], message.index)
         self._now["safety"] = {**before, "state": name, "alarm": event_log.text(message)}
 
-    def _limit(self, node: str, message: Sparse) -> None:
+    def _event(self, node: str, message: Sparse) -> None:
         action = str(message.values.get("action", ""))
-        if action.startswith(LIMITED):
+        verb, _, what = action.partition(" ")
+        if verb == FAULT:
+            self._now["faults"] = [*self._now["faults"], f"{node}: {what}"]
+        elif verb == REPAIR:  # a fault, or all of a target
+            names = f"{node}: {what}"
+            self._now["faults"] = [f for f in self._now["faults"] if f != names and not f.startswith(f"{names} ")]
+        elif action.startswith(LIMITED):
             self._limited.add(node)
         elif action.startswith(f"{FREE}:"):
             self._limited.discard(node)

@@ -355,11 +355,11 @@ def _lines(
             {"data": data_, "mark": text, "encoding": {"x": end, "text": {"field": "t"}, **where}},
         ]
     values = [row[end] for row in data for end in "ab" if row[end] is not None]
-    low, high = min(values, default=0.0), max(values, default=1.0)
+    least, most = min(values, default=0.0), max(values, default=1.0)
     ends: tuple[float, ...] = ()
-    if almost_equal(low, high):  # an axis from one number to the same would have a single tick
-        margin = 0.5 * (abs(low) or 1.0)
-        ends = (low - margin, high + margin)
+    if almost_equal(least, most):  # an axis from one number to the same would have a single tick
+        margin = 0.5 * (abs(least) or 1.0)
+        ends = (least - margin, most + margin)
     axis = {"format": ".4~g", "tickCount": 5}
     places = {label: colour for label, (_, colour, _) in curves.items()}
     return figure(
