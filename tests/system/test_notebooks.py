@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The notebooks in examples/: ``./lathe python tests/test_notebooks.py`` stores their outputs anew."""
+"""The notebooks in examples/: ``./lathe python tests/system/test_notebooks.py`` stores their outputs anew."""
 
 import tempfile
 from pathlib import Path
@@ -8,8 +8,10 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples").glob("*.ipynb"))
+NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples").glob("*.ipynb"))
 LARGEST = 300_000  # [B], with the pictures
+
+pytestmark = pytest.mark.system
 
 
 def executed(path, folder):
@@ -29,7 +31,6 @@ def shown(notebook):
     return ["a picture" if "image/png" in each else each["text/plain"] for each in found]
 
 
-@pytest.mark.system
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_prints_what_is_stored_in_it(path, tmp_path):
     """A notebook runs from top to bottom, prints what is stored in it and leaves nothing behind."""
