@@ -26,6 +26,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.names import checked_namespace
 from lathe_rc.nodes.listener import Listener
 from lathe_rc.nodes.standalone_node import standalone_node
+from lathe_rc.nodes.topic_recorder import LISTENS
 from lathe_rc.view import page_server, panel
 from lathe_rc.view.page_server import Site
 from lathe_rc.view.panel_live import LivePanel
@@ -119,15 +120,23 @@ class _Asking:
         self._live.know(pace=factor)
 
     def record(self, bag: str) -> None:
-        """Begin ``lathe record``; an empty text ends it.
+        """Begin ``lathe record`` and wait until it listens; an empty text ends it.
 
         Raises:
             InputError: no name, or one of something that exists.
+            LatheError: it has ended at once.
         """
         if bag:
             refuse_existing(Path(bag))
             words = [*allowed_code.interpreter("lathe_rc"), "record", bag]
-            self._recorder, self._bag = subprocess.Popen(words, stderr=subprocess.PIPE, text=True), bag
+            recorder, said = subprocess.Popen(words, stderr=subprocess.PIPE, text=True), ""
+            assert recorder.stderr is not None, "it is a pipe"
+            for said in recorder.stderr:
+                if LISTENS in said:
+                    break
+            else:
+                raise LatheError(said.strip() or f"lathe record {bag} has ended")
+            self._recorder, self._bag = recorder, bag
             self._live.know(bag=bag)
         elif self._recorder is None:
             raise InputError("bag = ''; allowed: a name, for the folder of the bag")

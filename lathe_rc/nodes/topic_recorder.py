@@ -26,6 +26,7 @@ from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.nodes import arguments, publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
+LISTENS = "recording"  #: begin of the line that is logged once earlier publishers have been discovered
 _CLOCK = "/clock"
 _OWN = {"/rosout", "/parameter_events"}  # topics of ROS itself, also published by this node
 _LOOK = 0.05  # [s] of wall time between polls of the graph and of signals
@@ -98,7 +99,7 @@ class TopicRecorder:
             self._present |= graph.keys()
             self._looks += 1
             if self._looks > _LOOKS:
-                self._node.get_logger().info("recording; what begins from now on is heard from its first message on")
+                self._node.get_logger().info(f"{LISTENS}; what begins from now on is heard from its first message on")
         if self._parameters.sim_time and _CLOCK not in self._inlets:
             if _CLOCK in graph:
                 self._subscribe(_CLOCK, graph[_CLOCK])
