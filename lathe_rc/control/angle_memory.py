@@ -368,8 +368,8 @@ def _end_cycle(m: AngleMemory, sample: int) -> None:
 
 
 @kernel
-def part(m: AngleMemory) -> None:
-    """Let a channel that waits for a small error before it learns wait for one again."""
+def leave(m: AngleMemory) -> None:
+    """Undo that the channel has joined, if it waits for a small error before it learns."""
     if m.join_below < np.inf:
         m.whole[JOINED] = 0
 

@@ -226,7 +226,7 @@ class RepetitiveController:
     def clear(self) -> None:
         """Clear the memory and restart learning, with ``join_below`` and the soft start if configured."""
         self.table.memory[:] = 0.0
-        angle_memory.part(self.table)
+        angle_memory.leave(self.table)
         self._replaced()
 
     def _replaced(self) -> None:

@@ -27,15 +27,7 @@ from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
 from lathe_rc.view.rerun_revolutions import HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import (
-    CYCLES,
-    STATE_COLOURS,
-    band,
-    curve_path,
-    curves,
-    extreme_samples,
-    supervisor,
-)
+from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
 
 _POSES = 250.0  # poses of part and tool per second
 _ROWS = 512  # rows of the map

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from lathe_rc import messages
 from lathe_rc.analysis.tolerance import FORCE as NEWTONS
+from lathe_rc.cell.events import FAULT, REPAIR
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.event_log import LOGGED
@@ -132,7 +133,6 @@ def extreme_samples(values: Samples, window: int) -> npt.NDArray[np.intp]:
 STATES = "states"  #: entity path of the bands in the view
 #: Colours of the supervisor's states.
 STATE_COLOURS = {"nominal": 0x2E7D4FFF, "degraded": 0xB8860BFF, "retracting": 0xD2622AFF, "safe": 0xB3262EFF}
-_FAULT, _REPAIR = "fault ", "repair "  # prefixes of fault events
 
 
 def supervisor(topic: str) -> str:
@@ -147,10 +147,9 @@ def band(message: Sparse) -> tuple[str, str] | None:
         state = message.values["state"]
         return supervisor(topic), State(state).name.lower() if state in set(State) else "?"
     action, node = str(message.values["action"]), f"{STATES}{topic.removesuffix('/events')}"
-    if action.startswith(_FAULT):
-        return f"{node}/fault", action.removeprefix(_FAULT)
-    if action.startswith(_REPAIR):
-        return f"{node}/fault", ""
+    verb, _, fault = action.partition(" ")
+    if verb in (FAULT, REPAIR):
+        return f"{node}/fault", fault if verb == FAULT else ""
     kind = action.partition(":")[0]
     if kind in (LIMITED, FREE):
         return f"{node}/limits", LIMITED if kind == LIMITED else ""

@@ -118,7 +118,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
             if who.listens:
                 control.whole[angle_memory.LEARNS] = may_learn(who)
                 if forbidden(who):
-                    angle_memory.part(control)
+                    angle_memory.leave(control)
             state[_INSIDE], state[_BEGIN], state[_END] = 1, start, stop
             if not state[_LOST]:
                 _begin(memory, first, start, stop, inputs)

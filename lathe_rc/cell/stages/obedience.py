@@ -117,15 +117,15 @@ def piece(who: Listener, start: int, end: int, reaction: Samples) -> int:
 
 
 @kernel
-def may_learn(who: Listener) -> bool:
-    """Return whether a listening node may learn in the next segment."""
-    return bool(who.obedience.whole[_WANTS] and who.obedience.forbidden[0] == 0.0)
-
-
-@kernel
 def forbidden(who: Listener) -> bool:
     """Return whether a reaction, or the return from it, forbids a listening node to learn in the next segment."""
     return bool(who.obedience.forbidden[0] > 0.0)
+
+
+@kernel
+def may_learn(who: Listener) -> bool:
+    """Return whether a listening node may learn in the next segment."""
+    return bool(who.obedience.whole[_WANTS]) and not forbidden(who)
 
 
 @kernel
