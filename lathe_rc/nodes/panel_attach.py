@@ -123,9 +123,11 @@ class _Asking:
         """Begin ``lathe record`` and wait until it listens; an empty text ends it.
 
         Raises:
-            InputError: no name, or one of something that exists.
+            InputError: no name, one of something that exists, or a recording is on.
             LatheError: it has ended at once.
         """
+        if bag and self._recorder:
+            raise InputError(f"{self._bag} is being recorded; allowed: end it first")
         if bag:
             refuse_existing(Path(bag))
             words = [*allowed_code.interpreter("lathe_rc"), "record", bag]

@@ -91,6 +91,7 @@ def test_a_running_cell_is_paced_paused_and_recorded_from_the_page(attached, dom
     assert "step" in attached.ask("about")[1]["cannot"]
     assert attached.ask("state", values={})[1]["answers"]  # the page of the loops is a tab
     assert attached.ask("record", bag=str(tmp_path / "bag"))[0] == 200
+    assert "is being recorded" in attached.ask("record", bag=str(tmp_path / "another"))[1]["error"]
     assert attached.ask("pause") == (200, {})
     attached.until(lambda told: told["now"]["state"] == "paused")
     event = {"node": "learning_controller", "action": "learn"}
