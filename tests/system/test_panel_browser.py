@@ -73,10 +73,8 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     browser.until("SHOWN.now.bag")
     browser.click("#step")
     assert browser.until("SHOWN.now.state == 'paused' && SHOWN.history.length") == 1
-    browser.click("#go")
-    browser.until("SHOWN.history.length > 12")
-    browser.click("#go")
-    browser.until("SHOWN.now.state == 'paused'")
+    while browser.run("SHOWN.history.length") < 12:
+        one_revolution(browser)
     # The part so far
     for name in ("stl", "glb"):
         browser.click(f"#{name}")
@@ -134,7 +132,7 @@ def test_the_page_fits_its_window_in_light_and_dark(page):
             corner = "[...document.getElementById('map').getContext('2d').getImageData(0, 0, 1, 1).data].slice(0, 3)"
             browser.until(f"'rgb(' + {corner}.join(', ') + ')' == '{paper}'")
             drawn = "document.querySelectorAll('#machine polygon, #machine rect').length"
-            assert browser.run(drawn) >= 8
+            assert browser.run(drawn) >= 5  # without a force, which has an arrow
 
 
 def test_a_refused_command_is_shown_and_the_cell_goes_on(page):
