@@ -4,18 +4,14 @@
 Like the ``rerun_bridge``, it is no member, and its subscriptions are best effort and volatile: no node waits for it.
 """
 
-import signal
 import threading
 import time
-from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import islice
-from typing import NoReturn
 
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import uninstall_signal_handlers
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -25,7 +21,7 @@ from lathe_rc.cell.beside import MACHINE_STATE as KIND
 from lathe_rc.cell.beside import MachineStateParameters
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import arguments, standalone_node
+from lathe_rc.nodes import standalone_node
 from lathe_rc.nodes.ports import message_class
 from lathe_rc.view.machine_state import BED, EDGE, JOINTS, Force, Joints, Machine, source
 
@@ -73,7 +69,7 @@ class MachineState:
                 due = now + _LOOK
                 self._look()
             self._hear()
-            self.stopped.wait(_PERIOD)
+            time.sleep(_PERIOD)  # not a wait for the event, whose lock the signal handler needs
         if self._machine.left_out:
             self._node.get_logger().warning(f"{self._machine.left_out} instants are left out: blocks did not arrive")
 
@@ -123,21 +119,11 @@ def _nothing(_: bytes) -> None:
 
 def _work(node: Node, parameters: MachineStateParameters) -> None:
     state = MachineState(node, parameters)
-    uninstall_signal_handlers()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: state.stopped.set())
+    standalone_node.set_by_signal(state.stopped)
     state.run()
 
 
-def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Publish until stopped (see `standalone_node.run`)."""
-    return standalone_node.run(KIND, MachineStateParameters, _work, values, args)
-
-
-def main() -> NoReturn:
-    """Run the node, and exit."""
-    arguments.executable(KIND, MachineStateParameters, partial(run, {}))
-
+run, main = standalone_node.program(KIND, MachineStateParameters, _work)
 
 if __name__ == "__main__":
     main()

@@ -1,38 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Services of a replay, with the names and types of rosbag2's player."""
 
-from collections.abc import Awaitable
 from importlib import import_module
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
-
-class Controlled(Protocol):
-    """Replay that clients control.
-
-    Attributes:
-        paused: whether it waits.
-        rate: pace against the bag's time; 0: none.
-    """
-
-    paused: bool
-
-    @property
-    def rate(self) -> float:
-        """See the class."""
-
-    def change_rate(self, rate: float) -> bool:
-        """Continue at another rate; return False if it is refused."""
-
-    def seek(self, log_ns: int) -> bool:
-        """Continue at a time of the bag; return False if it is outside of what is replayed."""
-
-    def step(self, messages: int) -> Awaitable[int]:
-        """Send the next messages of a paused replay at once, 0: all; return how many were sent."""
-
-    def stop(self) -> None:
-        """End the replay."""
+if TYPE_CHECKING:
+    from lathe_rc.nodes.replayer import Replayer
 
 
 class ReplayServices:
@@ -46,7 +21,7 @@ class ReplayServices:
         ImportError: their package, rosbag2_interfaces, is not installed.
     """
 
-    def __init__(self, node: Node, replay: Controlled) -> None:
+    def __init__(self, node: Node, replay: "Replayer") -> None:
         srv: Any = import_module("rosbag2_interfaces.srv")
 
         self._replay = replay

@@ -5,14 +5,13 @@ import json
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import partial
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from lathe_rc_msgs.msg import CellState, Member, Progress
@@ -39,7 +38,7 @@ from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
-from lathe_rc.nodes import arguments, keys, replayed_qos, standalone_node
+from lathe_rc.nodes import keys, replayed_qos, standalone_node
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.nodes.replay_services import ReplayServices
 from lathe_rc.nodes.replayed_qos import DEPTH
@@ -206,7 +205,7 @@ class Replayer:
                 f"{topic}: message type {kind} is not installed; install its package, or name other topics"
             ) from None
 
-    # ---- control (implements `replay_services.Controlled`) ------------------------------------------
+    # ---- control ------------------------------------------------------------------------------------
 
     @property
     def rate(self) -> float:
@@ -535,15 +534,7 @@ def _work(node: StandaloneNode, parameters: ReplayerParameters) -> None:
         node.get_logger().info(f"{replayer.sent} messages sent")
 
 
-def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Replay a bag until the end, a failure, or Ctrl-C (see `standalone_node.run`)."""
-    return standalone_node.run(KIND, ReplayerParameters, _work, values, args)
-
-
-def main() -> NoReturn:
-    """Run the replayer node, and exit."""
-    arguments.executable(KIND, ReplayerParameters, partial(run, {}))
-
+run, main = standalone_node.program(KIND, ReplayerParameters, _work)
 
 if __name__ == "__main__":
     main()

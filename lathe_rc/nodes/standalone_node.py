@@ -2,16 +2,19 @@
 """Start, parameters, signals and exit code of nodes that are not members of a cell."""
 
 import contextlib
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, NoReturn, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
+from rclpy.signals import SignalHandlerOptions, uninstall_signal_handlers
 
 from lathe_rc.cell.parameters import Table
 from lathe_rc.errors import InputError, LatheError
@@ -107,32 +110,37 @@ def standalone_node(
             rclpy.try_shutdown()
 
 
-def run(
-    kind: str,
-    table: type[T],
-    work: Callable[[StandaloneNode, T], None],
-    values: Mapping[str, object],
-    args: Sequence[str],
-) -> int:
-    """Run a node until its work ends or fails, or until Ctrl-C.
+def set_by_signal(stopped: threading.Event) -> None:
+    """Let SIGINT and SIGTERM set an event; ROS would end its context at once, before remaining messages are taken."""
+    uninstall_signal_handlers()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+
+
+def program(
+    kind: str, table: type[T], work: Callable[[StandaloneNode, T], None]
+) -> tuple[Callable[[Mapping[str, object], Sequence[str]], int], Callable[[], NoReturn]]:
+    """Return the functions ``run`` and ``main`` of a node's module.
+
+    ``run`` takes parameter values and the ROS command line, starting at ``--ros-args``; it runs the node until its work
+    ends or fails, or until Ctrl-C, and returns the exit code. ``main`` is the executable.
 
     Args:
         kind: name of the node.
         table: parameter table of the node.
         work: function that does the work of the node.
-        values: parameter values; values on the ROS command line are in ``args``.
-        args: ROS command line, starting at ``--ros-args``.
-
-    Returns:
-        The exit code.
     """
-    try:
-        # Replayed messages on /rosout must not be mixed with this node's own.
-        with standalone_node(kind, table, values, args, rosout=False) as (node, parameters):
-            work(node, parameters)
-    except LatheError as error:
-        print(f"lathe: {error}", file=sys.stderr)
-        return error.exit_code
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return LatheError.exit_code
-    return 0
+
+    def run(values: Mapping[str, object], args: Sequence[str]) -> int:
+        try:
+            # Replayed messages on /rosout must not be mixed with this node's own.
+            with standalone_node(kind, table, values, args, rosout=False) as (node, parameters):
+                work(node, parameters)
+        except LatheError as error:
+            print(f"lathe: {error}", file=sys.stderr)
+            return error.exit_code
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return LatheError.exit_code
+        return 0
+
+    return run, lambda: arguments.executable(kind, table, partial(run, {}))

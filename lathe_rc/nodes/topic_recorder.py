@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Executable: the ``topic_recorder``, which records arbitrary topics in the order of publication."""
 
-import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import uninstall_signal_handlers
 from rclpy.subscription import Subscription
 
 from lathe_rc import messages
@@ -23,7 +21,7 @@ from lathe_rc.cell.beside import TopicRecorderParameters
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LossyRunError, shown
-from lathe_rc.nodes import arguments, publisher_info, standalone_node
+from lathe_rc.nodes import publisher_info, standalone_node
 from lathe_rc.nodes.ports import message_class
 
 LISTENS = "recording"  #: begin of the line that is logged once earlier publishers have been discovered
@@ -267,22 +265,11 @@ class TopicRecorder:
 
 def _work(node: Node, parameters: TopicRecorderParameters) -> None:
     recorder = TopicRecorder(node, parameters)
-    # ROS would end its context at once, before the remaining messages are taken.
-    uninstall_signal_handlers()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: recorder.stopped.set())
+    standalone_node.set_by_signal(recorder.stopped)
     recorder.run()
 
 
-def run(values: Mapping[str, object], args: Sequence[str]) -> int:
-    """Record until stopped (see `standalone_node.run`)."""
-    return standalone_node.run(KIND, TopicRecorderParameters, _work, values, args)
-
-
-def main() -> NoReturn:
-    """Run the topic recorder, and exit."""
-    arguments.executable(KIND, TopicRecorderParameters, partial(run, {}))
-
+run, main = standalone_node.program(KIND, TopicRecorderParameters, _work)
 
 if __name__ == "__main__":
     main()
