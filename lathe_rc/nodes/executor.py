@@ -9,6 +9,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.ports import taken
 
 _MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
 
@@ -55,11 +56,8 @@ def drain_missed_messages(node: Node) -> None:
     before the start blocks forever.
     """
     for subscription in [*node.subscriptions]:
-        with subscription.handle:
-            for _ in range(_MOST):
-                if (found := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is None:
-                    break
-                subscription.callback(found[0])
+        for message, _ in taken(subscription, _MOST):
+            subscription.callback(message)
     for service in [*node.services]:
         kind: Any = service.srv_type  # rclpy's type hints lack its requests and responses
         with service.handle:

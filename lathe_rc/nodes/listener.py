@@ -11,24 +11,16 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
-from itertools import islice
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes.ports import message_class
+from lathe_rc.nodes.ports import overhear, taken
 from lathe_rc.view.live_runs import Backlog, LiveRuns, ShownRun
 from lathe_rc.view.rerun_signals import is_drawn
 
-_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=4096,
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)
+_DEPTH = 4096  # messages
 _BACKLOG = 2**25  # [B]: some seconds of a cell
 _BURST = 16  # messages
 _NICE = 10  # the view is less urgent than the cell
@@ -96,7 +88,8 @@ class Listener:
             if is_drawn(kind) and topic.startswith(namespace) and self._node.count_publishers(topic)
         }
         for topic in sorted(present.keys() - self._subscriptions.keys()):
-            self._subscribe(topic, present[topic])
+            self._subscriptions[topic] = overhear(self._node, topic, present[topic], _DEPTH), present[topic]
+            self._node.get_logger().info(f"listens to {topic}")
         quiet = self._heard == self._heard_before
         if quiet and self._live.present and not present:
             self._backlog.put(None)
@@ -105,18 +98,12 @@ class Listener:
         self._heard_before = self._heard
         return not quiet
 
-    def _subscribe(self, topic: str, msgtype: str) -> None:
-        subscription = self._node.create_subscription(message_class(msgtype), topic, _nothing, _QOS, raw=True)
-        self._subscriptions[topic] = subscription, msgtype
-        self._node.get_logger().info(f"listens to {topic}")
-
     def _hear(self) -> None:
         """Take the received messages in turns, a few per topic, since chunks wait only briefly for late topics."""
         count = -1
         while count < (count := self._heard):
             for topic, (subscription, msgtype) in self._subscriptions.items():
-                take = partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
-                heard = [(topic, msgtype, data) for data, _ in islice(iter(take, None), _BURST)]
+                heard = [(topic, msgtype, data) for data, _ in taken(subscription, _BURST)]
                 self._heard += len(heard)
                 self._backlog.put(*heard)
 
@@ -132,7 +119,3 @@ class Listener:
             self._live.end()
         except LatheError as error:
             self._failure = error
-
-
-def _nothing(_: bytes) -> None:
-    """Unused callback of the subscriptions: messages are taken without an executor."""

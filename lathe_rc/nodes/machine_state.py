@@ -6,12 +6,9 @@ Like the ``rerun_bridge``, it is no member, and its subscriptions are best effor
 
 import threading
 import time
-from functools import partial
-from itertools import islice
 
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -22,15 +19,10 @@ from lathe_rc.cell.beside import MachineStateParameters
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import standalone_node
-from lathe_rc.nodes.ports import message_class
+from lathe_rc.nodes.ports import overhear, taken
 from lathe_rc.view.machine_state import BED, EDGE, JOINTS, Force, Joints, Machine, source
 
-_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1024,
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)
+_DEPTH = 1024  # messages
 _BURST = 16  # messages
 _PERIOD = 0.01  # [s] between polls of messages
 _LOOK = 0.2  # [s] between polls of the graph
@@ -80,8 +72,7 @@ class MachineState:
             origin = source(topic, kinds[0]) if topic.startswith(namespace) else None
             if origin is None or topic in self.inlets or not self._node.count_publishers(topic):
                 continue
-            inlet = self._node.create_subscription(message_class(kinds[0]), topic, _nothing, _QOS, raw=True)
-            self.inlets[topic] = inlet, origin, Decoder(kinds[0])
+            self.inlets[topic] = overhear(self._node, topic, kinds[0], _DEPTH), origin, Decoder(kinds[0])
             if origin != "cut":
                 self._machine.sources.add(origin)
             self._node.get_logger().info(f"listens to {topic}")
@@ -92,8 +83,7 @@ class MachineState:
         while busy:
             busy = False
             for topic, (inlet, origin, decoder) in self.inlets.items():
-                take = partial(inlet.handle.take_message, inlet.msg_type, inlet.raw)
-                for data, _ in islice(iter(take, None), _BURST):
+                for data, _ in taken(inlet, _BURST):
                     busy = True
                     try:
                         block = decoder.decode(data)
@@ -111,10 +101,6 @@ class MachineState:
             self.joints.publish(JointState(header=header, name=list(JOINTS), **positions))
         else:
             self.wrench.publish(WrenchStamped(header=header, wrench=Wrench(force=Vector3(y=found.newton))))
-
-
-def _nothing(_: bytes) -> None:
-    """Unused callback of the subscriptions: blocks are taken without an executor."""
 
 
 def _work(node: Node, parameters: MachineStateParameters) -> None:

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS message classes, and quality of service (QoS) of a cell's topics."""
+"""ROS message classes, quality of service (QoS) of a cell's topics, and messages taken without an executor."""
 
 import importlib
 import importlib.util
+from collections.abc import Iterator
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 from lathe_rc import messages
 from lathe_rc.cell.host_topics import signal_depth
@@ -64,3 +69,21 @@ def latched_qos(depth: int = 0) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL,
     )
+
+
+def overhear(node: Node, topic: str, msgtype: str, depth: int) -> Subscription:
+    """Subscribe to encoded messages (see `taken`) so that no publisher waits: best effort and volatile."""
+    qos = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+    return node.create_subscription(message_class(msgtype), topic, lambda _: None, qos, raw=True)
+
+
+def taken(inlet: Subscription, most: int) -> Iterator[tuple[Any, Any]]:
+    """Take at most some of the received messages without an executor; yield each with its information."""
+    with inlet.handle:
+        take = partial(inlet.handle.take_message, inlet.msg_type, inlet.raw)
+        yield from islice(iter(take, None), most)

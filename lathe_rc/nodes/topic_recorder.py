@@ -22,7 +22,7 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.nodes import publisher_info, standalone_node
-from lathe_rc.nodes.ports import message_class
+from lathe_rc.nodes.ports import message_class, taken
 
 LISTENS = "recording"  #: begin of the line that is logged once earlier publishers have been discovered
 _CLOCK = "/clock"
@@ -169,14 +169,10 @@ class TopicRecorder:
         """Take the messages that have arrived; return True if none are left."""
         emptied = True
         for topic, inlet in self._inlets.items():
-            with inlet.handle:
-                for _ in range(_AT_ONCE):
-                    found = inlet.handle.take_message(inlet.msg_type, True)  # noqa: FBT003 - raw
-                    if found is None:
-                        break
-                    self._take(topic, *found)
-                else:
-                    emptied = False
+            before = self._taken
+            for message in taken(inlet, _AT_ONCE):
+                self._take(topic, *message)
+            emptied = emptied and self._taken - before < _AT_ONCE
         return emptied
 
     def _write(self, ready: Iterable[Recorded]) -> None:
