@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Human-readable event log of a run: node events and supervisor messages."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lathe_rc import messages
+from lathe_rc.cell.events import FAULT, REPAIR
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.safety.state_machine import Reaction, State
 
 _STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}
@@ -64,3 +66,44 @@ def cause(message: Sparse) -> str:
     sizes = [f"{values[name] * scale:.4g} {unit}".rstrip() for name in ("value", "limit")]
     found = f"{sizes[0]}, limit {sizes[1]}" if values["limit"] else ""
     return " ".join(filter(None, [values["monitor"], values["subject"], found]))
+
+
+def supervisor_state(message: Sparse) -> str:
+    """Return the state in a message of the supervisor, in lower case."""
+    return _STATES.get(message.values["state"], "?")
+
+
+@dataclass
+class Conditions:
+    """Faults and limits of a cell in effect, as the events of its nodes tell.
+
+    Attributes:
+        faults: faults in effect by node and target, oldest first.
+        limited: nodes that limit the command now.
+    """
+
+    faults: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+    limited: set[str] = field(default_factory=set)
+
+    def take(self, message: Sparse) -> tuple[str, str] | None:
+        """Take an event of a node; return what it changes, ``NODE/fault/TARGET`` or ``NODE/limits``, and its condition.
+
+        The condition is empty if there is no fault or limit any more; None: the event changes nothing.
+        """
+        node, action = message.topic.strip("/").removesuffix("/events"), str(message.values["action"])
+        verb, _, fault = action.partition(" ")
+        if verb in (FAULT, REPAIR):
+            target, several, _ = fault.partition(" ")
+            there = self.faults.setdefault((node, target), [])
+            if verb == FAULT:
+                there.append(fault)
+            elif not several:  # all faults of the target
+                there.clear()
+            elif fault in there:
+                there.remove(fault)
+            return f"{node}/fault/{target}", ", ".join(there)
+        kind = action.partition(":")[0]
+        if kind not in (LIMITED, FREE):
+            return None
+        (self.limited.add if kind == LIMITED else self.limited.discard)(node)
+        return f"{node}/limits", LIMITED if kind == LIMITED else ""

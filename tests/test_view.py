@@ -22,6 +22,7 @@ from lathe_rc.bag import reader  # noqa: E402
 from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
+from lathe_rc.event_log import Conditions  # noqa: E402
 from lathe_rc.view import rerun_part as parts  # noqa: E402
 from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
 from lathe_rc.view.rerun_output import _free_port, end_viewer, viewer  # noqa: E402
@@ -210,7 +211,7 @@ def test_desired_and_actual_position_of_the_tool_are_in_one_view(turned):
 
 
 def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
-    """From nominal on; a fault is a band of its own from its first sample to its last."""
+    """From nominal on; a faulty target has a band of its own from the first sample of its faults to their last."""
     overrides = ["spindle_encoder.revolutions=8"]
     overrides += ["electrodynamic_actuator.faults=['revolution 4 to 5: coarse/state.measured_position stuck']"]
     cell = load(resources.find(Path("supervised.yaml")), overrides)
@@ -218,16 +219,32 @@ def test_states_of_the_supervisor_and_faults_are_bands(tmp_path):
     done = lathe("view", tmp_path / "bag", "-o", tmp_path / "out.rrd")
     assert done.exit_code == 0, done.output
     view = View(tmp_path / "out.rrd")
-    assert view.entities("StateChange:state") == {"/states/cell/safety", "/states/electrodynamic_actuator/fault"}
+    faulty = "/states/electrodynamic_actuator/fault/coarse/state.measured_position"
+    assert view.entities("StateChange:state") == {"/states/cell/safety", faulty}
     status = [each for each in logged if each.topic == "/safety/status"]
     states = [state for (state,) in view.column("/states/cell/safety", "StateChange:state")]
     assert list(dict.fromkeys(states)) == ["nominal", "retracting", "safe"]
     samples = [0, *(each.sample for each in status)]
     assert view.column("/states/cell/safety", "time") == [sample * STEP_NS for sample in samples]
-    fault = view.column("/states/electrodynamic_actuator/fault", "StateChange:state")
+    fault = view.column(faulty, "StateChange:state")
     assert fault == [["coarse/state.measured_position stuck"], [""]]
     begun, over = (each.sample for each in logged if each.topic == "/electrodynamic_actuator/events")
-    assert view.column("/states/electrodynamic_actuator/fault", "time") == [begun * STEP_NS, over * STEP_NS]
+    assert view.column(faulty, "time") == [begun * STEP_NS, over * STEP_NS]
+
+
+def test_a_repair_ends_its_faults_and_no_others():
+    """One of two faults of a target, all of a target, and none of another target of the node."""
+    conditions = Conditions()
+    for action, told in (
+        ("fault a.x stuck", "a.x stuck"),
+        ("fault a.x wrong scale=2.0", "a.x stuck, a.x wrong scale=2.0"),
+        ("fault b off", "b off"),
+        ("repair a.x stuck", "a.x wrong scale=2.0"),
+        ("repair a.x", ""),
+    ):
+        changed = conditions.take(Sparse("n/events", messages.EVENT, 0, {"action": action}))
+        assert changed == (f"n/fault/{action.split()[1]}", told)
+    assert conditions.faults == {("n", "a.x"): [], ("n", "b"): ["b off"]}
 
 
 def test_without_a_state_there_is_no_view_of_states(turned, tmp_path, monkeypatch):

@@ -18,10 +18,8 @@ import numpy.typing as npt
 
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST
-from lathe_rc.cell.events import FAULT, REPAIR
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.loops import Loop, loops, watches
 from lathe_rc.messages import Samples, Signals, full
@@ -183,7 +181,7 @@ class View:
         self._rows: list[Row] = []
         self._newest: list[Row] = []
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
-        self._limited: set[str] = set()  # nodes that limit the command now
+        self._conditions = event_log.Conditions()
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
@@ -269,14 +267,15 @@ class View:
             self._now["margin"] = float(message.values["stability_margin"])
         if message.type in event_log.LOGGED:
             self.say(message.index, topic.strip("/"), event_log.text(message))
-            self._event(topic.strip("/").removesuffix("/events"), message)
         if message.type == messages.SAFETY_STATUS:
             self._safety(message)
+        if message.type == messages.EVENT and self._conditions.take(message):
+            told = self._conditions.faults.items()
+            self._now["faults"] = [f"{node}: {fault}" for (node, _), found in told for fault in found]
 
     def _safety(self, message: Sparse) -> None:
         """Take a message of the supervisor; the cause of a state is its first one, that of a retraction stays."""
-        state, before = message.values["state"], self._now["safety"]
-        name = State(state).name.lower() if state in set(State) else "?"
+        name, before = event_log.supervisor_state(message), self._now["safety"]
         out = name in _OUT
         if not before or name != before["state"]:
             was_out = bool(before) and before["state"] in _OUT
@@ -285,19 +284,6 @@ class View:
             if out != was_out:
                 self._out = (message.index, math.inf) if out else (self._out[0], message.index)
         self._now["safety"] = {**before, "state": name, "alarm": event_log.text(message)}
-
-    def _event(self, node: str, message: Sparse) -> None:
-        action = str(message.values.get("action", ""))
-        verb, _, what = action.partition(" ")
-        if verb == FAULT:
-            self._now["faults"] = [*self._now["faults"], f"{node}: {what}"]
-        elif verb == REPAIR:  # a fault, or all of a target
-            names = f"{node}: {what}"
-            self._now["faults"] = [f for f in self._now["faults"] if f != names and not f.startswith(f"{names} ")]
-        elif action.startswith(LIMITED):
-            self._limited.add(node)
-        elif action.startswith(f"{FREE}:"):
-            self._limited.discard(node)
 
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
@@ -312,7 +298,10 @@ class View:
             )
             out = ["The supervisor held the tool out of the part in the last revolutions."]
             self._limits = len(self._history), out if any(row.out for row in rows) else [each.text for each in found]
-        return [*(f"{node} is at the limits of its command." for node in sorted(self._limited)), *self._limits[1]]
+        return [
+            *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
+            *self._limits[1],
+        ]
 
     def _looped(self) -> list[str]:
         """Return verdict and behaviour of the force and position loops, in sentences."""

@@ -21,13 +21,12 @@ from lathe_rc import event_log, messages
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.event_log import LOGGED
 from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
 from lathe_rc.view.rerun_revolutions import HIGHEST, Revolution, Revolutions
-from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, band, curve_path, curves, extreme_samples, supervisor
+from lathe_rc.view.rerun_signals import CYCLES, STATE_COLOURS, STATES, curve_path, curves, extreme_samples, supervisor
 
 _POSES = 250.0  # poses of part and tool per second
 _ROWS = 512  # rows of the map
@@ -80,6 +79,7 @@ class Scene:
         self._live, self._silent = live, {full(topic) for topic in silent}
         self._types: dict[str, str] = {}
         self._nominal: set[str] = set()  # supervisors whose first state is shown
+        self._conditions = event_log.Conditions()
         self._bands = False  # whether there are states; without one, their view would only say so
         self._outlook = outlook or parts.Outlook()
         self.window = max(1, int(np.ceil(2e9 / (rate * step_ns))))
@@ -218,10 +218,12 @@ class Scene:
             values = parts.log_um(np.array([message.values[cycle.error] for message in found], dtype=np.float64))
             number = np.array([message.values[cycle.counter] for message in found])
             self._send(f"learning{topic}", rr.Scalars.columns(scalars=values), index, number)
-        elif kind in LOGGED:
+        elif kind in event_log.LOGGED:
             for message in found:
-                if change := band(message):
-                    self._log_state(*change, message.index)
+                if kind == messages.SAFETY_STATUS:
+                    self._log_state(supervisor(topic), event_log.supervisor_state(message), message.index)
+                elif change := self._conditions.take(message):
+                    self._log_state(f"{STATES}/{change[0]}", change[1], message.index)
             texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
             self._send("events", rr.TextLog.columns(text=texts), index)
 

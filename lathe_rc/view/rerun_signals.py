@@ -9,13 +9,9 @@ import numpy.typing as npt
 
 from lathe_rc import messages
 from lathe_rc.analysis.tolerance import FORCE as NEWTONS
-from lathe_rc.cell.events import FAULT, REPAIR
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.command_limits import FREE, LIMITED
 from lathe_rc.event_log import LOGGED
 from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, full
-from lathe_rc.safety.state_machine import State
 
 
 @dataclass(frozen=True)
@@ -138,19 +134,3 @@ STATE_COLOURS = {"nominal": 0x2E7D4FFF, "degraded": 0xB8860BFF, "retracting": 0x
 def supervisor(topic: str) -> str:
     """Return the entity path of a supervisor's band, given the topic of its status."""
     return f"{STATES}/cell{full(topic).removesuffix('/status')}"
-
-
-def band(message: Sparse) -> tuple[str, str] | None:
-    """Return path and new state of the band that a message changes; an empty state ends the band; None: no change."""
-    topic = full(message.topic)
-    if message.type == messages.SAFETY_STATUS:
-        state = message.values["state"]
-        return supervisor(topic), State(state).name.lower() if state in set(State) else "?"
-    action, node = str(message.values["action"]), f"{STATES}{topic.removesuffix('/events')}"
-    verb, _, fault = action.partition(" ")
-    if verb in (FAULT, REPAIR):
-        return f"{node}/fault", fault if verb == FAULT else ""
-    kind = action.partition(":")[0]
-    if kind in (LIMITED, FREE):
-        return f"{node}/limits", LIMITED if kind == LIMITED else ""
-    return None
