@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import cast
+from typing import TypeVar, cast
 
 import yaml
 
@@ -26,6 +26,8 @@ from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import in_words
 from lathe_rc.names import instead
+
+Table = TypeVar("Table", bound=NodeParameters)
 
 
 class _Tables(Mapping[str, type[NodeParameters]]):
@@ -144,6 +146,10 @@ class Scenario:
     def of_kind(self, kind: str) -> list[str]:
         """Return the names of the nodes of a kind."""
         return [name for name in self.nodes if self.kind(name) == kind]
+
+    def first(self, kind: type[Table]) -> Table | None:
+        """Return the first parameter table of a class; None if there is none."""
+        return next((table for table in self.nodes.values() if isinstance(table, kind)), None)
 
     @property
     def masters(self) -> list[str]:

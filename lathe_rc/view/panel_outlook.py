@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixed properties of a scenario in the drawings of the panel."""
 
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from lathe_rc.cell.budget import changing
-from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
 from lathe_rc.cell.stages.force_controller import ForceControllerParameters
@@ -13,28 +11,25 @@ from lathe_rc.cell.stages.supervisor import SupervisorParameters
 from lathe_rc.cell.stages.time_master import TimeMasterParameters
 from lathe_rc.cell.stages.tool import ToolParameters
 
-Parameters = TypeVar("Parameters", bound=NodeParameters)
-
 
 def outlook(scenario: Scenario) -> dict[str, Any]:
     """Return the name, tolerance and shape of a scenario, for the drawings of the page; lengths in µm and mm."""
-    shared, tables = scenario.shared, list(scenario.nodes.values())
     causes = changing({name: table.model_dump() for name, table in scenario.nodes.items()})
-    causes += ["cut"] if _first(CuttingProcessParameters, tables) else []
-    return {**_outlook(scenario.name, shared.step, shared.nominal_rpm, tables), "changing": causes}
+    causes += ["cut"] if scenario.first(CuttingProcessParameters) else []
+    return {**_outlook(scenario, scenario.shared.step, scenario.shared.nominal_rpm), "changing": causes}
 
 
 def plain_outlook(name: str, step: float) -> dict[str, Any]:
     """Return the same for an unknown scenario with a sampling step [s]."""
-    return {**_outlook(name, step, 0.0, []), "part": True}
+    return {**_outlook(Scenario(name, {}), step, 0.0), "part": True}
 
 
-def _outlook(name: str, step: float, rpm: float, tables: Sequence[NodeParameters]) -> dict[str, Any]:
-    tool, cut = _first(ToolParameters, tables), _first(CuttingProcessParameters, tables)
-    watch, force = _first(SupervisorParameters, tables), _first(ForceControllerParameters, tables)
-    master = _first(TimeMasterParameters, tables)
+def _outlook(scenario: Scenario, step: float, rpm: float) -> dict[str, Any]:
+    tool, cut = scenario.first(ToolParameters), scenario.first(CuttingProcessParameters)
+    watch, force = scenario.first(SupervisorParameters), scenario.first(ForceControllerParameters)
+    master = scenario.first(TimeMasterParameters)
     return {
-        "name": name,
+        "name": scenario.name,
         "step": step,
         "part": tool is not None,
         "tolerance": tool.tolerance * 1e6 if tool else 0.0,
@@ -46,7 +41,3 @@ def _outlook(name: str, step: float, rpm: float, tables: Sequence[NodeParameters
         "margin": max(watch.margin_limit, default=0.0) if watch else 0.0,
         "revolutions": master.revolutions if master else 0.0,
     }
-
-
-def _first(kind: type[Parameters], tables: Sequence[NodeParameters]) -> Parameters | None:
-    return next((table for table in tables if isinstance(table, kind)), None)

@@ -64,9 +64,8 @@ class Outlook:
     @classmethod
     def of(cls, scenario: Scenario) -> "Outlook":
         """Return the properties of a run of a scenario; the travel of a slide is not known in advance."""
-        tables = scenario.nodes.values()
-        turns = next((table.revolutions for table in tables if isinstance(table, TimeMasterParameters)), 0.0)
-        tool = next((table for table in tables if isinstance(table, ToolParameters)), None)
+        master, tool = scenario.first(TimeMasterParameters), scenario.first(ToolParameters)
+        turns = master.revolutions if master else 0.0
         return cls(turns, turns * tool.feed if tool and tool.height_from == "feed" else 0.0)
 
 
