@@ -116,7 +116,7 @@ def test_a_run_and_its_repetition_are_a_recording_each(turned, tmp_path):
     view = View(second.file)
     assert view.column("/events", "TextLog:text") == [["learning_controller/events: freeze"]]
     assert view.scalars("/learning/coarse/learning")[1].tolist() == recording.sparse["/coarse/learning"].values["cycle"]
-    assert "its end was not heard" in watched.said[2]
+    assert "the end of the run was not heard" in watched.said[2]
 
 
 def test_length_and_feed_of_a_scenario_scale_the_part(turned, tmp_path):
@@ -310,6 +310,6 @@ def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
         assert_array_equal(value, samples[time // STEP_NS])
         assert run["revolutions"] < LENGTH
     assert not until_the_end["complete"]
-    assert "its end was not heard" in cut
+    assert "the end of the run was not heard" in cut
     assert goes_on["left_out"] > 0
     assert "left out, wholly or in part" in left_out

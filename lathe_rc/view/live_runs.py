@@ -6,6 +6,7 @@ same name, has a view of its own. Independent of ROS.
 """
 
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
+from lathe_rc.messages import Signals
+from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_signals import drawn_fields
 
 Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
@@ -122,17 +125,76 @@ class ShownRun:
     complete: bool = False
 
 
-class RunView(Protocol):
-    """View of one run."""
+class Shown(Protocol):
+    """Destination of a run; also a sink of the engine."""
+
+    def learn(self, types: Mapping[str, str]) -> None:
+        """Add topics."""
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Show consecutive samples."""
+
+
+class RunView(ABC):
+    """View of one run, whose blocks it assembles to chunks.
+
+    Args:
+        block: first block received.
+        types: message type by topic, for the topics known so far.
+        view: shows the chunks.
+        size: length of a chunk [sample].
+        file: file of the recording, if there is one.
+
+    Attributes:
+        pieces: assembler of the chunks.
+        shown: summary of the run so far.
+    """
+
+    def __init__(
+        self, block: Block, types: Mapping[str, str], view: Shown, size: int, file: Path | None = None
+    ) -> None:
+        self._view, self._step_ns, self._size, self._types = view, block.step_ns, size, dict(types)
+        self.pieces = Pieces(types, size, self)
+        self.shown = ShownRun(block.run_id, file, end=block.first_index)
+        self._ended = {topic: False for topic, kind in types.items() if drawn_fields(kind)}
+
+    @abstractmethod
+    def note(self, index: int, text: str) -> None:
+        """Show a line of text about what was received, at a sample."""
 
     def block(self, topic: str, msgtype: str, block: Block) -> bool:
         """Add a block; return True if the run ends with it."""
+        if block.step_ns != self._step_ns:
+            raise LatheError(f"{topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
+        if topic not in self._types:
+            self._types[topic] = msgtype
+            self._view.learn(self._types)
+            self.pieces.learn(self._types)
+        self.pieces.block(topic, block.first_index, block.signals)
+        self.shown.end = max(self.shown.end, block.first_index + block.samples)
+        self._ended[topic] = block.last
+        return block.last and all(self._ended.values())
 
-    def message(self, message: Sparse) -> None:
-        """Add a message at its sample."""
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Show consecutive samples, after a note about dropped chunks before them."""
+        self._report_losses(first)
+        self._view.chunk(first, samples, dense, sparse)
+
+    def _report_losses(self, index: int) -> None:
+        """Report the chunks dropped before a sample since the last report."""
+        if missing := self.pieces.lost - self.shown.left_out:
+            self.shown.left_out = self.pieces.lost
+            piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
+            self.note(index, f"left out, wholly or in part: {missing} pieces of {piece:.3g} s, by {at:.2f} s")
 
     def close(self) -> ShownRun:
         """Show the remaining samples, and end the view."""
+        self.pieces.close()
+        self._report_losses(self.shown.end)
+        self.shown.first, self.shown.complete = self.pieces.first, all(self._ended.values())
+        if not self.shown.complete:
+            self.note(self.shown.end, "the end of the run was not heard")
+        return self.shown
 
 
 class LiveRuns:
@@ -173,16 +235,18 @@ class LiveRuns:
                 message = messages.decode(msgtype, data)
                 index = int(message.sample_index)
                 if self._belongs(topic, message.run_id, index, index):
-                    take = self._run.message if self._run else self._early.append
+                    take = self._run.pieces.message if self._run else self._early.append
                     take(Sparse(topic, msgtype, index, messages.values_of(msgtype, data)))
         except ValueError as error:
             raise LatheError(f"{topic}: {error}") from None
 
     def _block(self, topic: str, msgtype: str, block: Block) -> None:
+        if not block.step_ns:
+            raise LatheError(f"{block.source} sends a step of 0 ns")
         if self._run is None:
             self._run = self._begin(block, {**self.present, topic: msgtype})
             for message in self._early:
-                self._run.message(message)
+                self._run.pieces.message(message)
         if self._run.block(topic, msgtype, block):
             self.end()
 

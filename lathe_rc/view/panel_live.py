@@ -7,66 +7,38 @@ from typing import Any
 
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.view.live_runs import LiveRuns, ShownRun
+from lathe_rc.view.live_runs import LiveRuns, RunView, ShownRun
 from lathe_rc.view.panel_view import View
-from lathe_rc.view.rerun_pieces import Pieces
-from lathe_rc.view.rerun_signals import drawn_fields
 
 PIECE = 0.04  #: approximate length of a chunk [s] of simulated time
 
 
-class _Heard:
-    """One run in the view of the panel (implements `lathe_rc.view.live_runs.RunView`).
-
-    Args:
-        view: view of the panel, which begins anew.
-        block: first block received.
-        types: message type by topic, for the topics known so far.
-        told: returns the status of the panel, given that of the run.
-    """
+class _Heard(RunView):
+    """One run in the view of the panel, which begins anew; ``told`` returns the panel's status, given the run's."""
 
     def __init__(
         self, view: View, block: Block, types: Mapping[str, str], told: Callable[[str], Mapping[str, Any]]
     ) -> None:
-        if not block.step_ns:
-            raise LatheError(f"{block.source} sends a step of 0 ns")
-        self._view, self._told, self._types = view, told, dict(types)
+        self._panel, self._told = view, told
         view.begin(types, block.step_ns)
-        self._pieces = Pieces(types, math.ceil(PIECE * 1e9 / block.step_ns), self)
-        self._run = ShownRun(block.run_id, None, first=block.first_index, end=block.first_index)
-        self._ended = {topic: False for topic, kind in types.items() if drawn_fields(kind)}
-        self.message = self._pieces.message
+        super().__init__(block, types, view, math.ceil(PIECE * 1e9 / block.step_ns))
 
-    def block(self, topic: str, msgtype: str, block: Block) -> bool:
-        """Add a block; return True if the run ends with it."""
-        if topic not in self._types:
-            self._types[topic] = msgtype
-            self._view.learn(self._types)
-            self._pieces.learn(self._types)
-        self._pieces.block(topic, block.first_index, block.signals)
-        self._run.end = max(self._run.end, block.first_index + block.samples)
-        self._ended[topic] = block.last
-        return block.last and all(self._ended.values())
+    def note(self, index: int, text: str) -> None:
+        """Add a line to the log."""
+        self._panel.say(index, "panel", text)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Show consecutive samples, after a note about dropped ones before them."""
-        if missing := self._pieces.lost - self._run.left_out:
-            self._run.left_out = self._pieces.lost
-            self._view.say(first, "panel", f"left out, wholly or in part: {missing} pieces of {PIECE:g} s")
-        self._view.chunk(first, samples, dense, sparse)
-        self._view.publish(self._told("running"))
+        """Show consecutive samples, and tell the page."""
+        super().chunk(first, samples, dense, sparse)
+        self._panel.publish(self._told("running"))
 
     def close(self) -> ShownRun:
         """Show the remaining samples."""
-        self._pieces.close()
-        self._view.finish()
-        self._run.complete = all(self._ended.values())
-        if not self._run.complete:
-            self._view.say(self._run.end, "panel", "the end of the run was not heard")
-        self._view.publish(self._told("ended"), at_once=True)
-        return self._run
+        shown = super().close()
+        self._panel.finish()
+        self._panel.publish(self._told("ended"), at_once=True)
+        return shown
 
 
 class LivePanel(LiveRuns):
