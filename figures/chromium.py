@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Headless Chromium with one page, driven by the DevTools protocol over pipes; also used by the tests of the panel."""
+"""Headless Chromium with one page, driven by the DevTools protocol over pipes; also used by the tests of the panel.
+
+The scripts of figures/ take the program that their first argument names, if any, and save pictures with few colours.
+"""
 
 import base64
+import io
 import json
 import os
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any, NoReturn
+
+from PIL import Image
+
+from place import PICTURES
+
+SETTLED = "new Promise(done => setTimeout(done, 2000))"  #: figures are drawn by then
 
 
 class Chromium:
@@ -15,19 +26,20 @@ class Chromium:
 
     Args:
         folder: folder of its profile and of saved files.
+        program: the browser.
 
     Attributes:
         told: console messages and uncaught errors of the page.
         asked: addresses that it has requested.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, program: str = "chromium") -> None:
         self._number = 0
         self.told: list[str] = []
         self.asked: list[str] = []
         commands, self._commands = os.pipe()
         self._answers, answers = os.pipe()
-        words = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]
+        words = [program, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]
         words += ["--disable-background-networking", "--hide-scrollbars", f"--user-data-dir={folder / 'browser'}"]
         shell = f'exec "$@" 3<&{commands} 4>&{answers}'
         self._process = subprocess.Popen(
@@ -113,7 +125,33 @@ class Chromium:
         """Click the first element that a selector finds."""
         self.run(f"document.querySelector({json.dumps(selector)}).click()")
 
-    def shot(self, file: Path) -> None:
-        """Write a picture of the whole page."""
+    def shot(self) -> Image.Image:
+        """Return a picture of the window, or of a longer page."""
         found = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
-        file.write_bytes(base64.b64decode(found["data"]))
+        return Image.open(io.BytesIO(base64.b64decode(found["data"]))).convert("RGB")
+
+    def photograph(self, address: str, size: tuple[int, int], *, dark: bool = False) -> Image.Image:
+        """Return the top of a page in a window of a size [px]."""
+        self.look(*size, dark=dark)
+        self.open(address)
+        self.run(SETTLED)
+        return self.shot().crop((0, 0, *size))
+
+
+def shot(page: Path, size: tuple[int, int], *, dark: bool = False) -> Image.Image:
+    """Return the top of a page in a file."""
+    with Chromium(page.parent, *sys.argv[1:2]) as browser:
+        return browser.photograph(page.as_uri(), size, dark=dark)
+
+
+def light_and_dark(light: Image.Image, dark: Image.Image) -> Image.Image:
+    """Return two pictures side by side."""
+    both = Image.new("RGB", (2 * light.width + 20, light.height), "#888")
+    both.paste(light, (0, 0))
+    both.paste(dark, (light.width + 20, 0))
+    return both
+
+
+def save(picture: Image.Image, name: str, colours: int = 96) -> None:
+    """Save a picture of docs/img with few colours, so that it stays small."""
+    picture.quantize(colours, dither=Image.Dither.NONE).save(PICTURES / f"{name}.png", optimize=True)

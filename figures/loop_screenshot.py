@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 import lathe_rc
-from browser import save, shot
+from chromium import save, shot
 from lathe_rc.cell.varied_loop import VariedLoop
 from lathe_rc.view.loop_page import LoopPage
 

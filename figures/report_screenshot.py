@@ -8,10 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from PIL import Image
-
 import lathe_rc
-from browser import save, shot
+from chromium import light_and_dark, save, shot
 from lathe_rc.view import compare, report
 
 WIDE, NARROW = (1280, 2350), (420, 1500)
@@ -28,10 +26,7 @@ with tempfile.TemporaryDirectory() as folder:
     page.write_text(page.read_text(encoding="utf-8").replace(f"{folder}/", ""), encoding="utf-8")
     save(shot(page, WIDE), "report")
     save(shot(page, (WIDE[0], 1300), dark=True), "report_dark")
-    both = Image.new("RGB", (2 * NARROW[0] + 20, NARROW[1]), "#888")
-    for place, dark in enumerate((False, True)):
-        both.paste(shot(page, NARROW, dark=dark), (place * (NARROW[0] + 20), 0))
-    save(both, "report_narrow")
+    save(light_and_dark(shot(page, NARROW), shot(page, NARROW, dark=True)), "report_narrow")
     force = Path(folder) / "force"
     lathe_rc.run(lathe_rc.load("force_turning"), bag=force)
     report.write_report(force, page)

@@ -77,7 +77,7 @@ class TestPictures:
             assert f"img/{name})" in (ROOT / "docs" / picture.page).read_text(encoding="utf-8"), picture.page
 
     def test_no_script_draws_what_nobody_shows(self):
-        scripts = {path.name for path in (ROOT / "figures").glob("*.py")} - {"browser.py", "chromium.py", "place.py"}
+        scripts = {path.name for path in (ROOT / "figures").glob("*.py")} - {"chromium.py", "place.py"}
         drawing = {Path(word).name for picture in pictures.TABLE.values() for word in picture.command.split()}
         shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
         assert [name for name in scripts - drawing if f"figures/{name}" not in shown] == []
