@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.repairing import recover
-from lathe_rc.bag.writing.mcap_file import McapFile
+from lathe_rc.bag.writing.mcap_file import McapFile, channel_content, schema_content
 from lathe_rc.errors import InputError
 
 EVENTS = {"events": ["revolution 1.5: freeze", "sample 7000: learn"]}
@@ -221,8 +221,8 @@ def test_run_without_a_bag_leaves_nothing(tmp_path, monkeypatch):
 def test_memory_of_a_long_recording_grows_by_little_more_than_its_index(tmp_path):
     """A recorder writes two chunks a second: 170 000 a day."""
     file = McapFile(tmp_path / "long.mcap", chunk_size=2**20, compress=False)
-    schema = file.add_schema("std_msgs/msg/String", "string data")
-    channels = [file.add_channel(f"/topic_{number}", schema, "cdr", {}) for number in range(12)]
+    schema = file.add_schema(schema_content("std_msgs/msg/String", "ros2msg", b"string data"))
+    channels = [file.add_channel(channel_content(f"/topic_{number}", "cdr", {}), schema) for number in range(12)]
 
     def write(chunks: int) -> None:
         for stamp in range(chunks):

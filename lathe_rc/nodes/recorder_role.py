@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
-from lathe_rc_msgs.msg import CellState
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
@@ -33,13 +31,10 @@ from lathe_rc.nodes import publisher_info
 from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.exchange import Run
-from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
 
-_HOST_TOPICS = {
-    "/diagnostics": (DiagnosticArray, QoSProfile(depth=100)),
-    "cell_state": (CellState, latched_qos(4)),
-}
+_HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos(4)}
 _OFFERED = {topic.name: topic for topic in HOST_TOPICS}
 
 
@@ -122,13 +117,12 @@ class RecorderRole(Role):
     def activate(self) -> None:
         """Create the snapshot service and subscribe to the host topics; signal topics follow when announced."""
         self.node.create_service(Trigger, "~/snapshot", self._on_snapshot)
-        for topic, (kind, qos) in _HOST_TOPICS.items():
-            full = self.node.topic(topic)
-            offered = _OFFERED[topic]
+        for topic, qos in _HOST_TOPICS.items():
+            full, offered = self.node.topic(topic), _OFFERED[topic]
             durability = cast("Durability", offered.durability.replace(" ", "_"))
-            self._open.add_topic(full, self._type_name(kind), offered_qos(offered.depth, durability))
-            callback = self.node.guarded(partial(self._on_host, kind, full))
-            self.node.create_subscription(kind, full, callback, qos, raw=True)
+            self._open.add_topic(full, offered.type, offered_qos(offered.depth, durability))
+            callback = self.node.guarded(partial(self._on_host, offered.type, full))
+            self.node.create_subscription(message_class(offered.type), full, callback, qos, raw=True)
 
     def clean_up(self) -> None:
         """Reset the role; the bag of a cell that did not begin holds no block and is removed (implements `Role`)."""
@@ -137,24 +131,20 @@ class RecorderRole(Role):
             shutil.rmtree(self._path)
             self.node.get_logger().info(f"bag {self._path} removed: no block has come")
 
-    @staticmethod
-    def _type_name(kind: Any) -> str:
-        return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
-
     @property
     def _open(self) -> Output:
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
-    def _on_host(self, kind: Any, topic: str, data: bytes) -> None:
+    def _on_host(self, msgtype: str, topic: str, data: bytes) -> None:
         if self._writer is None:
             return
         try:
-            told = messages.decode(self._type_name(kind), data)
+            told = messages.decode(msgtype, data)
         except ValueError:
             return
         # All cells of a domain share /diagnostics.
-        if kind is CellState:
+        if msgtype == messages.CELL_STATE:
             ours = told.run_id == self.table.run_id
         else:
             ours = any(status.name in self.node.protocol.members for status in told.status)

@@ -9,7 +9,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import SampleReader, check_next
+from lathe_rc.bag.reading.stream import check_next
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals
 
@@ -46,6 +46,7 @@ class Recorded:
         names: the bag's topics by the cell's relative topics, where they differ by more than a leading slash.
 
     Attributes:
+        source: see the arguments.
         path: path of the bag.
         namespace: namespace of the recorded cell; empty if the cell had none.
 
@@ -55,14 +56,14 @@ class Recorded:
 
     def __init__(self, source: Source, names: Mapping[str, str]) -> None:
         self.path, self.namespace = source.path, provenance.namespace(source.about)
-        self._source, self._names = source, dict(names)
+        self.source, self._names = source, dict(names)
         for name, topic in names.items():
             if topic not in source.topics:
                 raise InputError(f"--topic {name}={topic}: {self.path} has no such topic; it has {self.holdings()}")
 
     def holdings(self) -> str:
         """Return the dense topics of the bag as readable text."""
-        found = {t: said for t, said in self._source.topics.items() if said.type in messages.block_types()}
+        found = {t: said for t, said in self.source.topics.items() if said.type in messages.block_types()}
         told = [f"{topic} ({said.type.rpartition('/')[2]})" for topic, said in sorted(found.items()) if said.count]
         return ", ".join(told) or "no topic with blocks of lathe_rc_msgs"
 
@@ -83,7 +84,7 @@ class Recorded:
             InputError: the topic has another type.
         """
         topic = self._names.get(name, self.namespace + messages.full(name))
-        said = self._source.topics.get(topic)
+        said = self.source.topics.get(topic)
         if said is None or not said.count:
             return None
         if said.type != msgtype:
@@ -92,17 +93,9 @@ class Recorded:
 
     def lacks(self, name: str, msgtype: str) -> str:
         """Describe a missing topic, listing the bag's topics of the same type."""
-        others = [t for t, said in sorted(self._source.topics.items()) if said.type == msgtype and said.count]
+        others = [t for t, said in sorted(self.source.topics.items()) if said.type == msgtype and said.count]
         options = " or ".join(f"--topic {name}={topic}" for topic in others or ["/TOPIC"])
         return f"{msgtype.rpartition('/')[2]} on {messages.full(name)} (or {options})"
-
-    def samples_of(self, topic: str, first: int = 0) -> SampleReader:
-        """Return a reader that reads a topic in step with a run, from sample ``first`` on."""
-        return SampleReader(self._source, topic, first)
-
-    def step_ns(self, topic: str) -> int:
-        """Return the sampling step of a topic [ns]; 0 if it has no block."""
-        return self._source.step_ns(topic)
 
     def pieces(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[int, Signals]]:
         """Yield the first sample and the requested fields of each block, as arrays of shape (n,).
@@ -111,7 +104,7 @@ class Recorded:
             LatheError: samples are missing or repeated, the step changes, or a number is not finite.
         """
         end, step_ns = 0, 0
-        for block in self._source.blocks(topic):
+        for block in self.source.blocks(topic):
             where = f"{self.path}: {topic}"
             check_next(where, block, end, step_ns)
             if not block.step_ns:

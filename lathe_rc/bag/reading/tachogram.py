@@ -55,7 +55,7 @@ def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
         recorded = Recorded(source, {"encoder": _chosen(source, topic)})
         spindle = recorded.spindle("encoder")
         field = "speed_true" if spindle.has_truth else "speed"
-        step = recorded.step_ns(spindle.topic) * 1e-9
+        step = source.step_ns(spindle.topic) * 1e-9
 
         def pieces() -> Iterator[tuple[Samples, Samples]]:
             for first, signals in recorded.pieces(spindle.topic, [field]):

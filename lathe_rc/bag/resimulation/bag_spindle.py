@@ -161,7 +161,7 @@ class Comparison:
         self.topics = topics
         self._encoder = remapped(cell.master.shared, "encoder")
         self._tool = remapped(tool.shared, tool.outputs[0].topic)
-        self._readers = [(recorded.samples_of(topic, cell.first), field) for topic, field in topics]
+        self._readers = [(SampleReader(recorded.source, topic, cell.first), field) for topic, field in topics]
         self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -183,16 +183,13 @@ class Comparison:
 Events = dict[str, list[tuple[int, str]]]  #: sample and action of each event, by node
 
 
-def wire(
-    chosen: Scenario, original: Scenario | None, recorded: Recorded, source: Source
-) -> tuple[Cell, Comparison | None, Events]:
+def wire(chosen: Scenario, original: Scenario | None, recorded: Recorded) -> tuple[Cell, Comparison | None, Events]:
     """Build and check a cell with the recorded spindle.
 
     Args:
         chosen: scenario to run.
         original: scenario of the bag; None if ``chosen`` replaces it.
         recorded: recorded topics of the bag.
-        source: the open bag.
 
     Returns:
         The cell; the comparison of its tool position with the recorded one, if the bag has that position but not the
@@ -203,7 +200,7 @@ def wire(
         InputError: the bag has no encoder, its step differs from the scenario's, or the pre-start checks fail.
         LatheError: required samples are missing or not finite.
     """
-    nodes = dict(chosen.nodes)
+    nodes, source = dict(chosen.nodes), recorded.source
     if original is not None:
         nodes = {name: table.model_copy(update={"events": [], "faults": []}) for name, table in nodes.items()}
     cell = Cell(nodes)
@@ -219,7 +216,7 @@ def wire(
         topics = []  # the bag has the recorded error, too
     samples = min([samples, *(recorded.length(of, kind) for of, kind in topics)])
     for of in (topic, *(of for of, _ in topics)):
-        step_ns = recorded.step_ns(of)
+        step_ns = source.step_ns(of)
         if step_ns != master.shared.step_ns:
             raise InputError(
                 f"{source.path}: {of} has a step of {step_ns} ns, the scenario one of {master.shared.step_ns} ns; "
@@ -230,7 +227,7 @@ def wire(
             f"{source.path} has samples {begin} to {samples - 1}, and the cell would begin at {first}; allowed: a "
             "checkpoint in the bag (--from FILE)"
         )
-    cell.replace(_RecordedSpindle(master, recorded.samples_of(topic, first), first, samples, spindle))
+    cell.replace(_RecordedSpindle(master, SampleReader(source, topic, first), first, samples, spindle))
     cell.check()
     compared = Comparison(recorded, cell, tool, topics) if tool and topics else None
     return cell, compared, _events(source, first) if original is not None else {}

@@ -78,7 +78,7 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
         )
     topic, field = position
     assert topic is not None, "one of the two is there"
-    steps = [recorded.step_ns(of) for of in (command, topic)]
+    steps = [recorded.source.step_ns(of) for of in (command, topic)]
     if steps[0] != steps[1]:
         raise InputError(
             f"{recorded.path}: steps of {steps[0]} ns on {command}, {steps[1]} ns on {topic}; record both alike"

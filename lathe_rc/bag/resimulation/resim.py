@@ -200,7 +200,7 @@ def resimulate(
         _refuse_part(source, begun=start_from is not None)
         recorded = Recorded(source, topics or {})
         overrides = [*overrides, *_start(source, start_from, given=scenario is not None)]
-        original = None if scenario is not None else _of_bag(recorded, source, Path(folder), overrides)
+        original = None if scenario is not None else _of_bag(recorded, Path(folder), overrides)
         if scenario is not None:
             chosen = scenarios.load(scenario, overrides)
         else:
@@ -218,7 +218,7 @@ def resimulate(
             identify.write_parameters(parameters, chosen, drives)
         changed = original is None or chosen.nodes != original.nodes
         with _without_strangers(path, changed=changed):
-            cell, compared, events = wire(chosen, original, recorded, source)
+            cell, compared, events = wire(chosen, original, recorded)
         warnings += cell.warnings if changed else []
         # Events are inserted at the samples at which they took effect, which depended on an operator or the spindle.
         for name, stage in cell.stages.items():
@@ -263,17 +263,18 @@ def resimulate(
     )
 
 
-def _of_bag(recorded: Recorded, source: Source, folder: Path, overrides: Sequence[str]) -> Scenario:
+def _of_bag(recorded: Recorded, folder: Path, overrides: Sequence[str]) -> Scenario:
     """Return the bag's scenario; ``overrides`` name the files that the bag does not contain.
 
     Raises:
         InputError: the bag has no scenario; the message states what the bag has and what is needed.
     """
-    if provenance.SCENARIO not in source.about:
-        raise InputError(f"{source.path}: {asked_for(recorded)}")
-    lacks = {name for name in provenance.named_files(source.about) if not name.endswith(scenarios.WRITTEN)}
+    about = recorded.source.about
+    if provenance.SCENARIO not in about:
+        raise InputError(f"{recorded.path}: {asked_for(recorded)}")
+    lacks = {name for name in provenance.named_files(about) if not name.endswith(scenarios.WRITTEN)}
     given = [text for text in overrides if _names(text, lacks | {START_FROM})]
-    return provenance.scenario_of(source.about, folder, given)
+    return provenance.scenario_of(about, folder, given)
 
 
 @contextmanager

@@ -161,26 +161,18 @@ class McapFile:
         """Release the disk space reserved for completing the file."""
         self._reserve.unlink(missing_ok=True)
 
-    def add_schema(self, name: str, text: str) -> int:
-        """Add the schema of a message type and return the schema's ID."""
-        return self.copy_schema(schema_content(name, "ros2msg", text.encode()))
-
-    def add_channel(self, topic: str, schema: int, encoding: str, metadata: Mapping[str, str]) -> int:
-        """Add a channel for a topic and return the channel's ID."""
-        return self.copy_channel(channel_content(topic, encoding, metadata), schema)
-
-    def copy_schema(self, content: bytes) -> int:
-        """Add a schema copied from another file's record, and return its ID in this file."""
+    def add_schema(self, content: bytes) -> int:
+        """Add a schema with the content of its record, except for the ID, and return its ID in this file."""
         number = len(self._schemas) + 1
         self._schemas.append(_record(Opcode.SCHEMA, struct.pack("<H", number), content[2:]))
         self._append(self._schemas[-1])
         return number
 
-    def copy_channel(self, content: bytes, schema: int) -> int:
-        """Add a channel copied from another file's record.
+    def add_channel(self, content: bytes, schema: int) -> int:
+        """Add a channel.
 
         Args:
-            content: content of the channel record.
+            content: content of the channel record, except for the IDs.
             schema: ID of the channel's schema in this file; 0: no schema.
 
         Returns:

@@ -18,7 +18,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from lathe_rc import messages
-from lathe_rc.bag.writing.mcap_file import McapFile
+from lathe_rc.bag.writing.mcap_file import McapFile, channel_content, schema_content
 from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.errors import InputError, LatheError
 
@@ -181,7 +181,7 @@ class BagWriter:
         self._about: dict[str, str] = {}
         self._topics: dict[ListedTopic, tuple[str, list[int]]] = {}  # hash of the type, and channels
         self._channels: dict[str, int] = {}  # channels of the written topics, by topic
-        self._schemas: dict[str | bytes | None, int] = {}
+        self._schemas: dict[bytes | None, int] = {}  # by content of the record
         try:
             self.tell(about)
         except LatheError:
@@ -217,12 +217,9 @@ class BagWriter:
 
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
         """Announce a topic of a type that this package may not know, with the text and hash of its definition."""
-        if msgtype not in self._schemas:
-            self._schemas[msgtype] = self._file.add_schema(msgtype, definition)
         said = {"offered_qos_profiles": _yaml(dump_qos_v9(list(qos))).strip(), "topic_type_hash": digest}
-        number = self._file.add_channel(topic, self._schemas[msgtype], "cdr", said)
-        self._channels[topic] = number
-        self._list(ListedTopic(topic, msgtype, "cdr", tuple(qos)), digest, number)
+        records = schema_content(msgtype, "ros2msg", definition.encode()), channel_content(topic, "cdr", said)
+        self._channels[topic] = self.copy_channel(ListedTopic(topic, msgtype, "cdr", tuple(qos)), digest, records)
 
     def copy_channel(self, topic: ListedTopic, digest: str, records: Records) -> int:
         """Announce a topic with the schema and channel records of another bag, whether or not they can be decoded.
@@ -237,13 +234,10 @@ class BagWriter:
         """
         schema, channel = records
         if schema not in self._schemas:
-            self._schemas[schema] = self._file.copy_schema(schema) if schema is not None else 0
-        number = self._file.copy_channel(channel, self._schemas[schema])
-        self._list(topic, digest, number)
+            self._schemas[schema] = self._file.add_schema(schema) if schema is not None else 0
+        number = self._file.add_channel(channel, self._schemas[schema])
+        self._topics.setdefault(topic, (digest, []))[1].append(number)
         return number
-
-    def _list(self, topic: ListedTopic, digest: str, channel: int) -> None:
-        self._topics.setdefault(topic, (digest, []))[1].append(channel)
 
     def copy(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Append a message to a channel announced by `copy_channel`.
