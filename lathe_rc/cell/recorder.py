@@ -50,6 +50,11 @@ class RecorderParameters(NodeParameters):
             if ": " not in pattern and "*" not in pattern:
                 raise InputError(f"triggers = {pattern!r}; allowed: a pattern of NODE: ACTION, like '*: {pattern}'")
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the bag."""
+        return Path(self.bag or f"bag_{self.run_id or 'cell'}")
+
     def snapshots_of(self, bag: Path) -> Path:
         """Return the folder of the snapshots that belong to a bag at ``bag``."""
         return Path(self.snapshots) if self.snapshots else bag.with_name(f"{bag.name}_snapshots")

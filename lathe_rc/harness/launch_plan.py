@@ -16,8 +16,6 @@ from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.harness.processes import with_recorder
@@ -52,7 +50,7 @@ def plan(asked: Mapping[str, Any]) -> dict[str, Any]:
     )
     Cell(scenario.nodes).check()
     namespace = checked_namespace(asked["namespace"])
-    bag = _place(scenario, asked["bag"])
+    bag = Path(asked["bag"]) if asked["bag"] else scenario.recorder[1].folder
     refuse_existing(bag)
     complete = with_recorder(scenario, bag, keep=True)
     file = Path(asked["folder"]) / "scenario.yaml"
@@ -86,12 +84,6 @@ def _refuse_unknown(given: Iterable[str], own: Sequence[str]) -> None:
                 f"no launch argument {name!r}; allowed: scenario, bag, namespace, allow_code, NODE.PARAM for a value "
                 f"of the scenario, or a shared one: {shared}"
             )
-
-
-def _place(scenario: Scenario, argument: str) -> Path:
-    """Return the bag's folder: the launch argument, the scenario's own, or one named after the run."""
-    recorders = [table for table in scenario.nodes.values() if isinstance(table, RecorderParameters)]
-    return Path(argument or next((table.bag for table in recorders if table.bag), f"bag_{scenario.shared.run_id}"))
 
 
 def _label(group: Sequence[str]) -> str:

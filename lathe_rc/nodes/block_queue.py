@@ -154,11 +154,9 @@ class BlockQueue(BlockOrder):
             self.received += 1
 
     def _last(self) -> Block:
-        """Return the newest block; a block of zeros before the first."""
-        return self._newest or self._zero()
-
-    def _zero(self) -> Block:
-        """Return a one-sample block of zeros, used before the first block arrives."""
+        """Return the newest block; before the first, a block of one sample of zeros."""
+        if self._newest is not None:
+            return self._newest
         zeros = {name: np.zeros(1, dtype) for name, dtype in messages.sample_fields(self.type).items()}
         return Block(self._run_id, self.source, 0, self._step_ns, False, 0, 0, 0, zeros)  # noqa: FBT003
 

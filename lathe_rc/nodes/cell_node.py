@@ -320,7 +320,8 @@ class CellNode(LifecycleNode):
             self._perform_actions()
             self._wait_for_acknowledgement([self._host["members"]], self.protocol.patience)
             self.watch.close()
-        for before, now, destroy in zip(self._endpoints_of_rclpy, self._endpoints(), self._destroyers(), strict=True):
+        destroyers: list[Any] = [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
+        for before, now, destroy in zip(self._endpoints_of_rclpy, self._endpoints(), destroyers, strict=True):
             self.discarded += [partial(destroy, endpoint) for endpoint in now - before]
         declare.release(self, self.table.rows())
         self._forget()
@@ -339,9 +340,6 @@ class CellNode(LifecycleNode):
 
     def _endpoints(self) -> list[set[Any]]:
         return [set(self.publishers), set(self.subscriptions), set(self.services)]
-
-    def _destroyers(self) -> list[Callable[[Any], object]]:
-        return [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
 
     # ---- parameters ---------------------------------------------------------------------------------
 

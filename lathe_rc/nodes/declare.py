@@ -52,12 +52,8 @@ def descriptor(row: Row) -> ParameterDescriptor:
 
 def overrides(node: Node) -> dict[str, Any]:
     """Return the parameter overrides of a node, which must have declared them automatically."""
-    given: dict[str, Any] = {}
     found: dict[str, Any] = node.get_parameters_by_prefix("")
-    for name, parameter in found.items():
-        if not is_of_rclpy(name):
-            given[name] = _plain(parameter.value)
-    return given
+    return {name: _plain(parameter.value) for name, parameter in found.items() if not is_of_rclpy(name)}
 
 
 def is_of_rclpy(name: str) -> bool:

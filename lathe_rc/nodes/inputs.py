@@ -130,7 +130,7 @@ class Inputs:
         """Return the next samples of all inputs; they must have arrived."""
         taken = {queue.topic: queue.pop(samples) for queue in self._shared}
         return [
-            taken[queue.topic] if queue.topic in taken else self._view(place, first, samples)
+            taken[queue.topic] if queue.topic in taken else self.take(place, first, samples)
             for place, (queue, _, _) in enumerate(self._inputs)
         ]
 
@@ -138,12 +138,6 @@ class Inputs:
         """Return the next samples of one input, after loading all earlier ones into its buffer."""
         queue, buffer, delay = self._inputs[place]
         _load(queue, buffer, first + samples - delay)
-        return buffer.view(first - delay, samples)
-
-    def _view(self, place: int, first: int, samples: int) -> Signals:
-        queue, buffer, delay = self._inputs[place]
-        if not delay:
-            _load(queue, buffer, first + samples)
         return buffer.view(first - delay, samples)
 
     # ---- in a chain ---------------------------------------------------------------------------------

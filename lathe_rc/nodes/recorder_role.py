@@ -61,8 +61,7 @@ class RecorderRole(Role):
         self.node = node
         self.whole: Path | None = None
         self.table = cast("RecorderParameters", node.table)
-        name = self.table.bag or f"bag_{self.table.run_id or 'cell'}"
-        self._path = Path(name)
+        self._path = self.table.folder
         self._snapshots: Snapshots | None = None
         if self.table.mode != "continuous":
             place, namespace = self.table.snapshots_of(self._path), node.namespace

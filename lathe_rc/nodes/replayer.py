@@ -4,7 +4,7 @@
 import json
 import tempfile
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -193,7 +193,7 @@ class Replayer:
         self._publishers: dict[str, Publisher] = {
             _CLOCK: node.create_publisher(Clock, self._names.get(_CLOCK, _CLOCK), QoSProfile(depth=DEPTH))
         }
-        self._waiting: dict[str, int] = {_CLOCK: 0}  # messages of a topic that may not have been acknowledged
+        self._waiting: Counter[str] = Counter()  # messages of a topic that may not have been acknowledged
         self._sent_ns = self._settled_ns = 0  # wall time of the newest message, and when all were acknowledged
 
     def _class(self, topic: str) -> Any:
@@ -289,7 +289,6 @@ class Replayer:
         except InvalidTopicNameException as error:
             reason = shown(error).removeprefix("Invalid topic name: ").rstrip(":")
             raise InputError(f"{name}: no name in ROS ({reason}); name others with --topics or --remap") from None
-        self._waiting[topic] = 0
 
     def _join(self) -> None:
         """Announce the bag's nodes with their topics, and a recorder; begin when the recorder is ready."""
@@ -309,7 +308,7 @@ class Replayer:
         self._folder = tempfile.TemporaryDirectory(prefix=REPLAYED_FILES)
         scenario = provenance.scenario_of(self._source.about, Path(self._folder.name))
         cell = Cell(scenario.nodes)
-        announced = []
+        self._announced = []
         for name, stage in cell.stages.items():
             member = self._members[name] = Node(name, context=self._node.context)
             sparse = {remapped(stage.shared, topic): kind for topic, kind in stage.sparse_topics.items()}
@@ -331,11 +330,9 @@ class Replayer:
                     parameters=json.dumps(stage.shared.model_dump()),
                 )
             )
-            announced.append(publisher)
-        self._announced = announced
+            self._announced.append(publisher)
         self._topics &= set(self._publishers)
         self._publishers[_STATE] = self._node.create_publisher(CellState, _STATE, latched_qos(1))
-        self._waiting[_STATE] = 0
         # A member becomes ready once it knows that the cell is not running yet.
         self._publishers[_STATE].publish(CellState(run_id=scenario.shared.run_id, state=CellState.WAITING))
         self._ended = CellState(run_id=scenario.shared.run_id, state=CellState.ENDED)

@@ -75,14 +75,6 @@ class TopicRecorder:
 
     # ---- topics -------------------------------------------------------------------------------------
 
-    def _graph(self) -> Mapping[str, Sequence[str]]:
-        """Return the message types by topic, for topics that have publishers."""
-        return {
-            topic: types
-            for topic, types in self._node.get_topic_names_and_types()
-            if self._node.count_publishers(topic)
-        }
-
     def _wanted(self, topic: str) -> bool:
         if self._parameters.topics:
             return topic in self._parameters.topics
@@ -92,7 +84,8 @@ class TopicRecorder:
 
     def _discover(self) -> None:
         """Subscribe to new topics; with simulated time, subscribe to /clock first."""
-        graph = self._graph()
+        found, count = self._node.get_topic_names_and_types(), self._node.count_publishers
+        graph = {topic: types for topic, types in found if count(topic)}
         if self._looks <= _LOOKS:
             self._present |= graph.keys()
             self._looks += 1

@@ -97,19 +97,6 @@ class Leave(NamedTuple):
 
 
 Action = (
-    Announce
-    | Say
-    | Tell
-    | TellTime
-    | TellPace
-    | Follow
-    | MembersChanged
-    | Begin
-    | CheckCell
-    | Start
-    | Release
-    | Lose
-    | Log
-    | Report
-    | Leave
-)
+    Announce | Say | Tell | TellTime | TellPace | Follow | MembersChanged | Begin | CheckCell | Start | Release | Lose
+    | Log | Report | Leave
+)  # fmt: skip

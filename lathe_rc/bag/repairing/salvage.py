@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -243,9 +244,7 @@ class Salvage:
     # ---- MCAP ---------------------------------------------------------------------------------------
 
     def _mcap(self, file: Path) -> Iterator[Message]:
-        def told(why: str, lost: int) -> None:
-            self._lose(file, why, lost)
-
+        told = partial(self._lose, file)
         with file.open("rb") as stream:
             sound = SoundRecords(stream, file.stat().st_size, told)
             sound.check_sums()
@@ -304,7 +303,7 @@ class Salvage:
                 with suppress(sqlite3.DatabaseError):  # caused by a damaged page; the other pages are read below
                     check_tables(base)
                 topics = self._sqlite_topics(file, base)
-                for number, log_ns, data in _readable_rows(base, lambda why, lost: self._lose(file, why, lost)):
+                for number, log_ns, data in _readable_rows(base, partial(self._lose, file)):
                     topic = topics.get(number)
                     if topic and isinstance(log_ns, int) and log_ns >= 0 and isinstance(data, bytes):
                         yield Message(topic, 0, log_ns, log_ns, data)

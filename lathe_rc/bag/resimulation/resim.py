@@ -349,7 +349,7 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
 
 def _digests_from(path: Path, cell: Cell) -> dict[str, str]:
     """Return the digests of a bag from the first sample of a cell on; empty if the recording is incomplete."""
-    found = _recorded_digests(path)
+    found = check.recorded(path) or check.check(path).digests
     with Source(path) as source:
         if not found or cell.first <= first_of(source):
             return found
@@ -365,8 +365,3 @@ def _errors_from(path: Path, first: int) -> ErrorsByRevolution:
         errors = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
     feed(path, [From(errors, first)])
     return errors
-
-
-def _recorded_digests(path: Path) -> dict[str, str]:
-    """Return the stored digests of a bag or, without them, those computed from its content; empty if incomplete."""
-    return check.recorded(path) or check.check(path).digests
