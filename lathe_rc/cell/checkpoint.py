@@ -125,8 +125,8 @@ class Checkpoint:
             stage.forget()
         if tuned:
             stage.shared = table
-            stage.parameters_now = stage.parameters_now.changed(name, {key: getattr(table, key) for key in tuned})
-            stage.tune(stage.parameters_now)
+            stage.parameters = stage.parameters.changed(name, {key: getattr(table, key) for key in tuned})
+            stage.tune(stage.parameters)
         return stage
 
     def _differing(self, name: str, stage: Stage) -> set[str]:

@@ -133,8 +133,8 @@ class Stage(ABC):
     Attributes:
         inputs, outputs: the ports, in the order of the arrays passed to `advance`.
         sparse_topics: relative name and type of every topic that carries `Sparse` messages.
+        parameters: parameter table, with the values of the ``set`` events so far.
         shared: parameter table at the start.
-        parameters_now: parameter table after the ``set`` events so far.
         unheard: sparse topics without a reader; their messages need not be created.
         foreign: type of each topic that the node receives from outside the cell, by name before remapping.
         tells: whether the stage generates events by itself, known only to `process`.
@@ -164,6 +164,7 @@ class Stage(ABC):
 
     kind: ClassVar[str]
     Parameters: ClassVar[type[NodeParameters]]
+    parameters: NodeParameters
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
     tunable: tuple[str, ...] = ()  #: parameters that the event ``set PARAM VALUE`` may change, all float
     announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves; up to a colon
@@ -189,7 +190,7 @@ class Stage(ABC):
 
     def __init__(self, name: str, parameters: NodeParameters) -> None:
         self.name = name
-        self.shared = self.parameters_now = parameters
+        self.shared = self.parameters = parameters
         self.sparse_topics: dict[str, str] = {}
         self.unheard: Collection[str] = ()
         self.foreign: dict[str, str] = {}
@@ -329,7 +330,7 @@ class Stage(ABC):
 
     def _table_after(self, actions: Sequence[str]) -> NodeParameters:
         """Return the parameters after all ``set`` events among some actions."""
-        table = self.parameters_now
+        table = self.parameters
         for verb, _, rest in (action.partition(" ") for action in actions):
             if verb == events.SET:
                 parameter, _, value = rest.partition(" ")
@@ -519,8 +520,8 @@ class Stage(ABC):
                 assert self._injection is not None, "the fault has been checked"
                 self._injection.begin(fault, index)
         elif verb == events.SET:
-            self.parameters_now = self._table_after([action])
-            self.tune(self.parameters_now)
+            self.parameters = self._table_after([action])
+            self.tune(self.parameters)
         elif verb == events.REPAIR:
             assert self._injection is not None, "the event has been checked"
             target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None

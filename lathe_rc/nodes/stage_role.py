@@ -59,7 +59,7 @@ class StageRole(Role):
         self.blocks = self.samples = 0
         self.started, self.angle = False, 0.0
         self.chain: Chain | None = None
-        self._shown = self.stage.parameters_now
+        self._shown = self.stage.parameters
         self.together = max(min(node.table.window // _TOGETHER, messages.MAX_BLOCK // node.table.block_size), 1)
         self.inputs = Inputs([(node.topic(port.topic), port) for port in self.stage.inputs], node.table, self.together)
         self.outputs = Outputs(node, self.stage)
@@ -279,7 +279,7 @@ class StageRole(Role):
             raise InputError(f"{node.full_name}: the run {when}{'' if node.protocol.over else before}")
         actions = [f"{events.SET} {name} {value!r}" for name, value in values.items()]
         self._accept_events(*actions)
-        cycle = int(getattr(self.stage.parameters_now, "cycle_revolutions", 1))
+        cycle = int(getattr(self.stage.parameters, "cycle_revolutions", 1))
         revolution = float((self.angle // (2.0 * np.pi * cycle) + 1) * cycle)
         for action in actions:
             self.stage.schedule_at_revolution(action, revolution)
@@ -339,8 +339,8 @@ class StageRole(Role):
     def _publish(self, said: Sequence[Sparse], memory: Sequence[Memory], samples: int, *, last: bool) -> None:
         self.blocks += self.outputs.publish(self.samples, said, memory, last=last)
         self.samples += samples
-        if self.stage.parameters_now is not self._shown:
-            self._shown = self.stage.parameters_now
+        if self.stage.parameters is not self._shown:
+            self._shown = self.stage.parameters
             self.node.show_parameters(self._shown, self.stage.tunable)
         self.node.completed(self.blocks, self.samples, last=last)
         if last:

@@ -226,7 +226,7 @@ def _node(stage: Stage) -> dict[str, Any]:
         "name": stage.name,
         "actions": [action for action in stage.actions if action not in _FILES],
         "knobs": [
-            {"name": name, "value": getattr(stage.parameters_now, name), "unit": rows[name].unit, "doc": rows[name].doc}
+            {"name": name, "value": getattr(stage.parameters, name), "unit": rows[name].unit, "doc": rows[name].doc}
             for name in stage.tunable
         ],
         "targets": stage.fault_targets,

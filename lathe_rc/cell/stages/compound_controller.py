@@ -62,11 +62,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class CompoundController(FormLaw):
-    """Law with feed-forward of the form and a PID on the error.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Law with feed-forward of the form and a PID on the error."""
 
     kind = "compound_controller"
     Parameters = CompoundControllerParameters

@@ -283,20 +283,16 @@ class CutStage(Stage):
 
 
 class CuttingProcessStage(CutStage):
-    """Cutting process with rigid drives (see `lathe_rc.plants.cutting`).
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Cutting process with rigid drives (see `lathe_rc.plants.cutting`)."""
 
     kind = "cutting_process"
     Parameters = CuttingProcessParameters
+    parameters: CuttingProcessParameters
     rooms = 4
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: CuttingProcessParameters) -> None:
         super().__init__(name, parameters, parameters, "")
-        self.parameters = parameters
         self.declare(
             inputs=[TURNS, *(READ[name] for name in parameters.moved_by)],
             outputs=[Output("cut", messages.CUT)],

@@ -82,19 +82,15 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
 
 
 class DecouplerStage(Stage):
-    """Decoupler of the force and position loops (see `lathe_rc.control.decoupler`).
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Decoupler of the force and position loops (see `lathe_rc.control.decoupler`)."""
 
     kind = "decoupler"
     Parameters = DecouplerParameters
+    parameters: DecouplerParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: DecouplerParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         channels = parameters.channels(name)
         with about(name, "w1_numerator", "w2_numerator", "inverse_lag"):  # inverted models, and the inverse's lag
             k1, k2 = compensators(channels, parameters.inverse_lag, parameters.leak)

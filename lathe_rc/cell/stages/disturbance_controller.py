@@ -106,11 +106,7 @@ def _passed(learned_waves: float, points: int, waves: bytes) -> Array:
 
 
 class DisturbanceController(FormLaw):
-    """Law that feeds the form forward, learns the disturbance and observes the rest.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Law that feeds the form forward, learns the disturbance and observes the rest."""
 
     kind = "disturbance_controller"
     Parameters = DisturbanceControllerParameters
@@ -141,7 +137,6 @@ class DisturbanceController(FormLaw):
 
     def tune(self, parameters: DisturbanceControllerParameters) -> None:
         """Continue with another learning gain from the next sample on; memory and estimates are kept."""
-        self.parameters = parameters
         known = self.law.known
         self.law = self.law._replace(known=known._replace(memory=with_gain(known.memory, parameters.learning_gain)))
 

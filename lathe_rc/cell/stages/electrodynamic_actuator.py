@@ -97,7 +97,6 @@ class ElectrodynamicActuator(SingleDrive):
     """Coarse electrodynamic drive in air (see `lathe_rc.plants.electrodynamic`).
 
     Attributes:
-        parameters: parameter table of the node.
         drive: machine of the drive.
     """
 
@@ -107,7 +106,6 @@ class ElectrodynamicActuator(SingleDrive):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
-        self.parameters = parameters
         self.drive = made_of(
             ElectrodynamicDrive, parameters, method=parameters.discretisation, modes=parameters.modes(name)
         )

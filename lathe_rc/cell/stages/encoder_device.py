@@ -74,7 +74,6 @@ class EncoderDevice(TimeMaster):
     """Time master that follows the counts of a real encoder (see `lathe_rc.signals.counts`).
 
     Attributes:
-        parameters: parameter table of the node.
         counted: angle from the counts.
     """
 

@@ -225,19 +225,18 @@ class FeedDriveStage(Obedient):
     """Feed drive of a slide (see `lathe_rc.plants.feed`).
 
     Attributes:
-        parameters: parameter table of the node.
         drive: simulated drive.
     """
 
     kind = "feed_drive"
     Parameters = FeedDriveParameters
+    parameters: FeedDriveParameters
     announces = (LIMITED, FREE, OUT_OF_REACH)
     rooms = 4
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FeedDriveParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         limits = parameters.command_limits()
         rubbing, screw = parameters.rubbing(name), parameters.screw(name)
         with about(name, *_COEFFICIENTS[parameters.model]):

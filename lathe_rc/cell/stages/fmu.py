@@ -187,17 +187,16 @@ class FmuStage(Stage):
     """Functional Mock-up Unit as a stage, whose ports follow from its parameters.
 
     Attributes:
-        parameters: parameter table of the node.
         fmu: the FMU.
     """
 
     kind = "fmu"
     Parameters = FmuParameters
+    parameters: FmuParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FmuParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self._memory: Memory | None = None
         self._instance: Instance | None = None
         self._saved: Samples | None = None  # state from which the instance goes on

@@ -60,17 +60,16 @@ class ForceController(Servo):
     """PID that controls the cutting force through the longitudinal feed (see `lathe_rc.control.pid`).
 
     Attributes:
-        parameters: parameter table of the node.
         pid: PID controller.
     """
 
     kind = "force_controller"
     Parameters = ForceControllerParameters
+    parameters: ForceControllerParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ForceControllerParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.pid = parameters.pid(name)
         self.declare(
             inputs=[

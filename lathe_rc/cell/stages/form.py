@@ -263,17 +263,16 @@ class ProfileStage(Stage):
     """Stage that evaluates the form at the spindle angle and the height.
 
     Attributes:
-        parameters: parameter table of the node.
         form: form of the part.
     """
 
     kind = "profile"
     Parameters = FormParameters
+    parameters: FormParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: FormParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.form = Form(name, parameters)
         self.declare(
             inputs=self.form.inputs,

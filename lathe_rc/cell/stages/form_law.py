@@ -102,7 +102,6 @@ class FormLaw(Law):
     """Base class of laws with a known form.
 
     Attributes:
-        parameters: parameter table of the node.
         form: form that the drive must follow.
 
     Raises:

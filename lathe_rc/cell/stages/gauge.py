@@ -250,19 +250,16 @@ class Gauge(Stage):
     The topic ``gauge/state`` is the state of the drive with its measured position corrected; a tool or a law reads it
     by ``remap: ["coarse/state:=gauge/state"]``. In ``gauge/reading``, ``position`` is the form error of the place under
     the gauge, ``measured_position`` the reading, and ``effort`` is 1 where there is one.
-
-    Attributes:
-        parameters: parameter table of the node.
     """
 
     kind = "gauge"
     Parameters = GaugeParameters
+    parameters: GaugeParameters
     actions = ("freeze", "learn", "clear")
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: GaugeParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         points, seed = parameters.points_per_revolution, parameters.seed
         if points & (points - 1):
             raise InputError(f"{name}.points_per_revolution = {points}; allowed: a power of 2, 64 up to 4096")

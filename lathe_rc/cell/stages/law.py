@@ -153,7 +153,6 @@ class Law(Sampled, Learner):
     change arrays of the memory and nothing else, and depends on the memory and on `Now` alone.
 
     Attributes:
-        parameters: parameter table of the node.
         law: memory of the law.
         senses: whether it reads the measured position of the commanded drive.
 
@@ -180,6 +179,7 @@ class Law(Sampled, Learner):
     """
 
     Parameters = LawParameters
+    parameters: LawParameters
     senses: ClassVar[bool] = False
     actions = ("freeze", "learn", "clear")
     announces = (OUT_OF_REACH,)
@@ -188,7 +188,6 @@ class Law(Sampled, Learner):
 
     def __init__(self, name: str, parameters: LawParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.law = self.started()
         delay = parameters.feedback_delay
         self._guard = GuardTable(parameters.stop_ratio**2, np.zeros(5), np.zeros(2, np.int64))

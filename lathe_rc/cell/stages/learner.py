@@ -58,11 +58,7 @@ class LawParameters(ObedientParameters, BoundedParameters, RestartParameters):
 
 
 class Learner(Obedient):
-    """Controller that learns a drive.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Controller that learns a drive."""
 
     parameters: LawParameters
     learns = True

@@ -40,11 +40,7 @@ _LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
 
 
 class LearningController(Learner):
-    """Repetitive controller of one drive (see `lathe_rc.control.repetitive`).
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Repetitive controller of one drive (see `lathe_rc.control.repetitive`)."""
 
     kind = "learning_controller"
     Parameters = LearningControllerParameters
@@ -57,7 +53,6 @@ class LearningController(Learner):
     goes_on: ClassVar[Mapping[int, str]] = {angle_memory.CYCLE_ENDED: "a cycle has ended"}
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
-        self.parameters = parameters
         super().__init__(name, parameters)
         lead = () if parameters.correction == "fir" else ("lead_time",)
         self.tunable = ("learning_gain", *lead, *_OF_Q.get(parameters.q_filter, ("q_time",)))
@@ -262,7 +257,6 @@ class LearningController(Learner):
 
     def tune(self, parameters: LearningControllerParameters) -> None:
         """Continue with another gain, lead or Q from the next sample on; the memory is kept."""
-        self.parameters = parameters
         self._q = parameters.make_q(self.name)
         self._margins.forget_suprema()
         self._controller.retune(self._q, parameters.learning_gain, parameters.make_preview(self.name))

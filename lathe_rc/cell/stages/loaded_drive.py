@@ -239,21 +239,18 @@ def step_series(memory: Memory, first: int, start: int, inputs: Fields, flags: F
 
 
 class LoadedDriveStage(CutStage, CoupledDrive):
-    """Electrodynamic drive under the cutting force (see `lathe_rc.plants.tool_drive`).
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Electrodynamic drive under the cutting force (see `lathe_rc.plants.tool_drive`)."""
 
     kind = "loaded_drive"
     Parameters = LoadedDriveParameters
+    parameters: LoadedParameters
     failure = staticmethod(failure)
     rooms = 9
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: LoadedParameters) -> None:
         super().__init__(name, parameters, parameters.cut, _CUT)
-        self.parameters, self._cut = parameters, parameters.cut
+        self._cut = parameters.cut
         coarse, fine, piezo = parameters.coarse, None, None
         coil = coarse.coil(name)
         if isinstance(parameters, LoadedSeriesParameters):

@@ -104,11 +104,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class NormOptimalController(FormLaw):
-    """Law that learns the best command within limits for every second revolution.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Law that learns the best command within limits for every second revolution."""
 
     kind = "norm_optimal_controller"
     Parameters = NormOptimalControllerParameters

@@ -233,18 +233,17 @@ class PiezoActuator(Drive):
     """Fine piezo drive (see `lathe_rc.plants.piezo`).
 
     Attributes:
-        parameters: parameter table of the node.
         drive: simulated drive.
         set_point: set point of the drive.
     """
 
     kind = "piezo_actuator"
     Parameters = PiezoActuatorParameters
+    parameters: PiezoActuatorParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: PiezoActuatorParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.drive = made_of(PiezoDrive, parameters, stack=parameters.stack(name), method=parameters.discretisation)
         self.set_point = SetPoint(name, parameters)
         self._commands = [LimitedCommand(name, parameters)]

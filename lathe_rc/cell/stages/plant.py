@@ -49,11 +49,7 @@ class PlantMemory(NamedTuple):
 
 
 class SingleDrive(Drive):
-    """Drive that moves the tool alone, with limited command, measured position, and retraction.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Drive that moves the tool alone, with limited command, measured position, and retraction."""
 
     parameters: PlantParameters
     _retraction: OwnRetraction
@@ -132,11 +128,11 @@ class Plant(Sampled, SingleDrive):
     """
 
     Parameters = PlantParameters
+    parameters: PlantParameters
     sample: ClassVar[Callable[[Any, float], Moved]]
     loop = staticmethod(_loop)
 
     def __init__(self, name: str, parameters: PlantParameters) -> None:
-        self.parameters = parameters
         super().__init__(name, parameters)
         self.plant = self.started()
 

@@ -231,17 +231,16 @@ class PositionController(Servo):
     """Position loop of a slide: `lathe_rc.control.pid`, `sampled_link` or `periodic`.
 
     Attributes:
-        parameters: parameter table of the node.
         law: controller of the position.
     """
 
     kind = "position_controller"
     Parameters = PositionControllerParameters
+    parameters: PositionControllerParameters
     goes_on: ClassVar[Mapping[int, str]] = {_TOLD: "the log of periods is full"}
 
     def __init__(self, name: str, parameters: PositionControllerParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.law = self._make()
         self._path = None
         axis, delay = parameters.axis, parameters.feedback_delay

@@ -75,11 +75,7 @@ def sample(memory: Memory, now: Now) -> float:
 
 
 class ResonantController(FormLaw):
-    """Law that cancels the harmonics of the error order by order.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Law that cancels the harmonics of the error order by order."""
 
     kind = "resonant_controller"
     Parameters = ResonantControllerParameters

@@ -142,20 +142,16 @@ class CoupledDrive(Drive):
 
 
 class SeriesDriveStage(CoupledDrive):
-    """Piezo and tool on the coarse carriage, in air (see `lathe_rc.plants.tool_drive`).
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Piezo and tool on the coarse carriage, in air (see `lathe_rc.plants.tool_drive`)."""
 
     kind = "series_drive"
     Parameters = SeriesDriveParameters
+    parameters: SeriesParameters
     step = staticmethod(step)
     _set_point: SetPoint
 
     def __init__(self, name: str, parameters: SeriesParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         coarse, fine = parameters.coarse, parameters.fine
         piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):

@@ -77,7 +77,6 @@ class SpindleEncoder(TimeMaster):
     """Spindle that follows a speed law, with its encoder (see `lathe_rc.signals.encoder`).
 
     Attributes:
-        parameters: parameter table of the node.
         law: speed law; None if a load changes it.
     """
 

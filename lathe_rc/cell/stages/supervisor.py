@@ -168,18 +168,17 @@ class Supervisor(Stage):
     """Supervisor with its monitors (see `lathe_rc.safety`).
 
     Attributes:
-        parameters: parameter table of the node.
         monitors: active monitors.
     """
 
     kind = "supervisor"
     Parameters = SupervisorParameters
+    parameters: SupervisorParameters
     actions = (RESET, RETRACT)
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SupervisorParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self._inputs = [Input("encoder", messages.ENCODER, ("angle", "speed", "index_pulse"))]
         self.monitors: list[Watcher] = []
         self._state = np.array([State.NOMINAL, Reaction.NONE, 0], np.int64)

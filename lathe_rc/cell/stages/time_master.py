@@ -80,18 +80,17 @@ class TimeMaster(Stage):
     """Stage that provides time and angle to all others, and reads no other stage.
 
     Attributes:
-        parameters: parameter table of the node.
         samples: length of the run [sample]; None: endless, or not known yet.
         live: whether readings arrive in real time while the cell runs, which excludes offline runs.
         law: speed law of the spindle; None: not known in advance.
     """
 
+    parameters: TimeMasterParameters
     live = False
     law: SpeedLaw | None = None
 
     def __init__(self, name: str, parameters: TimeMasterParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.samples: int | None = None
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:

@@ -138,17 +138,16 @@ class Tool(Stage):
     """Tool position as the sum of the motions (paper 001, Fig. 1a), compared with the desired form.
 
     Attributes:
-        parameters: parameter table of the node.
         form: form of the part; None if a profile node provides it.
     """
 
     kind = "tool"
     Parameters = ToolParameters
+    parameters: ToolParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ToolParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         self.form = Form(name, parameters) if parameters.reference == "own" else None
         if len(set(parameters.drives)) < len(parameters.drives):
             raise InputError(f"{name}.drives = {parameters.drives}; allowed: each drive once")

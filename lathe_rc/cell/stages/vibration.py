@@ -54,17 +54,16 @@ class Vibration(Stage):
     """Source of vibration between tool and part (see `lathe_rc.signals.vibration`).
 
     Attributes:
-        parameters: parameter table of the node.
         lines: amplitude [m], frequency [rad/s] and phase [rad] of each line, shape (3, n).
     """
 
     kind = "vibration"
     Parameters = VibrationParameters
+    parameters: VibrationParameters
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: VibrationParameters) -> None:
         super().__init__(name, parameters)
-        self.parameters = parameters
         # The name makes the random seeds of vibrations differ; the 1 makes each differ from that of its own sensor.
         random = np.random.default_rng(np.random.SeedSequence([parameters.seed, zlib.crc32(name.encode()), 1]))
         phase = parameters.line_phase or [0.0] * len(parameters.line_amplitude)
