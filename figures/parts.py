@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from lathe_rc import parameter
-from lathe_rc.control.q_filter import Array, Weights
+from lathe_rc.arrays import Array
+from lathe_rc.control.q_filter import Weights
 from lathe_rc.safety.monitors import Alarm, PlainMonitor
 from lathe_rc.signals.deviation_law import DeviationLaw
 from lathe_rc.signals.part_profile import PartProfile

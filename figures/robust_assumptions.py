@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lathe_papers import cells, judge, robust
-from lathe_rc.analysis.learning import Complex
+from lathe_rc.arrays import Complex
 from lathe_rc.cell.stages.learner import Loop
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.study import untracked

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
 from rich.console import Group
 
 from lathe_papers.formulas.angle_domain import COEFFICIENTS, AngleDomain, harmonic_errors
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
@@ -22,7 +22,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _GOST = (0.10, 0.15)  # speed deviations allowed by the standard for lathes, relative to Ω0 (paper 000, after eq. 11)
 _LABELS = ("exact", "quasi-static, eq. 9", "linearised, eq. 12")

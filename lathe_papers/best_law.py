@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
 from lathe_papers import cells, marks, sweeps
 from lathe_papers.speed_deviation import LAWS, SpeedDeviationParameters, settings
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -26,7 +26,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _LEARNED, _REVOLUTIONS, _JUDGED = 20.0, 50.0, 11  # revolutions at constant speed, in total, and evaluated at the end
 _TOLD = ("exact_preview", "exact_invariance")  # laws with advance knowledge of the speed

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
 from lathe_papers.formulas.loaded import compliance
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.plants.cutting import CuttingProcess
 from lathe_rc.plants.cutting_force import RIGID, SpecificForce
@@ -27,7 +27,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _STEP = 1 / 64000  # [s]
 _SPEED = 1000.0 * np.pi / 30.0  # [rad/s]

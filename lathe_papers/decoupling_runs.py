@@ -6,20 +6,18 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
 from lathe_papers.formulas.coupled_loops import CONNECTIONS, CoupledLoops, loops
 from lathe_papers.formulas.coupled_simulation import STEP, CoupledSimulation
 from lathe_rc.analysis.pid_tuning import Loop, evaluate
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.control.decoupler import PRESETS
 from lathe_rc.control.pid import FORCE, POSITION
 from lathe_rc.signals.allowance import Allowance, mean_reverting
 from lathe_rc.study import StudyParameters
 from lathe_rc.transfer import LinearSystem
-
-Array = npt.NDArray[np.float64]
 
 SETTLED = 2.0  #: time from which the paper computes the RMS of the force [s]
 CROSS = 3.0  #: simulated duration of a step [s]

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
@@ -28,6 +27,7 @@ from lathe_papers.formulas.step_fit import (
     fit_second_order,
     read_csv,
 )
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -35,7 +35,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _PRINTED = 2e-3  # T0 of eqs 18 and 19 in paper 000 [s]
 _SAMPLES = 1000  # number of samples of the simulated response

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
 from lathe_papers import cells, marks, sweeps
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.drive import Drive
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table as RichTable
 
-Array = npt.NDArray[np.float64]
 
 _DRAWN = ("natural_frequency", "damping", "delay")
 _SHARES = (0.5, 0.95, 0.99)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
 from lathe_papers.formulas.invariance import FirstOrderInvariance
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.errors import InputError
 from lathe_rc.plants.linear import discretise
@@ -25,7 +25,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _STEPS = 1000  # integration steps per T0
 _SPAN = 5.0  # angle range of the figure, in θ0

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.tolerance import LAST, judge
+from lathe_rc.arrays import Array
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 

@@ -9,7 +9,6 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
@@ -17,6 +16,7 @@ from lathe_papers import cells, marks
 from lathe_papers.formulas.structures import contraction, direct_compensation, iterative, supremum
 from lathe_papers.formulas.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, Tuning
 from lathe_rc import messages
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import RenderableType
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 SCENARIOS = ("one_channel", "direct_compensation", "two_coarse", "two_channel")  # in the order of the table
 _TUNINGS = {"none": PLAIN, "lead_lag": LEAD_LAG}

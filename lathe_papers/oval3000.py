@@ -19,8 +19,9 @@ from rich.console import Group
 from rich.table import Table as RichTable
 
 from lathe_papers import cells, marks, robust
-from lathe_papers.judge import Array, Judge, figure_of, finite, worst_of
+from lathe_papers.judge import Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.arrays import Array
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import SharedParameters, Value, parameter
 from lathe_rc.cell.scenario import TABLES, Scenario

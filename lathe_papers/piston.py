@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.table import Table as RichTable
 
@@ -18,6 +17,7 @@ from lathe_papers import cells
 from lathe_papers.formulas.tuning import PLAIN, ROWS
 from lathe_papers.multichannel import SCENARIOS, analytic
 from lathe_rc import messages
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -25,7 +25,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _SETTLED = 50  # revolutions after which learning has settled
 _POINTS = 1024  # points of the profile per revolution

@@ -16,8 +16,9 @@ from rich.console import Group
 from rich.table import Table as RichTable
 
 from lathe_papers import cells, marks
-from lathe_papers.judge import Array, Judge, figure_of, finite, worst_of
+from lathe_papers.judge import Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.drive import Drive

@@ -20,12 +20,12 @@ from lathe_papers.sampled_servo_numbers import (
     PRINTED,
     RATIOS,
     TERMS,
-    Array,
     LinkRow,
     Row,
     SampledServoNumbers,
     SampledServoParameters,
 )
+from lathe_rc.arrays import Array
 from lathe_rc.control.sampled_link import NONE, Link, SampledDrive, paper, ripple_free, towards
 from lathe_rc.study import Study, Track, untracked
 

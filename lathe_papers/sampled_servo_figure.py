@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_papers import marks
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import Measures
 from lathe_papers.sampled_servo_numbers import DESIRED, numbers, stable
+from lathe_rc.arrays import Array
 from lathe_rc.control.sampled_link import ripple_free
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from lathe_papers.sampled_servo_numbers import SampledServoNumbers
 
-Array = npt.NDArray[np.float64]
 
 _SHOWN = 1.2  # time span of the step responses [s]
 

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table
@@ -17,6 +16,7 @@ from rich.table import Table
 from lathe_papers.formulas import hyperstability
 from lathe_papers.formulas.hyperstability import BOX, NAMES, NOMINAL, Learning, Positivity
 from lathe_papers.formulas.periodic_example import Case, Outcome, ideal_input, limited_ideal_error, simulate, times
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.control.periodic import PRESETS, PeriodicGains
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _SHORT = 0.8  # input limit as a fraction of the input that the nominal drive requires
 _COARSE = 1e-4  # quantisation step in the table

@@ -20,6 +20,7 @@ from rich.table import Table as RichTable
 
 from lathe_papers import cells
 from lathe_rc import messages
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import Value, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -31,7 +32,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _BEGINS = 3.0  # [s] start of the deviation, after 50 revolutions at constant speed
 _SHOWN = 1.0  # [s] duration of the deviation

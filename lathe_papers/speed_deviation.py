@@ -11,19 +11,18 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
 from lathe_papers import cells, marks
 from lathe_rc import messages
+from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 Overrides = Mapping[str, object]
 
 _CYCLES = 50  # learning cycles at constant speed

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array operations as functions for kernels.
+"""Types of arrays, and array operations as functions for kernels.
 
 For statements on slices, Numba also compiles error messages about shapes, which takes seconds.
 """
@@ -10,6 +10,8 @@ import numpy.typing as npt
 from lathe_rc.jit import inlined
 
 Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+Integers = npt.NDArray[np.int64]
 
 
 @inlined

@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.compiled.struct_view import sized
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 
-Complex = npt.NDArray[np.complex128]
 Hold = Literal["zoh", "foh", "tustin"]
 
 

@@ -18,13 +18,12 @@ from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.speed import SpeedLaw
 
-Array = npt.NDArray[np.float64]
 Coefficients = Literal["exact", "quasi_static", "linearised"]
 
 COEFFICIENTS: tuple[Coefficients, ...] = ("exact", "quasi_static", "linearised")

@@ -13,15 +13,13 @@ from dataclasses import dataclass, replace
 
 import control
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.pid_tuning import Lti, delay, state_space
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.decoupler import FULL_W1, PRESETS, Channels, compensators, gain
 from lathe_rc.control.pid import FORCE, POSITION, PidGains
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
-
-Complex = npt.NDArray[np.complex128]
 
 CONNECTIONS = {"none": (False, False), "k1": (True, False), "k2": (False, True), "both": (True, True)}
 #: active compensators (K1, K2), by name
@@ -38,7 +36,7 @@ def plant(channels: Channels) -> Lti:
     return _connected(parts, inside, into, out, through)
 
 
-def _connected(parts: Lti, inside: npt.NDArray[np.float64], *around: npt.NDArray[np.float64]) -> Lti:
+def _connected(parts: Lti, inside: Array, *around: Array) -> Lti:
     """Connect subsystems: inputs are inside·outputs + into·w, outputs are out·outputs + through·w.
 
     ``around`` is (into, out, through).

@@ -11,17 +11,15 @@ from typing import NamedTuple
 
 import control
 import numpy as np
-import numpy.typing as npt
 
 from lathe_papers.formulas.coupled_loops import CoupledLoops, plant
+from lathe_rc.arrays import Array
 from lathe_rc.control.decoupler import Decoupler, decouple
 from lathe_rc.control.pid import Pid, PidTable
 from lathe_rc.control.pid import control as command_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.transfer import System
-
-Array = npt.NDArray[np.float64]
 
 STEP = 50e-6  #: sampling step of the simulation in paper 004 [s]
 

@@ -11,12 +11,10 @@ nothing is differentiated. Operators with varying parameters do not commute: Wk1
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 
 @kernel

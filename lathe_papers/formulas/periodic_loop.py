@@ -2,14 +2,12 @@
 """Example from paper 002, as in `lathe_rc.signals.example_002`: terms, derivatives, and the loop without delay."""
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState, advance
 from lathe_rc.jit import kernel
 from lathe_rc.signals.example_002 import OMEGA
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
-
-Array = npt.NDArray[np.float64]
 
 
 def transient(time: Array) -> Array:

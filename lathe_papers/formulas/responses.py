@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+from lathe_rc.arrays import Array, Complex
+
 Response = Callable[[Array], Complex]  #: function of frequencies [rad/s], shape (n,)
 
 

@@ -13,13 +13,11 @@ import control
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.sampled_link import Link, LinkTable, SampledDrive, closed_loop, correct, largest_pole, rest, table
 from lathe_rc.jit import kernel
 from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move
 from lathe_rc.plants.feed_models import sampled
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 _BAND = 0.05  # settling band, relative to the step
 STEPS = 400  #: simulation steps per period, to resolve the motion between samples

@@ -15,16 +15,13 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from lathe_papers.formulas.responses import second_order
 from lathe_rc.analysis.reduced_order import refuse_unusable
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True)

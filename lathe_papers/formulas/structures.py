@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_papers.formulas.responses import Array, Complex, Response, lead, lead_lag, second_order, smoothing
+from lathe_papers.formulas.responses import Response, lead, lead_lag, second_order, smoothing
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 
 _GRID = 4097  # number of frequencies evaluated before the worst one is refined

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from lathe_papers.formulas.responses import Array
 from lathe_papers.formulas.structures import Channel, direct_compensation, iterative, supremum
+from lathe_rc.arrays import Array
 from lathe_rc.errors import LatheError
 
 FREQUENCIES = np.array([500.0, 1000.0, 1500.0, 2000.0])  #: [rad/s]

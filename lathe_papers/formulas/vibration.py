@@ -13,11 +13,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
-from lathe_papers.formulas.responses import Array, Response
+from lathe_papers.formulas.responses import Response
 from lathe_papers.formulas.structures import uncompensated
+from lathe_rc.arrays import Array, Complex
 
 Spectrum = Callable[[Array], Array]
 
@@ -91,5 +91,5 @@ def describing_function(amplitude: float, thresholds: Array, weights: Array, pro
     ratio = np.minimum(np.asarray(thresholds, dtype=np.float64) / amplitude, 1.0)
     cosine = 1.0 - 2.0 * ratio
     real = 0.5 + (np.arcsin(cosine) + cosine * np.sqrt(1.0 - cosine**2)) / np.pi
-    plays: npt.NDArray[np.complex128] = real - 4j / np.pi * ratio * (1.0 - ratio)
+    plays: Complex = real - 4j / np.pi * ratio * (1.0 - ratio)
     return complex(proportional + weights @ plays)

@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lathe_rc.arrays import Array
+
 Causes = frozenset[str]
 
 TOLD = 0.01  #: smallest share of the interactions at which they are reported pair by pair

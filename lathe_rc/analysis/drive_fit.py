@@ -16,15 +16,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.control.identification import DriveIdentifier
 from lathe_rc.errors import InputError
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.linear import Discretisation
-
-Array = npt.NDArray[np.float64]
 
 PARAMETERS = ("natural_frequency", "damping", "delay")  #: in this order wherever they are an array
 MOST = 2**19  #: samples that are used; a longer record is cut

@@ -2,14 +2,12 @@
 """Measurement of a drive as data of `lathe_rc.analysis.modal_fit`: by its quantities a response, a record or a step."""
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.frequency_response import FrequencyResponse, Hold, estimate, of_measurement
 from lathe_rc.analysis.modal_fit import ResponseData, StepData
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.measurement_file import Measurement
-
-Array = npt.NDArray[np.float64]
 
 _LEVEL = 1e-9  # of the height of a step, within which a command is constant
 

@@ -16,7 +16,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin
+from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.arrays import Array, Complex
 
 Characteristic = Callable[[Array], tuple[Complex, Complex]]  #: D and F at frequencies [rad/s]
 

@@ -8,10 +8,8 @@ the expected sum for the true response.
 """
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+from lathe_rc.arrays import Array, Complex
 
 
 def fir_inverse(

@@ -17,10 +17,8 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc.analysis.metrology import gaussian_share
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 _TURN = 2.0 * np.pi
 _SEARCH = 8192  # angles at which the correlation is computed before it is refined

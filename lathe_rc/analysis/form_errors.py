@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 # State: samples so far; turns at the last sample and at the one before, error of the last; number of the current
@@ -37,7 +36,7 @@ class FormErrors:
     rms: Array
     largest: Array
     peak_to_valley: Array
-    starts: npt.NDArray[np.int64]
+    starts: Integers
 
     def told(self, error: str = "form error", unit: str = "µm", scale: float = 1e6) -> list[str]:
         """Describe the error in the first and the last revolution as a text line; none without a revolution.

@@ -27,12 +27,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.signals.measurement_file import Measurement
 from lathe_rc.signals.table import write_table
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 Hold = Literal["linear", "zero", "none"]
 
 LEAST = 16  #: points of a response
@@ -107,7 +106,7 @@ class FrequencyResponse:
                 "the point out)"
             )
 
-    def smoothed(self, response: Callable[[Array], npt.NDArray[np.complex128]]) -> npt.NDArray[np.complex128]:
+    def smoothed(self, response: Callable[[Array], Complex]) -> Complex:
         """Return a model's response as this measurement would show it, from one of frequencies [rad/s].
 
         Args:

@@ -17,15 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
-
-Array = npt.NDArray[np.float64]
 
 _WHOLE = 0.95  # fraction of the range that counts as the full range
 _LEAST = 1e-9  # a slope below this cannot be inverted

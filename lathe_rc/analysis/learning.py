@@ -12,16 +12,14 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic_response, derivative_responses
 from lathe_rc.control.q_filter import QFilter
 from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import Constant
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 Response = Callable[[Array], Complex]
 
 _COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each of the worst peaks

@@ -26,14 +26,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 BAND = 0.02  #: share of a step within which it is settled, without a tolerance
 _TURN = 2.0 * np.pi

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 
 

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 POINTS = 4096  #: angles per revolution, about the number of the cell's samples at 1000 rpm
 _STANDSTILL = 1e-3  # of the largest step of the angle between samples
@@ -118,7 +116,7 @@ def gaussian(profile: Array, cutoff: float) -> Array:
     return np.fft.irfft(np.fft.rfft(profile, axis=-1) * kept, n=points, axis=-1)
 
 
-def gaussian_share(order: npt.NDArray[np.int64], cutoff: float) -> Array:
+def gaussian_share(order: Integers, cutoff: float) -> Array:
     """Compute the part of an amplitude at ``order`` UPR that the Gaussian filter of ISO 16610-21 keeps, shape (n,)."""
     return np.asarray(np.exp(-np.log(2.0) * (order / cutoff) ** 2))
 

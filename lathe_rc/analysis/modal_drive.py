@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+from lathe_rc.arrays import Array, Complex
 
 MILLI = 1e-3  #: unit of the delay among the searched parameters [s]
 BASE = 3  #: searched parameters without modes

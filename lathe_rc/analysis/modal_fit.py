@@ -15,16 +15,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from lathe_rc.analysis.frequency_response import LEAST, FrequencyResponse
 from lathe_rc.analysis.modal_drive import BASE, EACH, MILLI, ModalDrive, resonance, resonance_step
 from lathe_rc.analysis.reduced_order import refuse_unusable
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 MOST_MODES = 8  #: that a fit looks for
 COVERED = 0.95  #: confidence of the set of drives

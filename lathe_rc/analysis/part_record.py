@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.form_correction import Revolution
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, shown
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Mapped
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _WHOLE = 0.75  # least part of a revolution that a record has to cover

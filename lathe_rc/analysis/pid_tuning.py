@@ -21,12 +21,10 @@ import control
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction, realise
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 Lti: TypeAlias = Any  # control.lti.LTI, which has no type annotations
 Plant: TypeAlias = TransferFunction | Lti

@@ -4,12 +4,10 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.table import write_table
-
-Array = npt.NDArray[np.float64]
 
 _CLOSEST = 1e-9  # [m] between two heights, required by the reader
 

@@ -18,18 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from lathe_rc.analysis.frequency_response import FrequencyResponse
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.decoupler import LAG, inverse
 from lathe_rc.errors import InputError, at_least
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
 from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 _SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, relative to the length of the record
 _DAMPINGS = (0.2, 1.2)

@@ -17,11 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 _POINTS = 20_000  # points of a frequency grid
 _SPAN = 30.0  # ratio of the grid's ends to the outermost poles

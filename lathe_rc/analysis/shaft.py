@@ -24,9 +24,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 
-Array = npt.NDArray[np.float64]
 Support = Literal["centres", "chuck_and_centre", "chuck"]
 
 STEEL_MODULUS = 2.1e11  #: E [Pa]

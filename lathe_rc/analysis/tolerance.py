@@ -16,9 +16,8 @@ fault or by a change of form along the part, is not growth.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from lathe_rc.arrays import Array
 
 LAST = 10  #: largest number of revolutions at the end of a run that margin and budget cover
 _FEWEST = 4  # smallest number of revolutions in a rise

@@ -21,8 +21,9 @@ from lathe_rc.analysis.cycle_weights import of_gaussian_process
 from lathe_rc.analysis.fir_inverse import fir_inverse
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.frequency_response import FrequencyResponse
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response
+from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.tolerance import LAST, judge
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import SharedParameters, Value
 from lathe_rc.cell.scenario import TABLES, Scenario

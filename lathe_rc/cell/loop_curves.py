@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.wiring import Cell
 
 LEAST = 0.1  #: lowest waves per revolution of a curve

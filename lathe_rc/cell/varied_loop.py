@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.analysis.form_errors import FormErrors
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.regeneration import Regeneration, lobes
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
 from lathe_rc.cell.parameters import Value

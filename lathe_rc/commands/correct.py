@@ -11,7 +11,8 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis import form_correction, part_record, profile_csv
-from lathe_rc.analysis.form_correction import Alignment, Complex, Correction, Revolution
+from lathe_rc.analysis.form_correction import Alignment, Correction, Revolution
+from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.form import FormParameters

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from numba.core.errors import NumbaError
 
-from lathe_rc.compiled.struct_view import Integers, Struct, StructView, call
+from lathe_rc.arrays import Integers
+from lathe_rc.compiled.struct_view import Struct, StructView, call
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.jit import cache_folder, kernel, read_kept

@@ -27,8 +27,6 @@ from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.extending import intrinsic, models, overload, register_model
 from numba.np.arrayobj import populate_array
 
-Integers = npt.NDArray[np.int64]
-
 _populate: Any = populate_array  # Numba has few types
 _proxy: Any = cgutils.create_struct_proxy
 _WORD = ir.IntType(64)

@@ -22,11 +22,9 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _ROUNDING = 1e-18  # [rad²] variance of an ideal encoder

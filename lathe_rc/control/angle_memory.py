@@ -10,16 +10,12 @@ vectorised in groups of eight.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, Integers, put
 from lathe_rc.control.correction import invariant
 from lathe_rc.control.interpolation import cubic, read, read_along, read_derivatives
 from lathe_rc.control.q_filter import two_sided
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
 PIECE = 512  #: number of grid points learned at a time

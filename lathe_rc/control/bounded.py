@@ -7,14 +7,11 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _LONGER = 1.05  # ratio of successive trial durations
 _LOOKS = 129  # points at which the bounds of a motion are checked

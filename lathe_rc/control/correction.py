@@ -16,13 +16,9 @@ The drive model is e^{-pτ}/(1 + a1·p + a2·p²) with a1 = 2ζ/ωn and a2 = 1/�
 from dataclasses import dataclass
 from enum import IntEnum
 
-import numpy as np
-import numpy.typing as npt
-
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 
 class CorrectionLaw(IntEnum):

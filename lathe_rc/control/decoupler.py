@@ -18,13 +18,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
-
-Array = npt.NDArray[np.float64]
 
 LAG = 1e-3  #: lag added for each missing order of an inverse [s] (paper 004)
 LEAK = 0.05  #: leak of the integrators [rad/s]

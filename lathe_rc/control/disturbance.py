@@ -22,8 +22,8 @@ Source: spec/robust.md.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.control.disturbance_memory import MemoryTable, empty_memory, expected, forget_all, learn, revolution_ended
 from lathe_rc.control.identification import (
     STAGES,
@@ -40,9 +40,6 @@ from lathe_rc.control.identification import (
 )
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
-
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _TURN = 2.0 * np.pi
 _SWINGS_IN = 10.0  # settling time of the drive, in units of a1

@@ -11,13 +11,11 @@ Source: spec/robust.md; learning over the position for non-circular cutting: Nak
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.control.interpolation import read
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _TAIL = 5.0  # distance at which S is truncated [standard deviations]

@@ -18,12 +18,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_rc.arrays import put_scaled
+from lathe_rc.arrays import Array, put_scaled
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
 
 STAGES = 3  #: number of first-order stages of each low-pass
 _LEAST_EXCITED = 1e-6  # smallest determinant of the normal equations, relative to that of orthogonal regressors

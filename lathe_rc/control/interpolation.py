@@ -4,12 +4,9 @@
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.jit import inlined, kernel
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
 
 
 @inlined

@@ -14,12 +14,10 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
 from lathe_rc.signals.speed import SpeedLaw, evaluate
-
-Array = npt.NDArray[np.float64]
 
 
 class LeadLaw(IntEnum):

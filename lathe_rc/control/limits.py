@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 _SHORT_OF = 0.98  # fraction of the allowed velocity that is used when approaching a limit
 _CLOSE = 1.0 + 1e-9  # tolerance factor of a limit, for rounding errors

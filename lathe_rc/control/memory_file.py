@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import data_file
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import replacing
-
-Array = npt.NDArray[np.float64]
 
 _KIND = "memory"
 _ROOM = 1 << 16  # space for everything but the memory [B]

@@ -23,14 +23,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
-
-Array = npt.NDArray[np.float64]
 
 # Indices in the state of a controller.
 _INTEGRAL, _SLOPE, _ERROR, _SET_POINT, _COMMAND, SATURATED, CLAMPED, SLOWED, _STANDS, _WAITS, _SIZE = range(11)

@@ -26,14 +26,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.table import read_table, write_table
 
-Array = npt.NDArray[np.float64]
 ForceLaw = Callable[[Array], Array]  #: force [N] for a depth of cut [m] at each height, not decreasing with it
 
 _COLUMNS = ("height_mm", "offset_um")
@@ -94,7 +93,7 @@ class PathTable(NamedTuple):
 
     heights: Array
     offsets: Array
-    beyond: npt.NDArray[np.int64]
+    beyond: Integers
 
 
 @kernel

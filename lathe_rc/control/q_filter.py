@@ -19,13 +19,11 @@ from abc import ABC, abstractmethod
 from math import ceil
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-
-Array = npt.NDArray[np.float64]
 
 _TAIL = 1e-12  # weight at which a kernel is truncated
 _EDGES = 256  # number of frequencies at which the ripple of a band is checked

@@ -18,16 +18,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.control import angle_memory
 from lathe_rc.control.angle_memory import AngleMemory
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import Preview, look_ahead
 from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _LONGEST = 8192  # largest number of samples in a block

@@ -31,10 +31,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 
-Array = npt.NDArray[np.float64]
 Law = Literal["paper", "ripple_free"]
 
 _DIGITS = 9  # decimals by which a pole magnitude is distinguished from 1

@@ -30,7 +30,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.compiled.struct_view import sized
 from lathe_rc.control.limits import CommandLimits, keep_position, keep_velocity, rest
 from lathe_rc.errors import InputError
@@ -41,8 +41,6 @@ from lathe_rc.plants.linear import discretise
 from lathe_rc.plants.screw import Screw, ScrewTable, nut, nut_speed, warm
 from lathe_rc.signals.noise import quantise
 from lathe_rc.transfer import TransferFunction
-
-Complex = npt.NDArray[np.complex128]
 
 
 @kernel
@@ -234,7 +232,7 @@ class FeedTable(NamedTuple):
     resolution: float
     from_load: bool
     kept: bool
-    counts: npt.NDArray[np.int64]
+    counts: Integers
 
 
 @kernel

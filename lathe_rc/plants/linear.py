@@ -9,11 +9,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.transfer import bilinear, hold_response
 
-Complex = npt.NDArray[np.complex128]
 Discretisation = Literal["foh", "tustin"]
 
 

@@ -19,13 +19,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.plants.hysteresis import LINEAR, Hysteresis, Law, advance, advance_along
 from lathe_rc.plants.linear import Constant, DiscretePlant, Discretisation, discretise, second_order
-
-Complex = npt.NDArray[np.complex128]
 
 _ROUNDING = 1e-9  # relative to the stroke: rounding error may bring an exact inverse above full voltage
 
@@ -237,7 +235,7 @@ class FineTable(NamedTuple):
     memory: Array
     full_voltage: float
     state: Array
-    saturated: npt.NDArray[np.int64]
+    saturated: Integers
 
 
 @kernel

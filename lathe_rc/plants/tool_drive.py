@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
@@ -49,9 +49,6 @@ from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
 from lathe_rc.plants.modes import NONE, Modes, carriage
 from lathe_rc.plants.piezo import Stack, StackTable
 from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
-
-Complex = npt.NDArray[np.complex128]
-Integers = npt.NDArray[np.int64]
 
 _CARRIAGE, _TOOL = 0, 2  # indices of the positions in the state: x1, x1', x2, x2'
 

@@ -15,13 +15,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, shown
 from lathe_rc.messages import Signals
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _LARGEST = 1e100  # far larger than any physical value, with finite products

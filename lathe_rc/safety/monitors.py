@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
-from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Array, Watch, clear
+from lathe_rc.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Watch, clear
 from lathe_rc.safety.state_machine import Reaction
 
 Place = tuple[int, str]  # index of an input, and name of its field

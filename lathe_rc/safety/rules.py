@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Array, Integers, put
 from lathe_rc.jit import inlined, kernel
 
-Array = npt.NDArray[np.float64]
-Places = npt.NDArray[np.int64]
+Places = Integers
 Pulses = npt.NDArray[np.uint8]
 
 THRESHOLD, RATE, INDEX, GROWTH = range(4)  #: numbers of the rules in the table

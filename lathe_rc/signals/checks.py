@@ -2,11 +2,9 @@
 """Checks of arrays from a scenario or a third-party class."""
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 
 def stacked(what: str, **arrays: Array) -> Array:

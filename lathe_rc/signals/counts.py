@@ -17,13 +17,12 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.edge_time import COUNT, STAMP, edge_table, pass_edge, passed
 from lathe_rc.signals.table import read_text
 
-Array = npt.NDArray[np.float64]
 #: time [ns], counter and, with edge times, that of the last edge [ns]; an integer counter as int, for all its digits
 Reading = tuple[int, int | float] | tuple[int, int | float, int]
 

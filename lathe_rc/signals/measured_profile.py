@@ -6,13 +6,11 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.table import parse_table, read_text
-
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))

@@ -21,10 +21,9 @@ import numpy.typing as npt
 import scipy
 
 from lathe_rc import extras, files
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.table import number
-
-Array = npt.NDArray[np.float64]
 
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 25.4e-3}
 _LENGTH = {**_LENGTHS, "": 1.0, "1": 1.0}

@@ -6,12 +6,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_rc.arrays import Array, put
+from lathe_rc.arrays import Array, Integers, put
 from lathe_rc.jit import inlined, kernel
-
-Integers = npt.NDArray[np.int64]
 
 DRAWN = 8192  #: largest number of random numbers that a stream draws at once
 

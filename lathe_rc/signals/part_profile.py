@@ -5,9 +5,9 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.checks import real_numbers
-from lathe_rc.signals.profile import Array
 from lathe_rc.signals.profile_table import ProfileTable, tabulated
 
 _TURN = 2.0 * np.pi

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.signals.checks import stacked
-
-Array = npt.NDArray[np.float64]
 
 
 class Profile(Protocol):

@@ -9,12 +9,10 @@ from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import files
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 
 def read_text(path: Path, what: str) -> str:

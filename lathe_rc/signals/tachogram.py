@@ -7,12 +7,10 @@ Time 0 is at the first row, as it is at the first reading of encoder counts; the
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.signals.table import read_table, write_table
-
-Array = npt.NDArray[np.float64]
 
 _COLUMNS = ("time_s", "rpm")
 _UNITS = {"revolutions per second (Hz)": 60.0, "rad/s": 30.0 / np.pi, "degrees per second": 1.0 / 6.0}  # in rpm

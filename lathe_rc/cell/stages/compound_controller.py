@@ -11,7 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now

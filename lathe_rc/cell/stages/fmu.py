@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.cell.columns import units
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage, WiredCell
 from lathe_rc.compiled.c_function import c_status
 from lathe_rc.compiled.step import CompiledStep
-from lathe_rc.compiled.struct_view import Integers
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.fmi.units import alike, powers
 from lathe_rc.jit import kernel

@@ -21,12 +21,11 @@ from statistics import NormalDist
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
 from lathe_rc.analysis.metrology import gaussian_share
-from lathe_rc.arrays import put
+from lathe_rc.arrays import Integers, put
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage, WiredCell
 from lathe_rc.control.interpolation import read
@@ -124,7 +123,7 @@ class Memory(NamedTuple):
     gain: float
     correction: Samples
     fresh: Samples
-    whole: npt.NDArray[np.int64]
+    whole: Integers
     real: Samples
 
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.learner import LawParameters, Learner
 from lathe_rc.cell.stages.obedience import OBEY, OUT_OF_REACH, Listener, apply, listens, may_learn, piece
@@ -59,7 +59,7 @@ class GuardTable(NamedTuple):
 
     limit: float
     sums: Samples
-    whole: npt.NDArray[np.int64]
+    whole: Integers
 
 
 _ERROR, _FORM, _ENDED, _FIRST, _ALLOWED = range(5)
@@ -109,8 +109,8 @@ class LawMemory(NamedTuple):
     delay: int
     period: float
     senses: bool
-    learns: npt.NDArray[np.int64]
-    asks: npt.NDArray[np.int64]
+    learns: Integers
+    asks: Integers
 
 
 def _loop(sample: Callable[[Any, Now], float]) -> Callable[..., Reached]:

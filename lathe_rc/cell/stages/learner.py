@@ -12,8 +12,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.analysis import feedback
-from lathe_rc.analysis.learning import Array, Complex, DriveMargin, Response, drive_margin, smallest_errors, supremum
+from lathe_rc.analysis.learning import DriveMargin, Response, drive_margin, smallest_errors, supremum
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import (
     NonNegative,
     ObedientParameters,

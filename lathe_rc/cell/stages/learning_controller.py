@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Array, Complex, LearningLoop, Response, highest_waves
+from lathe_rc.analysis.learning import LearningLoop, Response, highest_waves
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
 from lathe_rc.cell.stages.learner import Learner

@@ -4,8 +4,8 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from lathe_rc.arrays import Integers
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, forbidden, may_learn, obeyed, piece
 from lathe_rc.control import angle_memory
@@ -51,7 +51,7 @@ class Memory(NamedTuple):
     finer: int
     identifies: bool
     margin: Samples
-    state: npt.NDArray[np.int64]
+    state: Integers
 
 
 @inlined

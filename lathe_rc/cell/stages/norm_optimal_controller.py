@@ -17,10 +17,10 @@ from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Le
 
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stages.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
 from lathe_rc.cell.stages.law import Now
@@ -60,11 +60,11 @@ class Memory(NamedTuple):
 
     forward: ForwardTable
     step: float
-    asks: npt.NDArray[np.int64]
+    asks: Integers
     sums: Array
     given: Array
     before: Array
-    whole: npt.NDArray[np.int64]
+    whole: Integers
     place: Array
 
 

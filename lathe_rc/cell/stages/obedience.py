@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.arrays import Array, Integers
 from lathe_rc.cell.parameters import ObedientParameters, Positive, parameter
 from lathe_rc.cell.stage import Input, Sparse, Stage
 from lathe_rc.control import bounded
@@ -82,8 +82,8 @@ class ObedienceTable(NamedTuple):
         takeover: takeover of the command.
     """
 
-    whole: npt.NDArray[np.int64]
-    forbidden: npt.NDArray[np.float64]
+    whole: Integers
+    forbidden: Array
     takeover: TakeoverTable
 
 
@@ -177,7 +177,7 @@ class Obedience:
         return ObedienceTable(self._whole, self._forbidden, self._takeover.table)
 
     @property
-    def wanted(self) -> tuple[npt.NDArray[np.int64], int]:
+    def wanted(self) -> tuple[Integers, int]:
         """Array and index of the number that tells whether learning is requested."""
         return self._whole, _WANTS
 

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Array, Complex, Response
+from lathe_rc.analysis.learning import Response
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
 from lathe_rc.cell.stages.command_limits import LimitedCommand, LimitedParameters, limited

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Gt, Le
 
 from lathe_rc import messages, resources
+from lathe_rc.arrays import Integers
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.feed_drive import Axis
@@ -134,7 +134,7 @@ class PeriodicMemory(NamedTuple):
     divisor: int
     held: Samples
     log: Samples
-    logged: npt.NDArray[np.int64]
+    logged: Integers
 
 
 @kernel

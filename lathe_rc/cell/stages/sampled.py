@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Array, Complex
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Stage
 from lathe_rc.compiled.step import Step, step_of

@@ -7,10 +7,10 @@ from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
+from lathe_rc.arrays import Integers
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell, cut
 from lathe_rc.cell.stages.drive import Drive
@@ -137,7 +137,7 @@ class Memory(NamedTuple):
     watch: Watch
     clearance: Samples
     out: int
-    state: npt.NDArray[np.int64]
+    state: Integers
 
 
 @kernel
