@@ -14,12 +14,11 @@ import numpy as np
 
 from lathe_papers.formulas.coupled_loops import CoupledLoops, plant
 from lathe_rc.arrays import Array
-from lathe_rc.control.decoupler import Decoupler, decouple
+from lathe_rc.control.decoupler import Decoupler, DecouplerTable, decouple
 from lathe_rc.control.pid import Pid, PidTable
 from lathe_rc.control.pid import control as command_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.transfer import System
 
 STEP = 50e-6  #: sampling step of the simulation in paper 004 [s]
 
@@ -53,10 +52,7 @@ def _advance(
     pid2: PidTable,
     memory1: Array,
     memory2: Array,
-    k1: System,
-    k2: System,
-    lag1: Array,
-    lag2: Array,
+    decoupler: DecouplerTable,
     first: int,
     force_set: Array,
     position_set: Array,
@@ -85,7 +81,7 @@ def _advance(
         seen = (n - table.delay) % size
         u1 = command_of(pid1, memory1, n, force_set[k], line[0, seen])
         u2 = command_of(pid2, memory2, n, position_set[k], line[1, seen])
-        w1, w2 = decouple(k1, lag1, k2, lag2, u1, u2)
+        w1, w2 = decouple(decoupler, u1, u2)
         v1[k], v2[k] = min(max(w1, -table.limit), table.limit), min(max(w2, -table.limit), table.limit)
         cut += (v1[k] != w1) + (v2[k] != w2)
         for row in range(order):
@@ -175,9 +171,8 @@ class CoupledSimulation:
             v1: filled with the command of the longitudinal feed [1].
             v2: filled with the command of the cross feed [1].
         """
-        pid1, pid2, both = self.force_pid, self.position_pid, self._decoupler
+        pid1, pid2 = self.force_pid, self.position_pid
         self.cut += _advance(
             self._table, self._state, self._line, pid1.table, pid2.table, pid1.state, pid2.state,
-            both.k1, both.k2, both.state1, both.state2,
-            first, force_set, position_set, noise, force, position, v1, v2,
+            self._decoupler.table, first, force_set, position_set, noise, force, position, v1, v2,
         )  # fmt: skip

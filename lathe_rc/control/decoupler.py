@@ -16,6 +16,7 @@ The paper uses mm, N and % of the full command; here the channels are in m, N an
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,19 +117,26 @@ def compensators(channels: Channels, lag: float = LAG, leak: float = LEAK) -> tu
     return _leaking(k1, leak), _leaking(k2, leak)
 
 
+class DecouplerTable(NamedTuple):
+    """K1 and K2 for kernels, with their states (see `lathe_rc.transfer.step`)."""
+
+    k1: System
+    state1: Array
+    k2: System
+    state2: Array
+
+
 @inlined
-def decouple(k1: System, state1: Array, k2: System, state2: Array, u1: float, u2: float) -> tuple[float, float]:
-    """Compute the decoupled commands v1 and v2 of one sample; states as for `lathe_rc.transfer.step`."""
-    return u1 - step(k1, state1, u2), u2 - step(k2, state2, u1)
+def decouple(table: DecouplerTable, u1: float, u2: float) -> tuple[float, float]:
+    """Compute the decoupled commands v1 and v2 of one sample."""
+    return u1 - step(table.k1, table.state1, u2), u2 - step(table.k2, table.state2, u1)
 
 
 @kernel
-def decouple_along(
-    k1: System, state1: Array, k2: System, state2: Array, u1: Array, u2: Array, v1: Array, v2: Array
-) -> None:
+def decouple_along(table: DecouplerTable, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
     """Compute the decoupled commands of a block with `decouple`, shape (n,)."""
     for k in range(u1.size):
-        v1[k], v2[k] = decouple(k1, state1, k2, state2, u1[k], u2[k])
+        v1[k], v2[k] = decouple(table, u1[k], u2[k])
 
 
 class Decoupler:
@@ -141,13 +149,12 @@ class Decoupler:
         step_s: sampling step [s].
 
     Attributes:
-        k1, k2: difference equations, exact for commands that are linear between samples.
-        state1, state2: states of k1 and k2 for `decouple`.
+        table: K1 and K2 for `decouple`, exact for commands that are linear between samples.
     """
 
     def __init__(self, k1: TransferFunction | None, k2: TransferFunction | None, step_s: float) -> None:
-        self.k1, self.k2 = (discretise(k, step_s, "foh") if k else _OFF for k in (k1, k2))
-        self.state1, self.state2 = rest(self.k1), rest(self.k2)
+        one, two = (discretise(k, step_s, "foh") if k else _OFF for k in (k1, k2))
+        self.table = DecouplerTable(one, rest(one), two, rest(two))
 
     def block(self, u1: Array, u2: Array, v1: Array, v2: Array) -> None:
         """Decouple a block of commands, shape (n,) each.
@@ -158,4 +165,4 @@ class Decoupler:
             v1: output, command of the longitudinal feed [1].
             v2: output, command of the cross feed [1].
         """
-        decouple_along(self.k1, self.state1, self.k2, self.state2, u1, u2, v1, v2)
+        decouple_along(self.table, u1, u2, v1, v2)

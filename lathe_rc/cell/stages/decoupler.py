@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoupler of the force and position loops (paper 004, Figs 5 and 10)."""
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Le
 
@@ -9,11 +9,19 @@ from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
-from lathe_rc.control.decoupler import LAG, LEAK, PRESETS, Channels, Decoupler, compensators, decouple_along
+from lathe_rc.control.decoupler import (
+    LAG,
+    LEAK,
+    PRESETS,
+    Channels,
+    Decoupler,
+    DecouplerTable,
+    compensators,
+    decouple_along,
+)
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.messages import Samples
-from lathe_rc.transfer import System, TransferFunction
+from lathe_rc.transfer import TransferFunction
 
 _CHANNELS = ("w1", "w2", "w3", "w4")
 
@@ -41,10 +49,7 @@ class DecouplerParameters(NodeParameters):
     inverse_lag: Positive = parameter(LAG, "lag for each order that an inverse is missing", "s")
     leak: Annotated[float, Ge(0), Le(1e6)] = parameter(LEAK, "of the integrators in K1 and K2; 0: none", "rad/s")
 
-    @property
-    def commanded_topic(self) -> str:
-        """Topic of the drive that W2 describes; W1, W3 and W4 do not belong to a single drive."""
-        return "cross/command"
+    commanded_topic: ClassVar[str] = "cross/command"  #: of W2; W1, W3 and W4 do not belong to a single drive
 
     def channels(self, node: str) -> Channels:
         """Return the plant model of a node.
@@ -62,22 +67,13 @@ class DecouplerParameters(NodeParameters):
         return Channels(**made)
 
 
-class Memory(NamedTuple):
-    """State of the decoupler's step function: K1 and K2 with their states."""
-
-    k1: System
-    state1: Samples
-    k2: System
-    state2: Samples
-
-
 @kernel
-def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+def step(memory: DecouplerTable, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """Decouple the commands of one block; set points and errors are passed on unchanged."""
     force, position = inputs[0], inputs[3]
     for place in (1, 2, 4, 5):
         put(outputs[place], inputs[place])
-    decouple_along(memory.k1, memory.state1, memory.k2, memory.state2, force, position, outputs[0], outputs[3])
+    decouple_along(memory, force, position, outputs[0], outputs[3])
     return force.size, DONE
 
 
@@ -108,7 +104,6 @@ class DecouplerStage(Stage):
         )
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> DecouplerTable:
         """Current state of the decoupler's step function."""
-        made = self._decoupler
-        return Memory(made.k1, made.state1, made.k2, made.state2)
+        return self._decoupler.table
