@@ -10,11 +10,11 @@ and units that differ.
 import csv
 import re
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -73,18 +73,22 @@ class Clock(NamedTuple):
     step: float
 
 
-class Source(Protocol):
-    """Opened measurement: columns by name."""
+class Source(ABC):
+    """Opened measurement: columns by name.
 
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Unit by column, in the order of the file; empty if the file states none."""
+    Attributes:
+        units: unit by column, in the order of the file; empty if the file states none.
+    """
 
+    units: Mapping[str, str]
+
+    @abstractmethod
     def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
         """Return columns by name, shape (n,) each."""
 
     def clock(self, name: str) -> Clock | None:
         """Return the sampling of a column; None if the file does not state it."""
+        return None
 
 
 class Mapped(NamedTuple):
@@ -298,22 +302,7 @@ class Measurement:
 # --- formats
 
 
-@dataclass(frozen=True)
-class _Arrays:
-    """Columns in memory."""
-
-    arrays: Mapping[str, npt.NDArray[Any]]
-    units: Mapping[str, str]
-    clocks: Mapping[str, Clock]
-
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
-        return {name: self.arrays[name] for name in names}
-
-    def clock(self, name: str) -> Clock | None:
-        return self.clocks.get(name)
-
-
-class _Csv:
+class _Csv(Source):
     """CSV file: comma, semicolon or tabulator between columns; lines that start with # are comments."""
 
     def __init__(self, path: Path) -> None:
@@ -390,11 +379,8 @@ class _Csv:
             rows.append([number(row[place].replace(point, "."), self._path, line) for place in places])
         return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
 
-    def clock(self, name: str) -> Clock | None:
-        return None
 
-
-class _Parquet:
+class _Parquet(Source):
     """Parquet file; the metadata ``unit`` of a field is the unit of the column."""
 
     def __init__(self, path: Path) -> None:
@@ -408,32 +394,33 @@ class _Parquet:
         table = self._file.read(columns=list(names))
         return {name: table.column(name).to_numpy() for name in names}
 
-    def clock(self, name: str) -> Clock | None:
-        return None
 
+class _Mat(Source):
+    """MATLAB file; a field of a structure is ``NAME.FIELD``."""
 
-def _mat(path: Path) -> Source:
-    """Read a MATLAB file; a field of a structure is ``NAME.FIELD``."""
-    try:
-        variables = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
-    except NotImplementedError:
-        raise InputError(f"{path}: MATLAB 7.3; allowed: up to 7 (save it with '-v7' in MATLAB)") from None
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    def __init__(self, path: Path) -> None:
+        try:
+            variables = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
+        except NotImplementedError:
+            raise InputError(f"{path}: MATLAB 7.3; allowed: up to 7 (save it with '-v7' in MATLAB)") from None
+        self._arrays: dict[str, npt.NDArray[Any]] = {}
+        for name, value in variables.items():
+            if not name.startswith("__"):
+                self._collect(name, value)
+        self.units = dict.fromkeys(self._arrays, "")
 
-    def collect(name: str, value: Any) -> None:
+    def _collect(self, name: str, value: Any) -> None:
         if hasattr(value, "_fieldnames"):
             for field in value._fieldnames:  # noqa: SLF001 - the documented way to list the fields
-                collect(f"{name}.{field}", getattr(value, field))
+                self._collect(f"{name}.{field}", getattr(value, field))
         elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiuc":
-            arrays[name] = value
+            self._arrays[name] = value
 
-    for name, value in variables.items():
-        if not name.startswith("__"):
-            collect(name, value)
-    return _Arrays(arrays, dict.fromkeys(arrays, ""), {})
+    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+        return {name: self._arrays[name] for name in names}
 
 
-class _Tdms:
+class _Tdms(Source):
     """TDMS file: ``CHANNEL``, or ``GROUP/CHANNEL`` where the name of the channel alone is not unique."""
 
     def __init__(self, path: Path) -> None:
@@ -469,7 +456,7 @@ class _Tdms:
         return self._clocks.get(name)
 
 
-class _Mdf:
+class _Mdf(Source):
     """MDF file (versions 2 to 4): channels by name, the first of each."""
 
     def __init__(self, path: Path) -> None:
@@ -496,7 +483,7 @@ _FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
     ".csv": ("CSV", _Csv),
     ".txt": ("CSV", _Csv),
     ".parquet": ("Parquet", _Parquet),
-    ".mat": ("MATLAB", _mat),
+    ".mat": ("MATLAB", _Mat),
     ".tdms": ("TDMS", _Tdms),
     ".mf4": ("MDF", _Mdf),
     ".mdf": ("MDF", _Mdf),

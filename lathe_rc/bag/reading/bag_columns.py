@@ -9,12 +9,13 @@ from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import columns
 from lathe_rc.messages import Samples
+from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Clock, Mapped, Measurement
 
 _DRIVE = {"command": "coarse/command.position", "response": "coarse/state.measured_position"}
 
 
-class BagColumns:
+class BagColumns(measurement_file.Source):
     """Columns of a bag, for `lathe_rc.signals.measurement_file.Measurement`.
 
     Args:
