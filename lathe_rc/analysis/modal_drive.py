@@ -112,21 +112,14 @@ class ModalDrive:
             mode_participation=tuple(modes[:, 2].tolist()),
         )
 
-    def with_mode(self, frequency: float, damping: float, participation: float) -> "ModalDrive":
-        """Return the drive with a further mode."""
-        return ModalDrive(
-            self.natural_frequency,
-            self.damping,
-            self.delay,
-            (*self.mode_frequency, frequency),
-            (*self.mode_damping, damping),
-            (*self.mode_participation, participation),
-        )
+    def with_modes(self, modes: Sequence[tuple[float, float, float]]) -> "ModalDrive":
+        """Return the drive with other modes, as in `modes`."""
+        columns = zip(*modes, strict=True) if modes else ((), (), ())
+        return ModalDrive(self.natural_frequency, self.damping, self.delay, *columns)
 
     def sorted(self) -> "ModalDrive":
         """Return the drive with its modes in order of their frequencies."""
-        modes: Sequence[Sequence[float]] = list(zip(*sorted(self.modes), strict=True)) or ((), (), ())
-        return ModalDrive(self.natural_frequency, self.damping, self.delay, *(tuple(values) for values in modes))
+        return self.with_modes(sorted(self.modes))
 
     def parameters(self) -> dict[str, float | list[float]]:
         """Return the parameters of ``electrodynamic_actuator`` by name; those of modes only if there are any."""

@@ -303,9 +303,9 @@ class ModalFit:
         """Standard errors of the parameters."""
         x, spread = self.drive.searched(), np.sqrt(np.diag(self.covariance))
         modes = [(np.exp(x[k]) * spread[k], np.exp(x[k + 1]) * spread[k + 1], spread[k + 2]) for k in self._places]
-        w, z, share = (tuple(map(float, values)) for values in zip(*modes, strict=True)) if modes else ((), (), ())
         own = np.exp(x[:2]) * spread[:2]
-        return ModalDrive(float(own[0]), float(own[1]), float(spread[2]) * MILLI, w, z, share)
+        drive = ModalDrive(float(own[0]), float(own[1]), float(spread[2]) * MILLI)
+        return drive.with_modes([(float(w), float(z), float(share)) for w, z, share in modes])
 
     @property
     def _places(self) -> range:
@@ -437,19 +437,12 @@ def _bic(data: Data, drive: ModalDrive, model_error: float) -> float:
 
 def _with_rest(data: Data, drive: ModalDrive) -> ModalDrive:
     """Return the drive with a mode for those that are still missing, see `_search`."""
-    return drive.with_mode(_BEYOND * data.band[1], 1.0, 0.0)
+    return drive.with_modes([*drive.modes, (_BEYOND * data.band[1], 1.0, 0.0)])
 
 
 def _without_rest(drive: ModalDrive) -> ModalDrive:
     """Return the drive without its last mode."""
-    return ModalDrive(
-        drive.natural_frequency,
-        drive.damping,
-        drive.delay,
-        drive.mode_frequency[:-1],
-        drive.mode_damping[:-1],
-        drive.mode_participation[:-1],
-    )
+    return drive.with_modes(drive.modes[:-1])
 
 
 def _with_mode(data: Data, drive: ModalDrive, deviation: Array, held: ModalDrive | None) -> ModalDrive:
@@ -474,8 +467,8 @@ def _with_mode(data: Data, drive: ModalDrive, deviation: Array, held: ModalDrive
         place = int(np.argmax(best))
         row = int(np.argmax(gains[:, place]))
         share = float(np.clip(shares[row, place], -1.0, 1.0))
-        begun = _without_rest(drive).with_mode(float(frequency[place]), _TRIED[row], share)
-        begun = begun.with_mode(*drive.modes[-1])
+        *modes, others = drive.modes
+        begun = drive.with_modes([*modes, (float(frequency[place]), _TRIED[row], share), others])
         found.append(_search(data, begun, deviation, rest=True, held=held))
         best[np.abs(np.log(frequency / frequency[place])) < np.log(_APART)] = -1.0
         if best.max() <= 0.0:
