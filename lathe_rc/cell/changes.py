@@ -57,12 +57,9 @@ def changes(now: Any, start: Any) -> Change | None:
 def _is_frozen(part: Any) -> bool:
     """Return whether an object never changes, although parts of it may."""
     params = getattr(type(part), "__dataclass_params__", None)
-    return bool(params and params.frozen) or (isinstance(part, np.ndarray) and not part.flags.writeable) or _is_q(part)
-
-
-def _is_q(part: Any) -> bool:
-    """Return whether an object is a Q filter: without state, and shared by stages with equal parameters."""
-    return isinstance(part, QFilter)
+    is_read_only = isinstance(part, np.ndarray) and not part.flags.writeable
+    # A Q filter has no state; stages with equal parameters share it.
+    return bool(params and params.frozen) or is_read_only or isinstance(part, QFilter)
 
 
 def _attributes(part: Any) -> dict[str, Any]:
@@ -292,7 +289,7 @@ class Restoring:
         return fresh
 
     def _with_attributes(self, told: Mapping[str, Change], fresh: Any, start: Any, path: str) -> Any:
-        fresh = copy.deepcopy(fresh) if _is_q(fresh) else fresh
+        fresh = copy.deepcopy(fresh) if isinstance(fresh, QFilter) else fresh
         target = copy.copy(fresh) if _is_frozen(fresh) else fresh
         there, before = vars(fresh), vars(start)
         for name, change in told.items():

@@ -56,6 +56,10 @@ class Input:
     delay: int = 0
 
 
+#: input of a stage that does not use the angle itself: the spindle's blocks determine which samples are due
+CLOCK = Input("encoder", messages.ENCODER, ("angle",))
+
+
 class Joint(NamedTuple):
     """Selection of the fields of an output that form a decimated sensor_msgs/JointState."""
 
@@ -237,7 +241,7 @@ class Stage(ABC):
         self.inputs, self.outputs, self.own_inputs = tuple(inputs), tuple(outputs), len(inputs)
         # An event by revolutions needs the angle, even where the step does not: an additional input outside the step.
         if inputs and self.angle_input is None and any(trigger.kind == "revolution" for trigger in self._triggers):
-            self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
+            self.inputs += (CLOCK,)
         self._joints = [(place, output.joint) for place, output in enumerate(self.outputs) if output.joint]
         if self._joints:
             self.sparse_topics[f"{self.name}/joint_states"] = messages.JOINTS
@@ -285,15 +289,14 @@ class Stage(ABC):
             InputError: the event is unknown to the stage, or a prerequisite is missing.
         """
         verb, _, rest = action.partition(" ")
-        if verb == events.FAULT:
-            self._check_fault(faults.parse(rest, self.name))
-            return
-        if verb == events.REPAIR:
-            self._check_allowed(action)
-            if " " in rest:
-                self._check_fault(faults.parse(rest, self.name, what=events.REPAIR))
+        if verb in (events.FAULT, events.REPAIR):
+            if self._injection is None:
+                raise InputError(
+                    f"{self.name}: {action!r} is refused; set allow_faults = true under /** to let things break"
+                )
+            if verb == events.FAULT or " " in rest:
+                self._injection.check(faults.parse(rest, self.name, what=verb))
             else:
-                assert self._injection is not None, "there is one if faults are allowed"
                 self._injection.check_target(rest)
             return
         if verb == events.SET:
@@ -336,15 +339,6 @@ class Stage(ABC):
                 parameter, _, value = rest.partition(" ")
                 table = table.changed(self.name, {parameter: ros_yaml.parse_value(value, f"{self.name}.{parameter}")})
         return table
-
-    def _check_allowed(self, what: str) -> None:
-        if not self.shared.allow_faults:
-            raise InputError(f"{self.name}: {what!r} is refused; set allow_faults = true under /** to let things break")
-
-    def _check_fault(self, fault: Fault) -> None:
-        self._check_allowed(f"fault {fault.text}")
-        assert self._injection is not None, "there is one if faults are allowed"
-        self._injection.check(fault)
 
     def schedule(self, action: str, index: int) -> None:
         """Schedule an event at sample ``index``, which the host has not issued yet.
@@ -545,7 +539,7 @@ class Stage(ABC):
     def damage(self, fault: Fault) -> None:
         """Apply a fault to one of the ``devices`` of the stage.
 
-        Stages with ``devices`` override this; other faults are rejected earlier by `_check_fault`.
+        Stages with ``devices`` override this; other faults are rejected earlier by `check_action`.
         """
         raise NotImplementedError(fault.text)
 

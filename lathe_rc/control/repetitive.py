@@ -158,10 +158,6 @@ class RepetitiveController:
         """Whether the channel has joined: the error of a cycle was at most ``join_below``, and learning may begin."""
         return bool(self.table.whole[angle_memory.JOINED])
 
-    @joined.setter
-    def joined(self, on: bool) -> None:
-        self.table.whole[angle_memory.JOINED] = on
-
     @property
     def correction(self) -> Correction:
         """Correction 1/W0 between the memory and the drive."""
@@ -246,7 +242,7 @@ class RepetitiveController:
         places = np.arange(memory.size) + self.table.whole[angle_memory.NEXT] - memory.size
         memory[places & (memory.size - 1)] = points[places % self._cycle]
         self._replaced()
-        self.joined = True
+        self.table.whole[angle_memory.JOINED] = 1
 
     def block(
         self,

@@ -6,7 +6,6 @@ dc_screw       k·(1 + Tz·p)/(p·(1 + T_1·p)·(1 + T_2·p)·…)        (paper
 sampled        K/(p·(1 + T1·p)) behind a zero-order hold         (paper 003, eq. 2)
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -29,8 +28,9 @@ def fourth_order(
     return TransferFunction((gain,), (1.0, a4, a3, a2, a1))
 
 
-def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> TransferFunction:
-    """Return the model of a motor with a screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…).
+@lru_cache(maxsize=64)
+def dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float = 0.0) -> TransferFunction:
+    """Return the model of a motor with a screw, k·(1 + Tz·p)/(p·(1 + T_1·p)·…), cached: models repeat in a sweep.
 
     The zero cancels a lag that another part of the model includes: together with the lag of the cutting process, a
     drive with the lags of W1 has the response W1 from the command to the force.
@@ -43,12 +43,6 @@ def dc_screw(velocity_gain: float, lags: Sequence[float], zero: float = 0.0) -> 
     Raises:
         InputError: a lag is not positive.
     """
-    return _dc_screw(velocity_gain, tuple(lags), zero)
-
-
-@lru_cache(maxsize=64)
-def _dc_screw(velocity_gain: float, lags: tuple[float, ...], zero: float) -> TransferFunction:
-    """Return the model of a motor with a screw (implements `dc_screw`), cached, since models repeat in a sweep."""
     if not all(lag > 0.0 for lag in lags):
         raise InputError(f"lags of the feed drive = {list(lags)} s; allowed: above 0 (leave out what is not there)")
     bottom = np.array([1.0, 0.0])

@@ -124,7 +124,7 @@ class FeedDriveParameters(LimitedParameters, FeedObedientParameters):
             return feed_models.fourth_order(self.gain, self.a1, self.a2, self.a3, self.a4)
         if self.model == "sampled":
             return feed_models.sampled(self.sampled_gain, self.sampled_lag)
-        return feed_models.dc_screw(self.velocity_gain, self.lags or [0.045], self.zero)
+        return feed_models.dc_screw(self.velocity_gain, tuple(self.lags or [0.045]), self.zero)
 
     def rubbing(self, node: str) -> Friction | None:
         """Return the friction of a node; None if there is none.

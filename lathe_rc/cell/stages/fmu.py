@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.arrays import Array, Integers
 from lathe_rc.cell.columns import units
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage, WiredCell
+from lathe_rc.cell.stage import CLOCK, DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage, WiredCell
 from lathe_rc.compiled.c_function import c_status
 from lathe_rc.compiled.step import CompiledStep
 from lathe_rc.errors import InputError, LatheError, shown
@@ -213,7 +213,7 @@ class FmuStage(Stage):
         self.declare(inputs=inputs, outputs=outputs)
         if all(port.delay for port in self.inputs):
             # Blocks of the encoder set the pace of a node that reads nothing else in time, outside of the step.
-            self.inputs += (Input("encoder", messages.ENCODER, ("angle",)),)
+            self.inputs += (CLOCK,)
 
     def _samples_of_step(self) -> int:
         wanted, sample = self.parameters.fmu_step or self.shared.step, self.shared.step

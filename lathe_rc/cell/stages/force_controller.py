@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controller of the main cutting force through the longitudinal feed (paper 004)."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
-from lathe_rc.cell.stage import Fields, Input, Output, Reached
+from lathe_rc.cell.stage import CLOCK, Fields, Input, Output, Reached
 from lathe_rc.cell.stages.obedience import Listener, listens
 from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
 from lathe_rc.cell.stages.trajectory import Course, follow
@@ -30,10 +30,7 @@ class ForceControllerParameters(ServoParameters):
         0.0, "allowed following error to each side, by which a run is judged; 0: not judged", "N"
     )
 
-    @property
-    def commanded_topic(self) -> str:
-        """Topic of the command, before remapping."""
-        return "longitudinal/command"
+    commanded_topic: ClassVar[str] = "longitudinal/command"
 
 
 class Memory(NamedTuple):
@@ -73,8 +70,7 @@ class ForceController(Servo):
         self.pid = parameters.pid(name)
         self.declare(
             inputs=[
-                # The angle itself is not used; the spindle's blocks determine which samples are due.
-                Input("encoder", messages.ENCODER, ("angle",)),
+                CLOCK,
                 Input("cut", messages.CUT, ("measured_force",), parameters.feedback_delay),
                 *listens(parameters),
             ],

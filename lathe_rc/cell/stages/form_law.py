@@ -69,10 +69,7 @@ class FormLawParameters(LawParameters, FormParameters):
         """Empty mapping, since the law asks for the form instead of providing it."""
         return {}
 
-    @property
-    def commanded_topic(self) -> str:
-        """Topic of the drive described by the model, before remapping."""
-        return "coarse/command"
+    commanded_topic: ClassVar[str] = "coarse/command"
 
     @property
     def inverse(self) -> tuple[float, float]:

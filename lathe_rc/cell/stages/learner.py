@@ -352,8 +352,7 @@ class Learner(Obedient):
 
 def lag(response: Response) -> float:
     """Return the lag of a drive at low frequencies [s]."""
-    low = 1.0
-    return float(-np.angle(response(np.array([low])))[0] / low)
+    return float(-np.angle(response(np.ones(1)))[0])  # at 1 rad/s
 
 
 class Loop(NamedTuple):

@@ -78,7 +78,8 @@ class LearningController(Learner):
         self._first_rms = np.nan
         self._controller.table.whole[angle_memory.ASKS] = self._asks
         self._state, self._margin = np.array([0, 0, 0, 0, -1]), np.zeros(1)
-        self._check_identification()
+        if parameters.correction_model == "identified" and not parameters.identify:
+            raise InputError(f"{name}.correction_model = identified without identification; set identify as well")
         self._model = Identified(parameters.model_natural_frequency, parameters.model_damping, np.nan)
         self._margins = Margins(parameters)
         delay = parameters.feedback_delay
@@ -104,11 +105,6 @@ class LearningController(Learner):
         self.sparse_topics[_STATUS] = messages.LEARNING
         if self._scheduled_actions("load") and not self._scheduled_actions("save"):
             self._read_memory()
-
-    def _check_identification(self) -> None:
-        parameters = self.parameters
-        if parameters.correction_model == "identified" and not parameters.identify:
-            raise InputError(f"{self.name}.correction_model = identified without identification; set identify as well")
 
     # ---- the loop, for checks and margins -----------------------------------------------------------
 
@@ -150,12 +146,10 @@ class LearningController(Learner):
         """Return the Nyquist limit of grid and sampling [waves per revolution]."""
         return highest_waves(self.parameters.points_per_revolution, self.parameters.step, speed)
 
-    def worst(self, drive: Response, speed: float) -> tuple[float, float]:
+    def worst(self, drive: Response, speed: float) -> tuple[float, float] | None:
         """Return sup|Q - γZ|, and the waves per revolution where it occurs."""
         if isinstance(drive, MeasuredDrive):
-            found = super().worst(drive, speed)
-            assert found is not None, "it provides its factors"
-            return found
+            return super().worst(drive, speed)
         return self.loop(drive).worst(speed)  # cached for equal loops
 
     def checked_speeds(self, low: float, high: float) -> Collection[float]:
@@ -382,6 +376,7 @@ class Margins:
 
     def __init__(self, parameters: LearningControllerParameters) -> None:
         self._parameters = parameters
+        self._speeds: list[float] = (parameters.nominal_speed / 40 * np.arange(20, 61)).tolist()  # of the table [rad/s]
         self._models: dict[tuple[str, ...], Identified] = {}
         self._responses: dict[tuple[str, ...], Response] = {}
         self._suprema: dict[tuple[object, ...], float] = {}
@@ -426,21 +421,13 @@ class Margins:
 
     def at(self, stage: "LearningController", speed: float, model: Identified) -> float:
         """Return the margin at ``speed`` [rad/s], interpolated between tabulated speeds."""
-        speeds = _tabulated(self._parameters.nominal_speed)
-        after = bisect_left(speeds, speed)
+        speeds, after = self._speeds, bisect_left(self._speeds, speed)
         # Outside the table each speed would need a new entry.
         if not 0 < after < len(speeds):
             return 1.0 - stage.loop(self._response(model)).supremum(speed)
         below, above = speeds[after - 1], speeds[after]
         lower, upper = self._supremum(stage, below, model), self._supremum(stage, above, model)
         return 1.0 - ((upper - lower) / (above - below) * (speed - below) + lower)
-
-
-@lru_cache(maxsize=16)
-def _tabulated(nominal: float) -> list[float]:
-    """Return the speeds of the table [rad/s], from 0.5 to 1.5 times the nominal speed."""
-    speeds: list[float] = (nominal / 40 * np.arange(20, 61)).tolist()
-    return speeds
 
 
 def _make_room(table: dict[Any, Any]) -> None:

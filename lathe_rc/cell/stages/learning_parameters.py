@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Annotated, Literal, cast
+from typing import Annotated, ClassVar, Literal, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -120,10 +120,7 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
     model_damping: Positive = parameter(0.804, "drive model: ζ", drive="damping")
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
-    @property
-    def commanded_topic(self) -> str:
-        """Topic of the drive described by the model, before remapping."""
-        return "coarse/command"
+    commanded_topic: ClassVar[str] = "coarse/command"
 
     @property
     def cycle_points(self) -> int:

@@ -17,7 +17,7 @@ from lathe_rc.cell.stages.cutting_process import READ, TURNS, CutStage, CuttingP
 from lathe_rc.cell.stages.drive import followed
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuatorParameters, sum_up
-from lathe_rc.cell.stages.series_drive import FINE, CoupledDrive, piezo_on_carriage, tool_drive
+from lathe_rc.cell.stages.series_drive import FINE, CoupledDrive, piezo_on_carriage
 from lathe_rc.cell.stages.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
@@ -26,6 +26,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.plants.chip import CutTable
 from lathe_rc.plants.coil import Coil
+from lathe_rc.plants.tool_drive import ToolDrive
 from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import SensorTable, measure
@@ -255,13 +256,13 @@ class LoadedDriveStage(CutStage, CoupledDrive):
         coil = coarse.coil(name)
         if isinstance(parameters, LoadedSeriesParameters):
             fine = parameters.fine
+            piezo = piezo_on_carriage(name, fine, parameters.mass_ratio, fine.preload or np.inf)
         self._equip(coarse, fine)
-        if isinstance(parameters, LoadedSeriesParameters):
-            piezo = piezo_on_carriage(name, parameters.fine, parameters.mass_ratio, parameters.fine.preload or np.inf)
         with about(name, *(("coarse_loop", "coarse_bandwidth") if coil else ("mass_ratio",)), "sample_rate"):
-            self.drive = tool_drive(
+            self.drive = made_of(
+                ToolDrive,
                 coarse,
-                parameters,
+                method=parameters.discretisation,
                 radial=parameters.radial_ratio,
                 coil=coil,
                 piezo=piezo,

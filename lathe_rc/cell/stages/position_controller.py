@@ -11,7 +11,7 @@ from annotated_types import Gt, Le
 from lathe_rc import messages, resources
 from lathe_rc.arrays import Integers
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
+from lathe_rc.cell.stage import CLOCK, DONE, Fields, Input, Output, Reached, Sparse
 from lathe_rc.cell.stages.feed_drive import Axis
 from lathe_rc.cell.stages.obedience import OBEY, Listener, apply, listens, may_learn, piece
 from lathe_rc.cell.stages.servo import Servo, ServoParameters, pid_along
@@ -245,8 +245,7 @@ class PositionController(Servo):
         self._path = None
         axis, delay = parameters.axis, parameters.feedback_delay
         inputs = [
-            # The angle itself is not used; the spindle's blocks determine which samples are due.
-            Input("encoder", messages.ENCODER, ("angle",)),
+            CLOCK,
             Input(f"{axis}/state", messages.STATE, ("measured_position",), delay),
         ]
         if parameters.measures == "edge":

@@ -2,7 +2,7 @@
 """Piezo and tool on the coarse carriage: both drives as one stage, since they are coupled within a block."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -101,11 +101,6 @@ def piezo_on_carriage(name: str, fine: PiezoActuatorParameters, mass_ratio: floa
     return made_of(Piezo, fine, stack=stack, mass_ratio=mass_ratio, feedback=feedback, preload=preload)
 
 
-def tool_drive(coarse: ElectrodynamicActuatorParameters, shared: ComposedParameters, **beside: Any) -> ToolDrive:
-    """Return the machine for a coarse drive's table and the further arguments ``beside`` of `ToolDrive`."""
-    return made_of(ToolDrive, coarse, method=shared.discretisation, **beside)
-
-
 class CoupledDrive(Drive):
     """Coarse drive, optionally with the piezo drive and the tool on its carriage, as one machine.
 
@@ -155,7 +150,8 @@ class SeriesDriveStage(CoupledDrive):
         coarse, fine = parameters.coarse, parameters.fine
         piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):
-            self.drive = tool_drive(coarse, parameters, piezo=piezo, modes=coarse.modes(name, "coarse_"))
+            method, modes = parameters.discretisation, coarse.modes(name, "coarse_")
+            self.drive = made_of(ToolDrive, coarse, method=method, piezo=piezo, modes=modes)
         self._equip(coarse, fine)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],

@@ -406,10 +406,7 @@ class Supervisor(Stage):
         """Return the alarms in the samples up to ``reached``, in sample order."""
         found: list[tuple[Watcher, Alarm]] = [*self._lookout.found()]
         piece = cut(inputs, 0, reached) if self._plain else ()
-        for monitor in self._plain:
-            alarm = monitor.find(first, piece)
-            if alarm is not None:
-                found.append((monitor, alarm))
+        found += [(monitor, alarm) for monitor in self._plain if (alarm := monitor.find(first, piece)) is not None]
         return sorted(found, key=lambda one: one[1].place)
 
     def _fill(

@@ -9,7 +9,7 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
+from lathe_rc.cell.stage import CLOCK, DONE, Fields, Joint, Output, Reached, Stage
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
@@ -83,8 +83,7 @@ class Vibration(Stage):
                 )
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(
-            # The angle itself is not used; the spindle's blocks determine which samples are due.
-            inputs=[Input("encoder", messages.ENCODER, ("angle",))],
+            inputs=[CLOCK],
             outputs=[Output("vibration/state", messages.STATE, Joint("position", "velocity"))],
         )
 
