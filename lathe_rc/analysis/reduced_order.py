@@ -144,15 +144,15 @@ class Fit:
         return float(np.sqrt(np.mean((self.found - self.wanted) ** 2)))
 
 
-def _denominator(logarithms: Array, pairs: int) -> Array:
-    """Compute the denominator in descending powers: ``pairs`` factors a·p² + b·p + 1, then factors b·p + 1."""
+def _denominator(logarithms: Array, pairs: int, integrators: int) -> Array:
+    """Compute a denominator in descending powers: ``pairs`` factors a·p² + b·p + 1, then factors b·p + 1, then p."""
     values = np.exp(logarithms)
     whole = np.ones(1)
     for a, b in values[: 2 * pairs].reshape(-1, 2):
         whole = np.polymul(whole, np.array([a, b, 1.0]))
     for b in values[2 * pairs :]:
         whole = np.polymul(whole, np.array([b, 1.0]))
-    return whole
+    return np.append(whole, np.zeros(integrators))
 
 
 def _starts(poles: int, pairs: int, span: float) -> list[Array]:
@@ -208,18 +208,27 @@ def _check_orders(zeros: int, poles: int, *, integrator: bool) -> None:
 
 
 def _search(
-    residual: Callable[[Array], Array], starts: list[Array], powers: Array, low: float, high: float, delay: float | None
+    residual: Callable[[Array], Array],
+    poles: int,
+    pairs: int,
+    span: float,
+    low: float,
+    high: float,
+    delay: float | None,
 ) -> Array:
     """Return the logarithms of the denominator's coefficients, and the delay, with the least squares.
 
     Args:
         residual: of these numbers.
-        starts: logarithms from which the searches start.
-        powers: power of a time that each coefficient is.
-        low: lower bound of these times [s].
-        high: upper bound of these times [s].
+        poles: number of poles without an integrator.
+        pairs: number of pairs among them that may be complex.
+        span: length of a step response from which the time constants at the start follow [s].
+        low: lower bound of the time constants [s].
+        high: upper bound of the time constants [s].
         delay: estimate of the delay [s]; None: the model has none.
     """
+    starts = _starts(poles, pairs, span) if poles else [np.empty(0)]
+    powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))  # coefficients of p² are times squared
     bottom, top = np.log(low) * powers, np.log(high) * powers
     if delay is not None:
         starts = [np.append(start, part * delay) for start in starts for part in (0.5, 1.0)]
@@ -265,7 +274,7 @@ def fit(
 
     def numerator(x: Array) -> tuple[Array, Array, Array]:
         """Compute the best numerator for a denominator; return both in falling powers, and the step response."""
-        bottom = np.append(_denominator(x[:poles], pairs), np.zeros(int(integrator)))
+        bottom = _denominator(x[:poles], pairs, int(integrator))
         falling = [(1.0, *[0.0] * power) for power in range(zeros, -1, -1)]
         basis = np.stack([step_of(TransferFunction(power, tuple(bottom)), time) for power in falling], axis=1)
         if delayed:
@@ -274,13 +283,12 @@ def fit(
         top = np.linalg.lstsq(basis / size, response, rcond=None)[0] / size
         return top, bottom, basis @ top
 
-    # Coefficients of p² are times squared.
-    powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
     first = float(time[int(np.argmax(np.abs(response) > 0.02 * scale))]) if delayed else None
     best = _search(
         lambda x: np.asarray((numerator(x)[2] - response) / scale),
-        _starts(poles, pairs, float(time[-1])) if poles else [np.empty(0)],
-        powers,
+        poles,
+        pairs,
+        float(time[-1]),
         measured.step / 10.0,
         100.0 * float(time[-1]),
         first,
@@ -320,7 +328,7 @@ def fit_response(
 
     def numerator(x: Array) -> tuple[Array, Array, Complex]:
         """Compute the best numerator for a denominator; return both in falling powers, and the response."""
-        bottom = np.append(_denominator(x[:poles], pairs), np.zeros(int(integrator)))
+        bottom = _denominator(x[:poles], pairs, int(integrator))
         below = np.polyval(bottom, p) * np.exp(p * (x[poles] if delayed else 0.0))
         basis = np.stack([p**power / below for power in range(zeros, -1, -1)], axis=1)
         weighted = basis / deviation[:, None]
@@ -334,19 +342,11 @@ def fit_response(
         error = (numerator(x)[2] - value) / deviation
         return np.asarray(np.concatenate((error.real, error.imag)) / np.sqrt(value.size), np.float64)
 
-    powers = np.array([2.0, 1.0] * pairs + [1.0] * (poles - 2 * pairs))
     low, high = 1.0 / float(measured.frequency[-1]), 1.0 / float(measured.frequency[0])
     # Starts of a step response over this span have time constants in the middle of the band.
     span = float(np.sqrt(low * high)) / _SPREADS[1]
     lag = max(float(-np.unwrap(np.angle(value))[-1]), 1.0) / float(measured.frequency[-1])
-    best = _search(
-        residual,
-        _starts(poles, pairs, span) if poles else [np.empty(0)],
-        powers,
-        low / 10.0,
-        high * 10.0,
-        lag if delayed else None,
-    )
+    best = _search(residual, poles, pairs, span, low / 10.0, high * 10.0, lag if delayed else None)
     top, bottom, output = numerator(best)
     delay = float(best[poles]) if delayed else 0.0
     return ResponseFit(TransferFunction(tuple(top), tuple(bottom)), measured.frequency, value, output, delay)
