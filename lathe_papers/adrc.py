@@ -107,11 +107,7 @@ def observer_gains(transition: Array, pole: float) -> Array:
 
 
 class Adrc(FormLaw):
-    """Law that feeds the form forward, observes the disturbance as a third state, and feeds the states back.
-
-    Attributes:
-        parameters: parameter table of the node.
-    """
+    """Law that feeds the form forward, observes the disturbance as a third state, and feeds the states back."""
 
     kind = "adrc"
     Parameters = AdrcParameters

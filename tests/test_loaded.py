@@ -33,11 +33,9 @@ DELAY = 23 * STEP  # whole samples: what the servo follows is linear from sample
 
 
 def loaded(*, series=False, coil=None, radial=0.4, step=STEP, servo=None, stack=None, **piezo):
-    linear = Stack(
-        stroke=15e-6, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
-        step=step, method="foh",
-    )  # fmt: skip
-    fine = Piezo(linear, *{**STACK, **(stack or {})}.values(), full_voltage=100.0, **piezo)
+    fine = Piezo(
+        Stack(stroke=15e-6, step=step, method="foh"), *{**STACK, **(stack or {})}.values(), full_voltage=100.0, **piezo
+    )
     return ToolDrive(
         **{"stroke": 1e-3, **SERVO, **(servo or {})},
         delay=DELAY,

@@ -88,11 +88,7 @@ def test_a_drive_with_modes_is_exact_for_commands_linear_between_samples(modes):
 def test_a_piezo_rides_on_the_edge_of_a_carriage_with_modes(modes):
     """Tool over extension: mt·x2'' = mt·q, the base moves by -mt·q at the edge."""
     ratio, omega, zeta = 0.1, 2 * np.pi * 700.0, 0.3
-    stack = Stack(
-        stroke=1.0, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
-        step=STEP, method="foh",
-    )  # fmt: skip
-    piezo = Piezo(stack, omega, zeta, ratio, 1.0)
+    piezo = Piezo(Stack(stroke=1.0, step=STEP, method="foh"), omega, zeta, ratio, 1.0)
     drive = ToolDrive(natural_frequency=LOOP[0], damping=LOOP[1], delay=0.0, method="foh", modes=modes, piezo=piezo,
                       **OF_COIL)  # fmt: skip
     p = 1j * ANGULAR

@@ -37,7 +37,7 @@ PAIRS = {
 def make_drive(kind=None, *, linearised=True, scale=1.0, method="foh", **values):
     forward, inverse = PAIRS[kind](scale)
     stack = Stack(
-        **{"stroke": STROKE, "amplifier_lag": 0.0, "creep_per_decade": 0.0, **values},
+        **{"stroke": STROKE, **values},
         hysteresis=forward,
         inverse=inverse if linearised else None,
         creep_times=CREEP_TIMES,

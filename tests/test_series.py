@@ -43,10 +43,7 @@ SERVO |= {"force_constant": 30.0, "method": "foh"}
 
 def make_stack(kind=None, lag=0.0, step=STEP, stroke=STROKE):
     forward, inverse = OPERATORS[kind]()
-    return Stack(
-        stroke=stroke, amplifier_lag=lag, hysteresis=forward, inverse=inverse, creep_per_decade=0.0,
-        creep_times=np.empty(0), step=step, method="foh",
-    )  # fmt: skip
+    return Stack(stroke=stroke, amplifier_lag=lag, hysteresis=forward, inverse=inverse, step=step, method="foh")
 
 
 def make_drive(stack=None, *, ratio=0.1, feedback=False, step=STEP, tool_damping=Z2, **options):

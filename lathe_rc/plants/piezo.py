@@ -12,6 +12,7 @@ stroke, and the voltage to its range; clipped samples are counted.
 Source: paper 001 (Wpk of eqs 6-9); parameters of spec/learning.md.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -164,7 +165,7 @@ class Stack:
         hysteresis: hysteresis of the ceramics; None for no hysteresis.
         inverse: operator that linearises the hysteresis; None for no linearisation.
         creep_per_decade: c, relative creep per decade of time; 0 for no creep.
-        creep_times: τ_i [s], a decade apart; only used with creep, shape (n,).
+        creep_times: τ_i [s], a decade apart; only used with creep.
         step: sampling step [s].
         method: discretisation of the lags, see `lathe_rc.plants.linear.discretise`.
 
@@ -182,12 +183,12 @@ class Stack:
         self,
         *,
         stroke: float,
-        amplifier_lag: float,
+        amplifier_lag: float = 0.0,
         slew_rate: float = np.inf,
-        hysteresis: Hysteresis | None,
-        inverse: Hysteresis | None,
-        creep_per_decade: float,
-        creep_times: Array,
+        hysteresis: Hysteresis | None = None,
+        inverse: Hysteresis | None = None,
+        creep_per_decade: float = 0.0,
+        creep_times: Iterable[float] = (),
         step: float,
         method: Discretisation,
     ) -> None:

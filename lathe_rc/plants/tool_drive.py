@@ -222,7 +222,7 @@ class ToolDrive:
             weights = np.zeros((order, 3))
             weights[:, 0] = discretise(a, drives, 0.0, step, method).weights.sum(axis=1)
         self.step, self._piezo = step, piezo
-        stack = piezo.stack if piezo else _no_stack(step)
+        stack = piezo.stack if piezo else Stack(stroke=1.0, step=step, method="foh")  # not stepped without one
         self.table = MotionTable(
             series=piezo is not None,
             weights=Weights(self._coarse.transition, weights, self._fine.weights, load.weights),
@@ -343,11 +343,3 @@ class ToolDrive:
         assert self._piezo is not None, "there is one"
         alone = self._piezo.stack.linear.response(frequency) * self._of(_TOOL, frequency, command=False)
         return self._with_feedback(alone, frequency)
-
-
-def _no_stack(step: float) -> Stack:
-    """Return a placeholder stack for the table of a drive without a piezo; the kernels do not step it."""
-    return Stack(
-        stroke=1.0, amplifier_lag=0.0, hysteresis=None, inverse=None, creep_per_decade=0.0, creep_times=np.empty(0),
-        step=step, method="foh",
-    )  # fmt: skip
