@@ -25,7 +25,7 @@ from benchmarks.sides import alternate, ratio, spread
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.sweep import row, workers
 from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.sweep import run
+from lathe_rc.sweep.sweep import run_sweep
 
 _CORES = os.cpu_count() or 1
 _CELLS = {"two_channel": 10_000, "full_cell": 2000}
@@ -45,7 +45,7 @@ def _sweep(client: distributed.Client, scenario: Scenario, space: Space) -> tupl
     """Time of a sweep, and what the workers spend on its cells [s]."""
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        found = run(scenario, space, Path(folder) / "rows", client=client)
+        found = run_sweep(scenario, space, Path(folder) / "rows", client=client)
         took = time.perf_counter() - start
         assert set(found.statuses()) == {row.DONE}, "all of them work"
         return took, sum(found.folder.table(["seconds"]).column("seconds").to_pylist())
