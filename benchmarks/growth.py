@@ -35,11 +35,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks import sides
-from lathe_rc import part, resources
+from lathe_rc import resources
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
-from lathe_rc.cell import scenario
+from lathe_rc.cell import part, scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse

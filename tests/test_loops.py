@@ -17,10 +17,10 @@ from lathe_rc import harness
 from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.analysis.loop_errors import RunningLoop
 from lathe_rc.analysis.tolerance import FORCE, growth, swing_growth
+from lathe_rc.cell.loops import FIGURES
 from lathe_rc.cli import main
 from lathe_rc.control.pid import Pid, PidGains
 from lathe_rc.errors import InputError
-from lathe_rc.loops import FIGURES
 from lathe_rc.sweep import LOOP_FIGURES, row
 from lathe_rc.sweep.objectives import objectives
 

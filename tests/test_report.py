@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
-from lathe_rc import __version__, harness, messages, part, resources
+from lathe_rc import __version__, harness, messages, resources
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
+from lathe_rc.cell import part
 from lathe_rc.cell.budget import changing
 from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load

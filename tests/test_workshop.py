@@ -9,7 +9,8 @@ from bags import lathe
 from cells import scenario
 from numpy.testing import assert_allclose
 
-from lathe_rc import harness, part
+from lathe_rc import harness
+from lathe_rc.cell import part
 from lathe_rc.signals import measured_profile
 
 ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]

@@ -18,6 +18,7 @@ from lathe_rc import __version__, allowed_code
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
+from lathe_rc.cell.loops import Loop, loops
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
@@ -27,7 +28,6 @@ from lathe_rc.cell.stages.position_controller import PositionController, Positio
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
-from lathe_rc.loops import Loop, loops
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"

@@ -11,7 +11,7 @@ from typing import Any
 import click
 from rich.console import Console
 
-from lathe_rc import messages, part
+from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
@@ -21,6 +21,7 @@ from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
+from lathe_rc.cell import part
 from lathe_rc.commands import options, tables
 from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
 from lathe_rc.names import instead

@@ -9,10 +9,10 @@ import click
 import numpy as np
 from rich.table import Table
 
-from lathe_rc import part
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell import part
 from lathe_rc.cell.recording import Recording
 from lathe_rc.commands import options, tables
 from lathe_rc.errors import InputError

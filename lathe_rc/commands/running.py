@@ -8,7 +8,8 @@ from typing import Any
 import click
 from rich.console import Console
 
-from lathe_rc import harness, part
+from lathe_rc import harness
+from lathe_rc.cell import part
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios

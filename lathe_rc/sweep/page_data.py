@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from lathe_rc.cell.loops import loops
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
-from lathe_rc.loops import loops
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS, OF_LEARNING, row
 from lathe_rc.sweep.effects import Axis

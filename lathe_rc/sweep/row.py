@@ -38,6 +38,7 @@ from lathe_rc import __version__, messages
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import CellRunner, Errors
+from lathe_rc.cell.loops import FIGURES, loops, watches
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -47,7 +48,6 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError
-from lathe_rc.loops import FIGURES, loops, watches
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
@@ -84,7 +84,7 @@ class Measure(NamedTuple):
 
     Attributes:
         topic, field: signal; for a loop the error that its controller sees, which is part of the digest.
-        statistic: one of `STATISTICS`, or of `lathe_rc.loops.FIGURES`.
+        statistic: one of `STATISTICS`, or of `lathe_rc.cell.loops.FIGURES`.
         node: controller of the loop; empty for a signal.
     """
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc import __version__, files, part
+from lathe_rc import __version__, files
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.tolerance import LAST, judge
+from lathe_rc.cell import part
 from lathe_rc.cell.varied_loop import Along, LoopState, Setting, VariedLoop, chatter_charts, drive_curves
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead

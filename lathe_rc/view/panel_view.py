@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell.loops import Loop, loops, watches
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.loops import Loop, loops, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.safety.state_machine import State
 from lathe_rc.view import machine_state

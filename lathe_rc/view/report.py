@@ -19,9 +19,9 @@ from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
+from lathe_rc.cell.part import along_in_words
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
-from lathe_rc.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view import report_loop
 from lathe_rc.view.charts import Charts, page_template

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc import part
 from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
+from lathe_rc.cell import part
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
@@ -32,7 +32,7 @@ class Revolution:
     """Form of one revolution in the report.
 
     Attributes:
-        numbers: key figures of the revolution (see `lathe_rc.part.numbers`).
+        numbers: key figures of the revolution (see `lathe_rc.cell.part.numbers`).
         profile: radius deviation at uniformly spaced angles [m], shape (points,).
         amplitude: amplitudes of the undulations [m], starting at 0 UPR.
     """

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 import rerun.blueprint as rrb
 
 from lathe_rc import messages
+from lathe_rc.cell.loops import Loop
 from lathe_rc.event_log import LOGGED
-from lathe_rc.loops import Loop
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.loops import loops
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.loops import loops
 from lathe_rc.messages import Signals
 from lathe_rc.view.live_runs import LiveRuns, RunView, ShownRun
 from lathe_rc.view.rerun_part import Outlook

@@ -19,9 +19,9 @@ from PIL import Image
 
 from lathe_rc import event_log, messages
 from lathe_rc.cell.beside import RERUN_RATE
+from lathe_rc.cell.loops import Loop, watches
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.loops import Loop, watches
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import rerun_part as parts
 from lathe_rc.view.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint

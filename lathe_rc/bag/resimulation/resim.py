@@ -33,6 +33,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.parameters import SharedParameters
+from lathe_rc.cell.part import ErrorsByRevolution
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.stage import Sparse
@@ -41,7 +42,6 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
-from lathe_rc.part import ErrorsByRevolution
 
 
 @dataclass(frozen=True)
