@@ -117,8 +117,9 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(again).digest
 
 
-def test_the_page_fits_its_window_in_light_and_dark(page):
-    browser, _ = page
+def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page):
+    """In light and dark, wide and narrow; after a refused command the cell goes on, with other parameters."""
+    browser, cell = page
     browser.click("#go")
     browser.until("SHOWN.history.length > 5")
     browser.click("#go")
@@ -133,10 +134,7 @@ def test_the_page_fits_its_window_in_light_and_dark(page):
             browser.until(f"'rgb(' + {corner}.join(', ') + ')' == '{paper}'")
             drawn = "document.querySelectorAll('#machine polygon, #machine rect').length"
             assert browser.run(drawn) >= 5  # without a force, which has an arrow
-
-
-def test_a_refused_command_is_shown_and_the_cell_goes_on(page):
-    browser, cell = page
+    # A refused command, and one that is accepted
     submit(browser, "change", "button[value=start]", name="seed", value="none")
     assert "seed" in browser.until("document.getElementById('refusal').textContent")
     submit(browser, "change", "button[value=start]", name="spindle_encoder.revolutions", value="4.0")
@@ -144,10 +142,7 @@ def test_a_refused_command_is_shown_and_the_cell_goes_on(page):
     browser.click("#go")
     browser.until("SHOWN.now.state == 'ended'")
     assert cell.scenario.value("spindle_encoder.revolutions") == 4.0
-
-
-def test_the_loops_of_the_cell_are_another_tab(page):
-    browser, _ = page
+    # The loops of the cell
     browser.open(browser.run("document.querySelector('nav a:not([aria-current])').href"))
     browser.until("document.title == 'Loop of supervised_full_cell'")
     browser.until("document.querySelectorAll('.vega-embed').length > 2")

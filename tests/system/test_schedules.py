@@ -12,7 +12,7 @@ from deliberate_faults import FAULTS
 from simulation import play
 
 pytestmark = pytest.mark.system
-SCHEDULES, PIECE = sized(100_000), 500
+SCHEDULES, PIECE = sized(50_000), 250
 
 
 def _broken(first: int) -> list[str]:
