@@ -68,7 +68,7 @@ def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, 
             begin(kind, f"my_{kind}")
         file = tmp_path / "together.yaml"
         file.write_text(TOGETHER, encoding="utf-8")
-    found = hosts.digests_by_host(scenario.load(file, [SHORT]), tmp_path)
+    found = hosts.digests_by_host(scenario.load(file, ["spindle_encoder.revolutions=2.0"]), tmp_path)
     assert set(found) == {"offline", "bag", "simulated again", "blocks of 23", "batch", "composed", "processes"}
     assert {host for host, topics in found.items() if topics != found["offline"]} == set()
 

@@ -249,7 +249,8 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
     assert row.digest(harness.run(both.scenario(4)).recording, []) == both.row(4)["digest"]
 
 
-def test_a_folder_of_something_else_is_refused(piston, client, tmp_path):
+def test_a_folder_of_something_else_is_refused(piston, client, tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "_CONNECT", 0.1)  # [s] for which Dask calls a scheduler that is not there
     space_ = Space(grid={LEAD: [1.3e-3]})
     lathe_rc.run_sweep(piston, space_, tmp_path / "one", client=client)
     longer = piston.varied({"spindle_encoder.revolutions": 5.0})
