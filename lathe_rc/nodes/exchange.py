@@ -40,20 +40,17 @@ class Run(NamedTuple):
 Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
 
 
-def _alone(role: Any, cell: Cell | None) -> None:
-    """Default of `Exchange.form`: no chains, each stage computes alone."""
-
-
 class Exchange:
     """Exchange of blocks between the nodes of one process.
 
     Attributes:
         master: callback for the Progress of a node, if the time master is in this process.
         stages: active roles whose stage has not computed yet (see `lathe_rc.nodes.chain`).
-        form: function that forms chains of a stage and the waiting stages of its cell; takes the role and the cell.
+        form: function that forms chains of a stage and the waiting stages of its cell; takes the role and the cell. By
+            default there are no chains: each stage computes alone.
     """
 
-    def __init__(self, form: Callable[[Any, Cell | None], None] = _alone) -> None:
+    def __init__(self, form: Callable[[Any, Cell | None], None] = lambda _role, _cell: None) -> None:
         self.form = form
         self.master: Callable[[Any], None] | None = None
         self.stages: list[Any] = []

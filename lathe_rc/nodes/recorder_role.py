@@ -4,7 +4,7 @@
 import json
 import shutil
 from collections.abc import Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,15 +38,6 @@ _HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos
 _OFFERED = {topic.name: topic for topic in HOST_TOPICS}
 
 
-class _Encoders(dict[tuple[str, str, str, int], Encoder]):
-    """Block encoders by message type, run, source and step [ns]."""
-
-    def __missing__(self, key: tuple[str, str, str, int]) -> Encoder:
-        """Create the encoder of a key."""
-        encoder = self[key] = Encoder(*key)
-        return encoder
-
-
 class RecorderRole(Role):
     """Role of the recorder; subscribes to the topics of all members, or without a cell to all announced topics.
 
@@ -75,7 +66,7 @@ class RecorderRole(Role):
         self._processes: dict[str, int] = {}  # process number of the members that can be restarted
         self._joints: dict[str, tuple[int, set[int]]] = {}  # period, and samples of waiting messages, by topic
         self._newest: dict[str, bytes] = {}  # newest message of each topic from another process
-        self._encoders = _Encoders()
+        self._encoder = cache(Encoder)  # by message type, run, source and step [ns]
         self._merger: Merger | None = None
         self._ended: set[str] = set()  # topics whose last block has arrived
         self._first = self._blocks = self._samples = 0
@@ -375,7 +366,7 @@ class RecorderRole(Role):
             if ready:
                 self._drain()
             return
-        encoder = self._encoders[queue.type, whole.run_id, whole.source, whole.step_ns]
+        encoder = self._encoder(queue.type, whole.run_id, whole.source, whole.step_ns)
         for block in run.blocks(self.table.block_size):
             first, last, companions = block.first_index, block.last, block.companions
             _, data = encoder.encode(first, block.signals, last=last, companions=companions)

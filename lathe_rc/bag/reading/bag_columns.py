@@ -46,11 +46,9 @@ class BagColumns(measurement_file.Source):
             LatheError: samples are missing or not finite.
         """
         with Source(self._path) as source:
-            recorded = Recorded(source, {})
-            places = {name: name.rpartition(".") for name in names}
-            found = {name: recorded.whole(topic, field) for name, (topic, _, field) in places.items()}
-        common = min(array.size for array in found.values())  # a run that was stopped may lack the last blocks of one
-        return {name: array[:common] for name, array in found.items()}
+            places = [name.rpartition(".") for name in names]
+            found = Recorded(source, {}).whole([(topic, field) for topic, _, field in places])
+        return dict(zip(names, found, strict=True))
 
     def clock(self, name: str) -> Clock | None:
         """Return the sampling of the topic of a column."""

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 
@@ -119,18 +120,21 @@ class Recorded:
         if not end:
             raise LatheError(f"{self.path}: {topic} has no block, though the bag counts some")
 
-    def whole(self, topic: str, field: str, most: int | None = None) -> Samples:
-        """Return all samples of a field, or at most the first ``most`` samples, shape (n,).
+    def whole(self, fields: Sequence[tuple[str, str]], most: int | None = None) -> list[Samples]:
+        """Return the samples of some topics and fields, all or at most the first ``most``, shape (n,) each.
+
+        The arrays end together: a run that was stopped may lack the last blocks of one topic.
 
         Raises:
             LatheError: see `pieces`.
         """
-        found: list[Samples] = []
-        for first, signals in self.pieces(topic, [field]):
-            if most is not None and first >= most:
-                break
-            found.append(signals[field])
-        return np.concatenate(found)[:most]
+        arrays = []
+        for topic, field in fields:
+            pieces = self.pieces(topic, [field])
+            found = [signals[field] for _, signals in takewhile(lambda p: most is None or p[0] < most, pieces)]
+            arrays.append(np.concatenate(found)[:most])
+        common = min(array.size for array in arrays)
+        return [array[:common] for array in arrays]
 
     def length(self, topic: str, field: str) -> int:
         """Return the number of samples of a topic, after validating all of them.

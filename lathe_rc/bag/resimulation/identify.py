@@ -83,12 +83,11 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
         raise InputError(
             f"{recorded.path}: steps of {steps[0]} ns on {command}, {steps[1]} ns on {topic}; record both alike"
         )
-    arrays = [recorded.whole(*of, drive_fit.MOST) for of in ((command, "position"), (topic, field))]
-    common = min(array.size for array in arrays)
+    wanted, reached = recorded.whole([(command, "position"), (topic, field)], drive_fit.MOST)
     try:
         fit = drive_fit.fit(
-            arrays[0][:common],
-            arrays[1][:common],
+            wanted,
+            reached,
             steps[0] * 1e-9,
             method=table.discretisation,
             stroke=table.stroke if known else np.inf,
@@ -177,9 +176,8 @@ def form(recorded: Recorded) -> Form:
         )
     source = (tool, "displacement") if tool else (state or "", "measured_position")
     spindle = recorded.spindle("encoder")
-    arrays = [recorded.whole(topic, field) for topic, field in ((spindle.topic, spindle.angle), source)]
-    common = min(array.size for array in arrays)
-    angle, position = arrays[0][:common] - spindle.turns, arrays[1][:common]
+    angle, position = recorded.whole([(spindle.topic, spindle.angle), source])
+    angle = angle - spindle.turns
     # An encoder with few counts repeats each value for several samples, of which the first is used.
     new = np.diff(angle, prepend=-np.inf) > 0.0
     every = evenly(angle[new], position[new], _FORM_POINTS)
