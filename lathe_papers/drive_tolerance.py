@@ -13,6 +13,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from lathe_papers import cells, marks, sweeps
+from lathe_papers.judge import finite
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
@@ -66,10 +67,7 @@ class DriveToleranceResult:
         return {
             "tolerance": self.parameters.tolerance,
             "nominal_um": self.nominal,
-            **{
-                f"{100 * share:g}_percent_um": [float(e) if np.isfinite(e) else None for e in self._at(share)]
-                for share in _SHARES
-            },
+            **{f"{100 * share:g}_percent_um": finite(self._at(share)) for share in _SHARES},
             "refused": np.isinf(self.error).sum(axis=1).tolist(),
         }
 
@@ -90,9 +88,9 @@ class DriveToleranceResult:
         left, right = figure.subplots(1, 2)
         shares = 100.0 * np.arange(1, self.error.shape[1] + 1) / self.error.shape[1]
         for place, tolerance in enumerate(self.parameters.tolerance):
-            finite = np.isfinite(self.error[place])
+            errors = self.error[place][np.isfinite(self.error[place])]
             label = f"{100 * tolerance:g} %"
-            left.semilogx(self.error[place][finite], shares[finite], label=label, **marks.curve(place))
+            left.semilogx(errors, shares[: errors.size], label=label, **marks.curve(place))
         left.axvline(self.nominal, color="#7f7f7f", ls=":", label="the scenario's own")
         left.set(xlabel="largest form error of the last revolution [µm]", ylabel="drives below [%]")
         left.legend(title="tolerance (1σ)", fontsize=8, title_fontsize=8)
