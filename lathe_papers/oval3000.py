@@ -8,7 +8,6 @@ be tuned to it. Each drive has a noise and a random speed of its own; all laws g
 """
 
 import secrets
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -23,7 +22,7 @@ from lathe_papers.judge import Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.arrays import Array
 from lathe_rc.cell import ros_yaml
-from lathe_rc.cell.parameters import SharedParameters, Value, parameter
+from lathe_rc.cell.parameters import SharedParameters, Value, Values, parameter
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import LawParameters, Learner, Loop
@@ -34,8 +33,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Value]
 
 PUBLISHED = 3000  #: seed of the first set of drives
 _LARGEST = 2**31  # fresh seeds are below

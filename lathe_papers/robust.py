@@ -19,7 +19,7 @@ from lathe_papers import cells, marks
 from lathe_papers.judge import Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.arrays import Array
-from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.parameters import Values, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.stages.learner import Learner
@@ -28,8 +28,6 @@ from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Value]
 
 _SPREAD = 0.2  # relative spread of the drives
 TOLD = (1038.0, 0.804, 0.36e-3)  # nominal natural frequency [rad/s], damping and delay [s], assumed by the laws

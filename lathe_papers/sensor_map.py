@@ -21,7 +21,7 @@ from rich.table import Table as RichTable
 from lathe_papers import cells
 from lathe_rc import messages
 from lathe_rc.arrays import Array
-from lathe_rc.cell.parameters import Value, parameter
+from lathe_rc.cell.parameters import Value, Values, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.learner import Learner
@@ -37,7 +37,7 @@ _BEGINS = 3.0  # [s] start of the deviation, after 50 revolutions at constant sp
 _SHOWN = 1.0  # [s] duration of the deviation
 _GOLDEN = 0.6180339887  # shift of the deviation's start from seed to seed, in revolutions
 _PLAIN, _OURS = "speed_deviation", "robust"  # scenarios
-_FREE: Mapping[str, Value] = {  # the study assumes the linear drive, without its limits
+_FREE: Values = {  # the study assumes the linear drive, without its limits
     "electrodynamic_actuator.max_velocity": 1e3,
     "electrodynamic_actuator.max_acceleration": 1e6,
     "electrodynamic_actuator.stroke": 1.0,

@@ -11,7 +11,7 @@ from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.cell import batch, models
-from lathe_rc.cell.parameters import NodeParameters, Value
+from lathe_rc.cell.parameters import NodeParameters, Value, Values
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import FormParameters
@@ -30,9 +30,8 @@ _PREFIXES = ("", "coarse_", "fine_", "cut_")  # parameter prefixes of stages com
 _FACTOR = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
 _CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
 
-_Off = Mapping[str, Value]
 #: Parameters by cause, in nodes with a table of a given kind, with the values that switch the cause off.
-_CAUSES: Mapping[str, tuple[type[NodeParameters], _Off]] = {
+_CAUSES: Mapping[str, tuple[type[NodeParameters], Values]] = {
     "force": (NodeParameters, {"deflects": False, "cross_slide": False, "radial_ratio": 0.0}),
     "load": (LoadedSpindleParameters, {"part_radius": 0.0}),
     "vibration": (
@@ -69,7 +68,7 @@ class Cause:
         needs: another cause without which this one has no effect; empty if there is none.
     """
 
-    off: Mapping[str, Value]
+    off: Values
     needs: str = ""
 
 
@@ -117,7 +116,7 @@ class _Keep:
         return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:])
 
 
-def _not_yet(scenario: Scenario, values: Mapping[str, Value]) -> dict[str, Value]:
+def _not_yet(scenario: Scenario, values: Values) -> dict[str, Value]:
     """Return the values that differ from those of the scenario."""
     parts = {target: target.partition(".") for target in values}
     return {t: v for t, v in values.items() if getattr(scenario.nodes[parts[t][0]], parts[t][2]) != v}
@@ -196,7 +195,7 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
     return {"Q floor": Cause(off)}
 
 
-def changing(nodes: Mapping[str, Mapping[str, Value]]) -> list[str]:
+def changing(nodes: Mapping[str, Values]) -> list[str]:
     """Return the names of the causes that make revolutions differ from each other, except for speed and cut.
 
     Args:

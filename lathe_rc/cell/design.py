@@ -25,15 +25,13 @@ from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell import batch
-from lathe_rc.cell.parameters import SharedParameters, Value
+from lathe_rc.cell.parameters import SharedParameters, Values
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.learner import Learner, Loop, lag
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Signals
-
-Values = Mapping[str, Value]
 
 _LEADS = np.linspace(0.5, 1.3, 9)  # over the lag that the correction leaves
 _GAINS = (1.0, 0.5)

@@ -26,6 +26,7 @@ NonNegative = Annotated[float, Ge(0)]  #: most quantities, including those that 
 Positive = Annotated[float, Gt(0)]  #: quantities that are used as divisors
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
+Values = Mapping[str, Value]  #: values by parameter name
 
 T = TypeVar("T", bound="Table")
 
@@ -320,7 +321,7 @@ class NodeParameters(SharedParameters):
         """Return the drive quantities available to controllers, by command topic before remapping and by quantity."""
         return {}
 
-    def known(self) -> Mapping[str, Value]:
+    def known(self) -> Values:
         """Return the values of the node that other nodes may use, by parameter name."""
         return {}
 

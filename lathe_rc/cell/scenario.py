@@ -17,7 +17,7 @@ import yaml
 
 from lathe_rc import allowed_code, files, resources
 from lathe_rc.cell import models, ros_yaml
-from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value
+from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value, Values
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stage import Stage
@@ -238,7 +238,7 @@ class Scenario:
         tables = {node: models.given(table) for node, table in self.nodes.items()}
         return Scenario(self.name, tables, self.fingerprints)
 
-    def varied(self, values: Mapping[str, Value]) -> "Scenario":
+    def varied(self, values: Values) -> "Scenario":
         """Return the same cell with other parameter values, without reading its file again.
 
         Args:

@@ -16,7 +16,7 @@ from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
-from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.parameters import Values
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
 from lathe_rc.cell.stages.learner import Learner
@@ -30,8 +30,6 @@ _WIDEST = 2.5  # end of a range, in values of the scenario
 _POINTS = 400  # of a response, and of a lobe
 _LOBES = 8
 _REVOLUTIONS = 30.0  # longest run for the form error
-
-Values = Mapping[str, Value]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from lathe_rc.commands import options
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
-    from lathe_rc.cell.design import Candidate, Values
+    from lathe_rc.cell.design import Candidate
+    from lathe_rc.cell.parameters import Values
 
 
 @click.command()
