@@ -14,7 +14,7 @@ import numpy as np
 from lathe_rc.cell.loops import LoopResult
 from lathe_rc.messages import Samples
 from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
-from lathe_rc.view.report_figures import LEGEND, colour_range, diverging, um
+from lathe_rc.view.report_figures import LEGEND, colour_range, diverging, rectangles, um
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_series import Envelope
 
@@ -190,21 +190,24 @@ def verdicts(runs: Compared) -> Spec:
     return _steered(runs, spec)
 
 
-def convergence(runs: Compared) -> Spec:
-    """Return the largest form error by revolution of all runs, with the chosen tolerance and revolution."""
-    line = {"type": "line", "clip": True, "strokeWidth": 1.6}
-    drawn = {
-        "data": {"name": SIZES},
+def _by_revolution(data: Spec, error: str, unit: str, names: Iterable[str]) -> Spec:
+    """Return the largest error by revolution as lines, from a data set with r, v and the run l."""
+    return {
+        "data": data,
         "transform": [{"filter": "datum.v > 0"}],
-        "mark": line,
+        "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
         "encoding": {
             "x": quantity("r", "revolution", scale=axis_scale(), axis={"grid": False}),
-            "y": quantity("v", "largest form error [µm]", scale=axis_scale(log=True)),
-            **_by_run(runs.sizes, r="revolution", v="largest [µm]"),
+            "y": quantity("v", f"largest {error} [{unit}]", scale=axis_scale(log=True)),
+            **_by_run(names, r="revolution", v=f"largest [{unit}]"),
         },
     }
-    layer = [drawn, _rule("y", "tolerance", (6, 4)), _rule("x", "revolution")]
-    return _steered(runs, chart(280, layer=layer))
+
+
+def convergence(runs: Compared) -> Spec:
+    """Return the largest form error by revolution of all runs, with the chosen tolerance and revolution."""
+    drawn = _by_revolution({"name": SIZES}, "form error", "µm", runs.sizes)
+    return _steered(runs, chart(280, layer=[drawn, _rule("y", "tolerance", (6, 4)), _rule("x", "revolution")]))
 
 
 def servo_error(results: Mapping[str, LoopResult], shown: int) -> Spec:
@@ -222,16 +225,7 @@ def servo_error(results: Mapping[str, LoopResult], shown: int) -> Spec:
         place, _, high = sizes.curve()
         data += rows(r=place + 1.0 + result.before, v=high * quantity_.scale, l=name)
         limits[name] = result.loop.tolerance * quantity_.scale
-    line = {
-        "data": {"values": data},
-        "transform": [{"filter": "datum.v > 0"}],
-        "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
-        "encoding": {
-            "x": quantity("r", "revolution", scale=axis_scale(), axis={"grid": False}),
-            "y": quantity("v", f"largest {quantity_.error} [{quantity_.unit}]", scale=axis_scale(log=True)),
-            **_by_run(results, r="revolution", v=f"largest [{quantity_.unit}]"),
-        },
-    }
+    line = _by_revolution({"values": data}, quantity_.error, quantity_.unit, results)
     tolerances = [_rule("y", str(number(limit)), (6, 4)) for limit in sorted({*limits.values()}) if limit > 0.0]
     spec = chart(240, layer=[line, *tolerances, _rule("x", "revolution")])
     return {**spec, "params": [{"name": "revolution", "value": shown}], "usermeta": {"signals": ["revolution"]}}
@@ -253,7 +247,7 @@ def maps(runs: Compared) -> list[Spec]:
 
 
 def _map(runs: Compared, place: int, name: str, largest: float, linear: float) -> Spec:
-    end = runs.revolutions + 0.5
+    end, across = runs.revolutions + 0.5, {"grid": False, "values": [0, 90, 180, 270, 360]}
     fields = {
         "data": {"name": MAPS},
         "transform": [
@@ -263,22 +257,13 @@ def _map(runs: Compared, place: int, name: str, largest: float, linear: float) -
             {"calculate": "datum.r - 0.5", "as": "v"},
             {"calculate": f"min(datum.v + {runs.step}, {end})", "as": "v2"},
         ],
-        "mark": {"type": "rect", "clip": True, "strokeWidth": 1.2},
-        "encoding": {
-            "x": quantity(
-                "u",
-                "spindle angle [°]",
-                scale=axis_scale(ends=(0, 360)),
-                axis={"grid": False, "values": [0, 90, 180, 270, 360]},
-            ),
-            "x2": {"field": "u2"},
-            "y": quantity(
-                "v", "revolution", scale={**axis_scale(ends=(0.5, end)), "reverse": True}, axis={"grid": False}
-            ),
-            "y2": {"field": "v2"},
-            **diverging("radius deviation [µm]", largest, linear),
-            "tooltip": tip(u="spindle angle [°]", r="revolution", data="radius deviation [µm]"),
-        },
+        **rectangles(
+            quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis=across),
+            quantity("v", "revolution", scale={**axis_scale(ends=(0.5, end)), "reverse": True}, axis={"grid": False}),
+            {"field": "v2"},
+            diverging("radius deviation [µm]", largest, linear),
+            tip(u="spindle angle [°]", r="revolution", data="radius deviation [µm]"),
+        ),
     }
     return _steered(runs, chart(260, title=name, layer=[fields, _rule("y", "revolution")]), renderer="canvas")
 

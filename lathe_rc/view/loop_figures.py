@@ -9,8 +9,8 @@ import numpy as np
 from lathe_rc.cell.varied_loop import Along, Chart, DriveCurve
 from lathe_rc.messages import Samples
 from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
-from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
-from lathe_rc.view.report_loop import texts
+from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure, limit_line
+from lathe_rc.view.report_loop import diamond
 
 _MOST = 5  # responses of a controller
 _LOWEST, _HIGHEST = -60.0, 20.0  # [dB] ends of the axis
@@ -74,7 +74,6 @@ def chatter(chart: Chart) -> Spec:
         order = np.arange(kept.sum())
         data += rows(n=speed[kept] * _RPM, v=stiffness[kept] * 1e-3, k=order, l="lobe", d=number)
     top = 1.05 * max(_ABOVE * chart.limit, 0.0 if np.isnan(chart.stiffness) else chart.stiffness) * 1e-3
-    limit = rows(v=np.array([chart.limit * 1e-3]), t=f"no chatter at any speed below {chart.limit * 1e-3:.4g} N/mm")
     shade = colours({"lobe": LAST, "cut": FIRST}, legend=False)
     layer: Rows = [
         {
@@ -88,22 +87,11 @@ def chatter(chart: Chart) -> Spec:
                 "tooltip": tip(n="speed [1/min]", v="stiffness [N/mm]"),
             },
         },
-        {
-            "data": {"values": limit},
-            "mark": {"type": "rule", "strokeDash": [6, 4], "clip": True},
-            "encoding": {"x": {"value": 0}, "x2": {"value": "width"}},
-        },
-        {
-            "data": {"values": limit},
-            "mark": {"type": "text", "align": "right", "dy": 12, "clip": True, "fontSize": 11},
-            "encoding": {"x": {"value": "width"}, "text": {"field": "t"}},
-        },
+        *limit_line(chart.limit * 1e-3, f"no chatter at any speed below {chart.limit * 1e-3:.4g} N/mm", dy=12),
     ]
     if not np.isnan(chart.stiffness):
         own = rows(n=chart.speed * _RPM, v=np.array([chart.stiffness * 1e-3]), l="cut", t="cut of the scenario")
-        mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
-        layer.append({"data": {"values": own}, "mark": mark, "encoding": {"color": shade}})
-        layer += texts(own, align="left", dx=10)
+        layer += diamond(own, shade, align="left", dx=10)
     return figure(
         300,
         encoding={

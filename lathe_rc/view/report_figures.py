@@ -67,13 +67,12 @@ def figure(height: int, *, usermeta: Mapping[str, Any] | None = None, **parts: A
     return chart(height, usermeta={"box": True, **(usermeta or {})}, **parts)
 
 
-def _rectangles(height: int, x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: Rows, **parts: Any) -> Spec:
-    """Return a figure of rectangles from u to u2 horizontally and from y to y2 vertically."""
+def rectangles(x: Spec, y: Spec, y2: Spec, colour: Spec, tooltip: Rows) -> Spec:
+    """Return mark and encoding of rectangles from u to u2 horizontally and from y to y2 vertically."""
     encoding = {"x": x, "x2": {"field": "u2"}, "y": y, "y2": y2, "color": colour, "tooltip": tooltip}
     if colour["type"] == "quantitative":  # no gaps between the fields of a map
         encoding["stroke"] = {key: value for key, value in colour.items() if key != "legend"}
-    mark = {"type": "rect", "clip": True, "strokeWidth": 1.2}
-    return figure(height, params=[BOX], mark=mark, encoding=encoding, **parts)
+    return {"mark": {"type": "rect", "clip": True, "strokeWidth": 1.2}, "encoding": encoding}
 
 
 def colours(places: Mapping[str, int], symbol: str = "stroke", *, legend: bool) -> Spec:
@@ -102,13 +101,16 @@ def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
     """Return a heat map with one field per number; ``across`` and ``up`` give start, step and axis per direction."""
     # The page holds one number per field; positions, which Vega computes, would make the page 5 times as large.
     place = "(datum.k - 1)"
-    return _rectangles(
-        340,
+    drawn = rectangles(
         quantity("u", "spindle angle [°]", scale=axis_scale(ends=(0, 360)), axis=across["axis"]),
         quantity("v", up["title"], scale=up["scale"], axis={"grid": False}),
         {"field": "v2"},
         colour,
         tip(u="spindle angle [°]", v=up["title"], data=colour["title"]),
+    )
+    return figure(
+        340,
+        params=[BOX],
         data={"values": [number(value) for value in fields.ravel().tolist()]},
         transform=[
             {"window": [{"op": "row_number", "as": "k"}]},
@@ -118,6 +120,7 @@ def _map(fields: Samples, across: Spec, up: Spec, colour: Spec) -> Spec:
             {"calculate": f"min(datum.v + {up['step']}, {up['end']})", "as": "v2"},
         ],
         usermeta={"renderer": "canvas"},
+        **drawn,
     )
 
 
@@ -134,15 +137,11 @@ def _downsample(fields: Samples, most: int) -> tuple[Samples, int]:
 
 
 def diverging(title: str, largest: float, linear: float) -> Spec:
-    """Return the colours of a signed map (field ``data``), see `colour_range`, without gaps between its fields."""
+    """Return the colours of a signed map (field ``data``), see `colour_range`."""
     ticks = [largest, linear] if largest > 3 * linear else [largest]
     values = [*(-tick for tick in ticks), 0.0, *reversed(ticks)]
     scale = {"type": "symlog", "constant": linear / _LINEAR, "domain": [-largest, largest], "range": "diverging"}
-    legend = {**_GRADIENT, "values": values, "format": ".3~g"}
-    return {
-        "color": quantity("data", title, scale=scale, legend=legend),
-        "stroke": quantity("data", title, scale=scale),
-    }
+    return quantity("data", title, scale=scale, legend={**_GRADIENT, "values": values, "format": ".3~g"})
 
 
 def form_map(form: Form, maps: int) -> Spec:
@@ -154,8 +153,7 @@ def form_map(form: Form, maps: int) -> Spec:
     end = form.map.size + 0.5
     up = {"title": "revolution", "start": 0.5, "step": group * form.map.group, "end": end}
     up["scale"] = {**axis_scale(ends=(0.5, end)), "reverse": True}
-    colour = diverging("radius deviation [µm]", largest, linear)["color"]
-    return _map(fields, _across(360 / _ACROSS, 45), up, colour)
+    return _map(fields, _across(360 / _ACROSS, 45), up, diverging("radius deviation [µm]", largest, linear))
 
 
 def along(surface: Lay) -> list[Spec]:
@@ -281,15 +279,14 @@ def spectrum(form: Form) -> Spec:
         bars += rows(n=order, u=left, u2=left + width, v=value, l=label)
     indices = {label: places[label.partition(" revolution")[0].split(", ")[-1]] for label in shown}
     ends = (low, high) if high else ()
-    return _rectangles(
-        260,
+    drawn = rectangles(
         quantity("u", "undulations per revolution", scale=axis_scale(ends=(0.4, 50.6)), axis={"grid": False}),
         quantity("v", "amplitude [µm]", scale=axis_scale(log=bool(high), ends=ends)),
         {"datum": number(low)},
         colours(indices, "square", legend=True),
         tip(n="undulations per revolution", v="amplitude [µm]"),
-        data={"values": bars},
     )
+    return figure(260, params=[BOX], data={"values": bars}, **drawn)
 
 
 # --- curves
@@ -345,15 +342,7 @@ def _lines(
         encoding = {"y": {"field": "m"}, "tooltip": tooltip}
         layer.append({"transform": [{"filter": drawn}], "mark": mark, "encoding": encoding})
     if limit > 0.0:
-        data_ = {"values": [{"v": number(limit), "t": f"tolerance {limit:.4g} {unit}"}]}
-        where = {"y": {"field": "v"}, "color": {"value": "#888"}}
-        rule = {"type": "rule", "strokeDash": [6, 4], "clip": True}
-        text = {"type": "text", "align": "right", "dy": -6, "clip": True, "fontSize": 11}
-        end = {"value": "width"}
-        layer += [
-            {"data": data_, "mark": rule, "encoding": {"x": {"value": 0}, "x2": end, **where}},
-            {"data": data_, "mark": text, "encoding": {"x": end, "text": {"field": "t"}, **where}},
-        ]
+        layer += limit_line(limit, f"tolerance {limit:.4g} {unit}")
     values = [row[end] for row in data for end in "ab" if row[end] is not None]
     least, most = min(values, default=0.0), max(values, default=1.0)
     ends: tuple[float, ...] = ()
@@ -373,6 +362,19 @@ def _lines(
         },
         layer=layer,
     )
+
+
+def limit_line(value: float, text: str, dy: int = -6) -> Rows:
+    """Return layers of a dashed line across a figure, with its text ``dy`` px below the right end."""
+    data = {"values": [{"v": number(value), "t": text}]}
+    where = {"y": {"field": "v"}, "color": {"value": "#888"}}
+    rule = {"type": "rule", "strokeDash": [6, 4], "clip": True}
+    written = {"type": "text", "align": "right", "dy": dy, "clip": True, "fontSize": 11}
+    end = {"value": "width"}
+    return [
+        {"data": data, "mark": rule, "encoding": {"x": {"value": 0}, "x2": end, **where}},
+        {"data": data, "mark": written, "encoding": {"x": end, "text": {"field": "t"}, **where}},
+    ]
 
 
 def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
@@ -429,16 +431,15 @@ def _histogram(name: str, counts: Samples, edges: Samples, axes: tuple[str, str]
     """Return a histogram from counts, shape (bins,), bin edges, shape (bins + 1,), and axis titles."""
     across, up = axes
     scale = axis_scale(log=log, ends=(edges[0], edges[-1]))
-    return _rectangles(
-        220,
+    data = rows(u=edges[:-1], u2=edges[1:], v=counts.astype(int), l=name)
+    drawn = rectangles(
         quantity("u", across, scale=scale, axis={"grid": False, "format": "~r"}),
         quantity("v", up, scale={"zero": True}),
         {"value": "height"},
         colours({name: colour}, legend=False),
         tip(u="from", u2="to", v=up),
-        title=name,
-        data={"values": rows(u=edges[:-1], u2=edges[1:], v=counts.astype(int), l=name)},
     )
+    return figure(220, params=[BOX], title=name, data={"values": data}, **drawn)
 
 
 def timing(host: Host, step: float) -> list[Spec]:

@@ -32,6 +32,12 @@ def texts(data: Rows, **mark: Any) -> Rows:
     return [{**layer, "mark": {**text, "style": "halo"}}, {**layer, "mark": text}]
 
 
+def diamond(data: Rows, shade: Spec, **mark: Any) -> Rows:
+    """Return layers of a diamond with its label, in a colour of an encoding."""
+    point = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
+    return [{"data": {"values": data}, "mark": point, "encoding": {"color": shade}}, *texts(data, **mark)]
+
+
 def _locus(curve: LoopCurve) -> Spec:
     factor, waves = curve.factor, curve.waves
     assert factor is not None, "asked by the caller"
@@ -94,11 +100,7 @@ def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec, side: float =
     """
     align, dx = ("center", 0) if abs(side) < _INNER else ("left", -8) if side < 0.0 else ("right", 8)
     data = [{**row, "t": f"margin {curve.margin}", "l": label} for row in place]
-    mark = {"type": "point", "shape": "diamond", "filled": True, "size": 130, "opacity": 1, "clip": True}
-    return [
-        {"data": {"values": data}, "mark": mark, "encoding": {"color": shade}},
-        *texts(data, dy=16, align=align, dx=dx),
-    ]
+    return diamond(data, shade, dy=16, align=align, dx=dx)
 
 
 def _over_waves(curve: LoopCurve) -> Spec:
