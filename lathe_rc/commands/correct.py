@@ -24,7 +24,7 @@ from lathe_rc.signals import measurement_file
 from lathe_rc.signals.profile import Profile
 
 _TURN = 2.0 * np.pi
-_POINTS = 1024  # angles of the file
+_ANGLES = _TURN * np.arange(1024) / 1024  # of the file
 _ROWS, _LEFT = 8, 2  # corrected and other harmonics in the table
 _BAG_REVOLUTIONS = 10  # of a bag, the last ones
 _LATE = 1e-3  # [rev] after the begin of a complete revolution at most comes the first reading of all
@@ -104,8 +104,8 @@ class _Read(NamedTuple):
 def _read(
     records: Sequence[Path],
     desired: Profile,
-    columns: Sequence[str],
     *,
+    columns: Sequence[str],
     highest: int,
     lowest: int,
     deviation: bool,
@@ -118,12 +118,9 @@ def _read(
 ) -> _Read:
     """Read the records and turn them to the part's angle; angles in degrees."""
     mapping = measurement_file.parse_mapping(columns)
-    around, within, sense = (
-        np.radians(offset or 0.0),
-        np.radians((0.0 if offset is not None else 180.0) if search is None else search),
-        -1.0 if reverse else 1.0,
-    )
-    even = _TURN * np.arange(_POINTS) / _POINTS
+    if search is None:
+        search = 180.0 if offset is None else 0.0
+    around, within, sense = np.radians(offset or 0.0), np.radians(search), -1.0 if reverse else 1.0
     found, points = _Read([], [], 0.0), []
     for path in records:
         bag = measured.is_bag(path)
@@ -143,10 +140,8 @@ def _read(
             found.alignments.append(Alignment(around))
             found.deviations.append([-form_correction.turn(each, around, sense) for each in waves])
             continue
-        forms = [
-            form_correction.harmonics(even, desired.deviation(even, _height(path, desired, each, height)), highest)
-            for each in revolutions
-        ]
+        heights = [_height(path, desired, each, height) for each in revolutions]
+        forms = [form_correction.harmonics(_ANGLES, desired.deviation(_ANGLES, each), highest) for each in heights]
         for amplitudes in (*forms, *waves):
             amplitudes[:lowest] = 0.0
         try:
@@ -188,9 +183,9 @@ def _check_likeness(path: Path, aligned: Alignment) -> None:
 
 def _write(path: Path, programmed: Profile, change: Complex, comment: str) -> None:
     """Write the programmed form with its change as a profile file."""
-    angle, heights = _TURN * np.arange(_POINTS) / _POINTS, programmed.heights
-    radius = np.array([programmed.deviation(angle, float(height)) for height in heights])
-    radius += form_correction.evaluate(change, angle)
+    heights = programmed.heights
+    radius = np.array([programmed.deviation(_ANGLES, float(height)) for height in heights])
+    radius += form_correction.evaluate(change, _ANGLES)
     if heights.size > 1:
         profile_csv.write(path, radius, heights=heights, comment=comment)
     else:
@@ -199,7 +194,6 @@ def _write(path: Path, programmed: Profile, change: Complex, comment: str) -> No
 
 def _summary(found: _Read, made: Correction, records: Sequence[Path], forms: _Forms, output: Path) -> dict[str, Any]:
     """Return the result; lengths in µm, angles in degrees."""
-    even = _TURN * np.arange(_POINTS) / _POINTS
     aligned = [
         {
             "record": str(path),
@@ -223,8 +217,8 @@ def _summary(found: _Read, made: Correction, records: Sequence[Path], forms: _Fo
         "records": aligned,
         "node": forms.node,
         "unit": "um",
-        "deviation": float(np.abs(form_correction.evaluate(made.deviation, even)).max()) * 1e6,
-        "change": float(np.abs(form_correction.evaluate(made.change, even)).max()) * 1e6,
+        "deviation": float(np.abs(form_correction.evaluate(made.deviation, _ANGLES)).max()) * 1e6,
+        "change": float(np.abs(form_correction.evaluate(made.change, _ANGLES)).max()) * 1e6,
         "harmonics": waves,
         "file": str(output),
     }
@@ -305,23 +299,16 @@ def correct(
     scenario: str,
     output: Path,
     node: str | None,
-    columns: tuple[str, ...],
-    offset: float | None,
-    search: float | None,
-    height: float | None,
     highest: int,
     cutoff: float | None,
     gain: float,
     guard: float,
     noise: float | None,
-    last: int,
-    topic: str | None,
     overrides: tuple[str, ...],
     *,
-    deviation: bool,
-    reverse: bool,
     roundness: bool,
     as_json: bool,
+    **how: Any,
 ) -> None:
     """Correct the programmed form of the next part, from RECORDs of finished parts.
 
@@ -332,20 +319,7 @@ def correct(
     check_place("--output", output)
     forms = _forms(scenarios.load(scenario, overrides), node)
     lowest = _ROUNDNESS if roundness else 0
-    found = _read(
-        records,
-        forms.desired,
-        columns,
-        highest=highest,
-        lowest=lowest,
-        deviation=deviation,
-        reverse=reverse,
-        offset=offset,
-        search=search,
-        height=height,
-        last=last,
-        topic=topic,
-    )
+    found = _read(records, forms.desired, highest=highest, lowest=lowest, **how)
     revolutions = sum(map(len, found.deviations))
     given = None
     if noise is not None:

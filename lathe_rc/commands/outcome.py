@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Result of a run as tables and lines for the terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
@@ -22,20 +23,20 @@ _ALIKE = 4  # length of a series of similar events from which its inner events a
 def table(result: harness.Result) -> Table:
     """Return a table of the part's form error in its first and last revolution."""
     columns = {"rms": "RMS [µm]", "max": "maximum [µm]", "peak_to_valley": "peak to valley [µm]", "ront": "RONt [µm]"}
-    found = tables.table("", *columns.values(), left=1)
-    for label, revolution in (("first revolution", 0), ("last revolution", -1)):
-        numbers = part.numbers(result.part, revolution)
-        found.add_row(label, *(f"{numbers[name]:#.4g}" for name in columns))
-    return found
+    return _ends("", columns, lambda revolution: part.numbers(result.part, revolution))
 
 
 def _loop(node: str, loop: LoopResult) -> Table:
     """Return a table of a loop's error in its first and last revolution."""
     columns = {"rms": "RMS", "max": "maximum", "peak_to_valley": "peak to valley", "mean": "mean"}
-    found = tables.table(f"{node} [{loop.loop.quantity.unit}]", *columns.values(), left=1)
+    return _ends(f"{node} [{loop.loop.quantity.unit}]", columns, loop.row)
+
+
+def _ends(heading: str, columns: Mapping[str, str], numbers: Callable[[int], Mapping[str, Any]]) -> Table:
+    found = tables.table(heading, *columns.values(), left=1)
     for label, revolution in (("first revolution", 0), ("last revolution", -1)):
-        numbers = loop.row(revolution)
-        found.add_row(label, *(f"{numbers[name]:#.4g}" for name in columns))
+        row = numbers(revolution)
+        found.add_row(label, *(f"{row[name]:#.4g}" for name in columns))
     return found
 
 
