@@ -111,7 +111,8 @@ class LoopPage:
         scripts = [*self._charts.scripts, own_file("loop.js")]
         styles = [own_file(name) for name in ("report.css", "loop.css", "diagram.css")]
         styles.append("figure .chart { display: block; }")  # there are no pictures for printing
-        page = Page(f"Loop of {self._loop.scenario.name}", self._body(live=True), styles, scripts)
+        body = page_template(_HERE / "loop_live.html.j2").render(**self._content(live=True))
+        page = Page(f"Loop of {self._loop.scenario.name}", body, styles, scripts)
         answers = {"state": self.state, "errors": self.errors, "along": self.along, "write": self.write}
         return Site({"": page}, answers)
 
@@ -119,9 +120,6 @@ class LoopPage:
         """Return the page as a file, with the values of the scenario; ``command`` reproduces it."""
         template = page_template(_HERE / "loop.html.j2")
         return template.render(**self._content(live=False), version=__version__, command=command)
-
-    def _body(self, *, live: bool) -> str:
-        return page_template(_HERE / "loop_live.html.j2").render(**self._content(live=live))
 
     def _content(self, *, live: bool) -> dict[str, Any]:
         loop, state, places = self._loop, self._state, self._places

@@ -40,25 +40,17 @@ def site(driver: Driver, cell: LiveCell) -> Site:
 def player_site(driver: Driver, player: Player) -> Site:
     """Return the panel of a bag."""
 
-    def start(_: Mapping[str, Any]) -> object:
-        def again() -> None:
-            if player.reached >= player.samples:
-                player.seek(player.first)
-            driver.start()
+    def start(_: Mapping[str, Any]) -> None:
+        if player.reached >= player.samples:
+            player.seek(player.first)
+        driver.start()
 
-        driver.call(again)
-        return {}
-
-    def seek(question: Mapping[str, Any]) -> object:
-        def moved() -> None:
-            player.seek(int(_number(question, "sample")))
-            driver.again()
-
-        driver.call(moved)
-        return {}
+    def seek(question: Mapping[str, Any]) -> None:
+        player.seek(int(_number(question, "sample")))
+        driver.again()
 
     about = {**player.view.outlook, "can": ["run", "seek"], "nodes": [], "faults": {}, "parameters": []}
-    answers = {"about": lambda _: about, "seek": seek, "start": start}
+    answers = {"about": lambda _: about, "seek": _called(driver, seek), "start": _called(driver, start)}
     return Site({"": page()}, {**_watching(player.view), **_playing(driver), **answers})
 
 
@@ -92,23 +84,16 @@ def attached_site(view: View, cell: Cell, commands: Attached) -> Site:
         cell: the cell of its scenario, for the choice of commands.
         commands: commands to its nodes.
     """
-
-    def acting(question: Mapping[str, Any]) -> object:
-        return {"text": commands.act(_text(question, "node"), _text(question, "action"))}
-
-    def done(command: Callable[[Mapping[str, Any]], object]) -> Answer:
-        return lambda question: command(question) or {}
-
     nodes = [_node(stage) for stage in cell.stages.values()]
     can = {"can": ["run", "command", "record"], "cannot": commands.cannot}
     about = {**view.outlook, "revolutions": 0.0, **can, "nodes": nodes, "faults": _faults(), "parameters": []}
     answers: dict[str, Answer] = {
         "about": lambda _: about,
-        "act": acting,
-        "start": done(lambda _: commands.hold(held=False)),
-        "pause": done(lambda _: commands.hold(held=True)),
-        "pace": done(lambda question: commands.pace(_number(question, "factor"))),
-        "record": done(lambda question: commands.record(_text(question, "bag").strip())),
+        "act": lambda question: {"text": commands.act(_text(question, "node"), _text(question, "action"))},
+        "start": _done(lambda _: commands.hold(held=False)),
+        "pause": _done(lambda _: commands.hold(held=True)),
+        "pace": _done(lambda question: commands.pace(_number(question, "factor"))),
+        "record": _done(lambda question: commands.record(_text(question, "bag").strip())),
     }
     return Site({"": page()}, {**_watching(view), **answers})
 
@@ -135,18 +120,23 @@ def _watching(view: View) -> dict[str, Answer]:
     return {"frame": frame, "part": part}
 
 
+def _done(command: Callable[[Mapping[str, Any]], object]) -> Answer:
+    """Return an answer that carries out a command, which may return nothing."""
+    return lambda question: command(question) or {}
+
+
+def _called(driver: Driver, command: Callable[[Mapping[str, Any]], object]) -> Answer:
+    """Return an answer that carries out a command between two blocks."""
+    return _done(lambda question: driver.call(lambda: command(question)))
+
+
 def _playing(driver: Driver) -> dict[str, Answer]:
     """Return the answers of a run with a pace."""
-
-    def done(command: Callable[[], object]) -> object:
-        driver.call(command)
-        return {}
-
     return {
-        "start": lambda _: done(driver.start),
-        "pause": lambda _: done(driver.pause),
-        "step": lambda _: done(driver.step),
-        "pace": lambda question: done(lambda: driver.pace(_number(question, "factor"))),
+        "start": _called(driver, lambda _: driver.start()),
+        "pause": _called(driver, lambda _: driver.pause()),
+        "step": _called(driver, lambda _: driver.step()),
+        "pace": _called(driver, lambda question: driver.pace(_number(question, "factor"))),
     }
 
 
@@ -154,34 +144,23 @@ def _commands(driver: Driver, cell: LiveCell) -> dict[str, Answer]:
     """Return the answers that change the cell."""
 
     def act(question: Mapping[str, Any]) -> object:
-        node, action = _text(question, "node"), _text(question, "action")
-        return {"text": driver.call(lambda: cell.act(node, action))}
+        return {"text": cell.act(_text(question, "node"), _text(question, "action"))}
 
-    def change(question: Mapping[str, Any]) -> object:
+    def change(question: Mapping[str, Any]) -> None:
         given = question.get("values")
         if not isinstance(given, dict):
             raise InputError("values of parameters are missing; allowed: an object of texts")
         values = {str(name): ros_yaml.parse_value(str(text), str(name)) for name, text in given.items()}
+        cell.change(values, here=question.get("here") is True)
+        driver.again()
 
-        def carried_out() -> None:
-            cell.change(values, here=question.get("here") is True)
-            driver.again()
-
-        driver.call(carried_out)
-        return {}
-
-    def record(question: Mapping[str, Any]) -> object:
+    def record(question: Mapping[str, Any]) -> None:
         if not (bag := _text(question, "bag").strip()) and not cell.recording:
             raise InputError("bag = ''; allowed: a name, for the folder of the bag")
-        driver.call(lambda: cell.record(bag))
-        return {}
+        cell.record(bag)
 
-    return {
-        "about": lambda _: driver.call(lambda: about(cell)),
-        "act": act,
-        "change": change,
-        "record": record,
-    }
+    commands = {"about": lambda _: about(cell), "act": act, "change": change, "record": record}
+    return {name: _called(driver, command) for name, command in commands.items()}
 
 
 def _text(question: Mapping[str, Any], name: str) -> str:

@@ -258,7 +258,8 @@ class LiveCell:
         self._given = {name: scenario.value(name) for name in masters}  # checkpoint of a restart, if any
         self._changed: dict[str, Value] = {}  # parameters changed since the panel was opened
         self._begin(scenario)
-        self.view = View(self._types(), scenario.shared.step_ns, self._margin())
+        types = {topic: source.type for topic, source in {**self.cell.dense, **self.cell.sparse}.items()}
+        self.view = View(types, scenario.shared.step_ns, self._margin())
         self._remark()
 
     def _begin(self, scenario: Scenario) -> None:
@@ -276,9 +277,6 @@ class LiveCell:
         self.view.know(self.scenario)
         for text in [*self.cell.unchecked, *self.cell.warnings]:
             self.view.say(self.reached, "check", text)
-
-    def _types(self) -> dict[str, str]:
-        return {topic: source.type for topic, source in {**self.cell.dense, **self.cell.sparse}.items()}
 
     def _margin(self) -> float | None:
         known = [margin for margin in self.cell.margins.values() if margin is not None]
