@@ -12,16 +12,7 @@ from lathe_rc.errors import InputError
 _TARGETS = ("x86-64", "aarch64")  # those of lathe_rc.c_library.object_code, whose import takes a second
 
 
-class _BagUnlessNamed(click.Group):
-    """Group whose command ``bag`` need not be named."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, with ``bag`` before them if they name no command."""
-        named = not args or args[0] in (*self.commands, *ctx.help_option_names)
-        return super().parse_args(ctx, args if named else ["bag", *args])
-
-
-@click.group(cls=_BagUnlessNamed)
+@click.group(cls=options.GroupWithDefault, default="bag")
 def export() -> None:
     """Export a recording as tables, or stages of a scenario as a C library or FMU; without a command: a recording."""
 

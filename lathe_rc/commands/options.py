@@ -16,6 +16,25 @@ F = TypeVar("F", bound=Callable[..., Any])
 POSITIVE = click.FloatRange(min=0, min_open=True)
 PATH = click.Path(path_type=Path)
 
+
+class GroupWithDefault(click.Group):
+    """Group with a command that need not be named.
+
+    Args:
+        default: name of the command.
+        more: see `click.Group`.
+    """
+
+    def __init__(self, *, default: str, **more: Any) -> None:
+        super().__init__(**more)
+        self._default = default
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments, with the default command before them if they name none."""
+        named = not args or args[0] in (*self.commands, *ctx.help_option_names)
+        return super().parse_args(ctx, args if named else [self._default, *args])
+
+
 scenario = click.argument("scenario", shell_complete=completers.scenarios)
 bag = click.argument("bag", type=PATH)
 as_json = click.option("--json", "as_json", is_flag=True, help="print one JSON object")
@@ -36,14 +55,12 @@ def _allow(packages: Iterable[str]) -> None:
         allowed_code.allow(package)
 
 
-overrides = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="NODE.PARAM=VALUE",
-    shell_complete=completers.targets,
-    help="also PARAM=VALUE if shared",
-)
+def of_targets(*names: str, metavar: str, help: str) -> Callable[[F], F]:  # noqa: A002 - Click's name
+    """Return a repeatable option whose values begin with NODE.PARAM."""
+    return click.option(*names, multiple=True, metavar=metavar, shell_complete=completers.targets, help=help)
+
+
+overrides = of_targets("--set", "overrides", metavar="NODE.PARAM=VALUE", help="also PARAM=VALUE if shared")
 
 groups = click.option(
     "--group",
@@ -82,13 +99,7 @@ length = click.option("--revolutions", type=POSITIVE, help="length of each run")
 
 # --- sweep and tuning
 
-tie = click.option(
-    "--tie",
-    multiple=True,
-    metavar="NODE.PARAM=FORMULA",
-    shell_complete=completers.targets,
-    help="such as fine_controller.q_time*1.1",
-)
+tie = of_targets("--tie", metavar="NODE.PARAM=FORMULA", help="such as fine_controller.q_time*1.1")
 
 seeds = click.option(
     "--seeds", type=click.IntRange(1), default=1, show_default=True, help="each cell with so many seeds"
@@ -103,8 +114,18 @@ measures = click.option(
     + ", ".join(LOOP_FIGURES),
 )
 
-scheduler = click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine")
 
-workers = click.option(
-    "--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core"
-)
+def many_cells(folder: str) -> Callable[[F], F]:
+    """Return the last options of a command that computes many cells; ``folder``: default of ``--out``, in words."""
+    own = [
+        click.option("--out", type=PATH, help=f"folder of the results; default: {folder}"),
+        click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine"),
+        click.option("--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core"),
+    ]
+
+    def added(command: F) -> F:
+        for option in reversed([overrides, length, start_from, *own, allow_code, as_json]):
+            command = option(command)
+        return command
+
+    return added

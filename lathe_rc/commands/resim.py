@@ -18,7 +18,7 @@ from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for
 from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
-from lathe_rc.commands import completers, options, tables
+from lathe_rc.commands import options, tables
 from lathe_rc.errors import InputError
 
 _DIFFERENT = 1  # exit code if the results of an unchanged run differ from the recording
@@ -109,14 +109,7 @@ def _has_scenario(bag: Path) -> bool:
 
 @click.command()
 @options.bag
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="NODE.PARAM=VALUE",
-    shell_complete=completers.targets,
-    help="repeatable; not of the spindle",
-)
+@options.of_targets("--set", "overrides", metavar="NODE.PARAM=VALUE", help="repeatable; not of the spindle")
 @click.option("--controller", type=options.PATH, help="parameter file whose nodes replace the bag's")
 @click.option("--scenario", type=options.PATH, help="parameter file in place of the bag's scenario")
 @click.option(

@@ -26,21 +26,15 @@ def check_crew(scheduler: str | None, workers: int | None) -> None:
         raise InputError("--workers with --scheduler; allowed: one of them: a scheduler has its own workers")
 
 
-class _Sweep(click.Group):
+class _Sweep(options.GroupWithDefault):
     """Command group in which ``lathe sweep SCENARIO`` is short for ``lathe sweep run SCENARIO``."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Insert the omitted command name ``run``."""
-        if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
-            args = ["run", *args]
-        return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Complete commands and scenarios."""
         return [*super().shell_complete(ctx, incomplete), *completers.scenarios(ctx, None, incomplete)]
 
 
-@click.group(cls=_Sweep)
+@click.group(cls=_Sweep, default="run")
 def sweep() -> None:
     """Compute many variations of a scenario into a table: lathe sweep SCENARIO --vary NODE.PARAM=LOW:HIGH:COUNT."""
 
@@ -79,19 +73,11 @@ def space_of(
 
 @sweep.command()
 @options.scenario
-@click.option(
-    "--vary",
-    multiple=True,
-    metavar="NODE.PARAM=RANGE",
-    shell_complete=completers.targets,
-    help="LOW:HIGH:COUNT[:log] or A,B,C; % of the scenario's value",
+@options.of_targets(
+    "--vary", metavar="NODE.PARAM=RANGE", help="LOW:HIGH:COUNT[:log] or A,B,C; % of the scenario's value"
 )
-@click.option(
-    "--draw",
-    multiple=True,
-    metavar="NODE.PARAM=LAW",
-    shell_complete=completers.targets,
-    help="normal:DEVIATION, normal:MEAN:DEVIATION, uniform:LOW:HIGH",
+@options.of_targets(
+    "--draw", metavar="NODE.PARAM=LAW", help="normal:DEVIATION, normal:MEAN:DEVIATION, uniform:LOW:HIGH"
 )
 @options.tie
 @click.option(
@@ -110,14 +96,7 @@ def space_of(
     show_default=True,
     help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
 )
-@options.overrides
-@options.length
-@options.start_from
-@click.option("--out", type=options.PATH, help="folder of the results; default: sweep-SCENARIO")
-@options.scheduler
-@options.workers
-@options.allow_code
-@options.as_json
+@options.many_cells("sweep-SCENARIO")
 def run(
     scenario: str,
     vary: tuple[str, ...],

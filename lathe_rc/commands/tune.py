@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import lathe_rc
-from lathe_rc.commands import completers, options
+from lathe_rc.commands import options
 from lathe_rc.commands.sweep import check_crew, pairs, space_of
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import BATCH, NUMBERS, SAMPLERS
@@ -26,13 +26,7 @@ _STEPS = 5  # number of displayed steps of the history
 
 @click.command()
 @options.scenario
-@click.option(
-    "--free",
-    multiple=True,
-    metavar="NODE.PARAM=RANGE",
-    shell_complete=completers.targets,
-    help="LOW:HIGH[:log] or A,B,C; % of the scenario's value",
-)
+@options.of_targets("--free", metavar="NODE.PARAM=RANGE", help="LOW:HIGH[:log] or A,B,C; % of the scenario's value")
 @click.option(
     "--goal",
     "goals",
@@ -42,11 +36,9 @@ _STEPS = 5  # number of displayed steps of the history
     "as of --measure; repeatable",
 )
 @click.option("--subject", "subjects", multiple=True, metavar="COLUMN>=NUMBER", help="also <=; has to be met")
-@click.option(
+@options.of_targets(
     "--over",
-    multiple=True,
     metavar="NODE.PARAM=LAW",
-    shell_complete=completers.targets,
     help="plants and spindles that the goal is over: ranges, lists and laws as of lathe sweep --vary and --draw",
 )
 @options.tie
@@ -66,14 +58,7 @@ _STEPS = 5  # number of displayed steps of the history
 @click.option("--batch", type=click.IntRange(1), default=BATCH, show_default=True, help="trials asked for at once")
 @click.option("--no-formulas", is_flag=True, help="do not let what formulas give be trial 1")
 @options.measures
-@options.overrides
-@options.length
-@options.start_from
-@click.option("--out", type=options.PATH, help="folder of the results; default: tune-SCENARIO")
-@options.scheduler
-@options.workers
-@options.allow_code
-@options.as_json
+@options.many_cells("tune-SCENARIO")
 def tune(
     scenario: str,
     free: tuple[str, ...],
