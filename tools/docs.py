@@ -28,6 +28,11 @@ def build(folder: Path) -> list[str]:
     return [*MKDOCS, "build", "--strict", "--quiet", *CONFIG, "--site-dir", str(folder)]
 
 
+def run(command: Sequence[str], *, bare: bool = False) -> int:
+    """Run MkDocs and return the exit code."""
+    return subprocess.run(command, env=os.environ | QUIET | (BARE if bare else {}), check=False).returncode
+
+
 def archive(file: Path) -> int:
     """Write the site as one file, and return the exit code."""
     suffix = ".tar.gz"
@@ -39,7 +44,7 @@ def archive(file: Path) -> int:
         return 2
     name = file.name.removesuffix(suffix)
     with TemporaryDirectory() as folder:
-        code = subprocess.run(build(Path(folder) / name), env=os.environ | QUIET, check=False).returncode
+        code = run(build(Path(folder) / name))
         if code == 0:
             shutil.make_archive(str(file.absolute().with_name(name)), "gztar", folder, name)
             print(f"archive: {file} ({file.stat().st_size / 1e6:.1f} MB)")
@@ -60,17 +65,17 @@ def main(arguments: Sequence[str]) -> int:
         return pictures.main(chosen.figures)
     if chosen.check:
         with TemporaryDirectory() as folder:
-            return subprocess.run(build(Path(folder)), env=os.environ | QUIET | BARE, check=False).returncode
+            return run(build(Path(folder)), bare=True)
     if chosen.archive:
         return archive(chosen.archive)
     if chosen.build:
-        code = subprocess.run(build(chosen.build.absolute()), env=os.environ | QUIET, check=False).returncode
+        code = run(build(chosen.build.absolute()))
         if code == 0:
             print(f"site: {chosen.build}/index.html")
         return code
     serve = [*MKDOCS, "serve", *CONFIG, "--dev-addr", f"127.0.0.1:{chosen.port}"]
     with suppress(KeyboardInterrupt):  # that is how it ends
-        return subprocess.run(serve, env=os.environ | QUIET, check=False).returncode
+        return run(serve)
     return 0
 
 
