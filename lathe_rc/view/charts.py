@@ -21,6 +21,7 @@ import vl_convert
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from lathe_rc.messages import Samples
+from lathe_rc.view.pages import own_file
 
 Spec = dict[str, Any]
 Rows = list[dict[str, Any]]
@@ -59,7 +60,7 @@ def library() -> str:
 @cache
 def _light() -> Spec:
     """Return the Vega configuration `LOOK` with the colours of a light page."""
-    light = (_HERE / "page.css").read_text(encoding="utf-8").partition("@media")[0]
+    light = own_file("page.css").partition("@media")[0]
     colours = {name: value.split() for name, value in re.findall(r"(--[\w-]+): ([^;]+);", light)}
     text = re.sub(
         r'"(--[\w-]+)"', lambda found: json.dumps(c if len(c := colours[found[1]]) > 1 else c[0]), json.dumps(LOOK)
@@ -148,7 +149,7 @@ class Charts:
     @property
     def scripts(self) -> list[str]:
         """Return the scripts that draw the figures; empty if there are no figures."""
-        return [library(), (_HERE / "charts.js").read_text(encoding="utf-8")] if self.specs else []
+        return [library(), own_file("charts.js")] if self.specs else []
 
     @property
     def policy(self) -> str:

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.view.page_server import own_file
+from lathe_rc.view.pages import own_file
 
 Array = npt.NDArray[np.float64]
 

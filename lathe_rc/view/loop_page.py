@@ -18,7 +18,8 @@ from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
 from lathe_rc.view import block_diagram, loop_figures, report_loop
 from lathe_rc.view.charts import Charts, Spec, page_template
-from lathe_rc.view.page_server import Page, Site, own_file
+from lathe_rc.view.page_server import Page, Site
+from lathe_rc.view.pages import own_file
 
 Row = tuple[str, str, str]  # name, value, value with all digits
 _HERE = Path(__file__).parent

@@ -19,7 +19,6 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -30,11 +29,11 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.view.pages import own_file
 
 HOST = "127.0.0.1"  #: the only interface
 TOKEN = "X-Lathe-Token"  # noqa: S105 - the header with the token, which the scripts of a page send
 _LARGEST = 2**20  # request [B]
-_HERE = Path(__file__).parent
 _LOOSE = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 
 
@@ -85,11 +84,6 @@ class Site:
 
     pages: Mapping[str, Page]
     answers: Mapping[str, Answer] = field(default_factory=dict)
-
-
-def own_file(name: str) -> str:
-    """Return the text of a style sheet or script beside this module."""
-    return (_HERE / name).read_text(encoding="utf-8")
 
 
 def _document(site: Site, path: str, token: str, nonce: str) -> str:

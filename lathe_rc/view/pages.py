@@ -28,6 +28,11 @@ class Grid:
     texts: Sequence[str]
 
 
+def own_file(name: str) -> str:
+    """Return the text of a style sheet or script beside this module."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
 def printable(text: str, longest: int = _LONGEST_TEXT) -> str:
     """Return a string from a bag, truncated and reduced to printable characters, line ends and tabs."""
     cut = text[:longest] + (f" … ({len(text)} characters)" if len(text) > longest else "")

@@ -12,7 +12,8 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 from lathe_rc.safety import faults
-from lathe_rc.view.page_server import Answer, Download, Page, Site, own_file
+from lathe_rc.view.page_server import Answer, Download, Page, Site
+from lathe_rc.view.pages import own_file
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, View, news
