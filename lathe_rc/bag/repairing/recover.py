@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import name_of
-from lathe_rc.bag.repairing.salvage import Message, Salvage, Topic
-from lathe_rc.bag.writing.writer import BagWriter, ListedTopic, refuse_existing
+from lathe_rc.bag.repairing.salvage import Message, Salvage
+from lathe_rc.bag.writing.writer import BagWriter, Topic, refuse_existing
 from lathe_rc.errors import LatheError, shown
 
 _CHUNK = 2**20  # [B]
@@ -111,7 +111,7 @@ def _copy(salvages: Sequence[Salvage], writer: BagWriter, choice: Choice) -> Non
     channels: dict[Topic, int] = {}
 
     def announce(topic: Topic) -> int:
-        channels[topic] = writer.copy_channel(ListedTopic(*topic[:4]), topic.digest, (topic.schema, topic.channel))
+        channels[topic] = writer.copy_channel(topic)
         return channels[topic]
 
     def chosen(salvage: Salvage) -> Iterator[tuple[Salvage, Message]]:

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
-from rosbags.interfaces import Qos
 
 from lathe_rc import messages
 from lathe_rc.bag.reading import metadata
@@ -30,7 +29,7 @@ from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
-from lathe_rc.bag.writing.writer import definition
+from lathe_rc.bag.writing.writer import Topic, definition
 from lathe_rc.errors import InputError, shown
 
 ROS2 = "ros2"  #: profile of rosbag2 files
@@ -41,28 +40,6 @@ _PAGE = 4096  # bytes of a database reported as lost when SQLite does not state 
 _MOST_ID_BITS = 62  # maximum size of a row ID [bit]
 _MOST_DAMAGE = 1000  # maximum number of places reported
 _SCHEMALESS = "__schemaless__"  # type of messages without a schema, as in rosbags
-
-
-class Topic(NamedTuple):
-    """Channel of a bag; the byte fields hold the raw record contents, including the leading IDs.
-
-    Attributes:
-        name: name of the topic.
-        type: message type; may be empty.
-        encoding: serialization of the messages.
-        qos: profiles of the publishers, as far as they can be parsed.
-        digest: hash of the message type; may be empty.
-        schema: content of the schema record; None without a schema.
-        channel: content of the channel record.
-    """
-
-    name: str
-    type: str
-    encoding: str
-    qos: tuple[Qos, ...]
-    digest: str
-    schema: bytes | None
-    channel: bytes
 
 
 class Message(NamedTuple):

@@ -24,7 +24,6 @@ from lathe_rc.errors import InputError, LatheError
 
 Compression = Literal["zstd", "none"]
 Durability = Literal["volatile", "transient_local"]
-Records = tuple[bytes | None, bytes]
 
 FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they do not fill a chunk [s]
 _FOREVER = QosTime(9223372036, 854775807)
@@ -46,20 +45,26 @@ def _yaml(tree: Any) -> str:
     return str(yaml.dump(tree, None, _Dumper, default_flow_style=False, allow_unicode=True))
 
 
-class ListedTopic(NamedTuple):
-    """Topic as listed in the metadata of a bag; several channels of a file may share one entry.
+class Topic(NamedTuple):
+    """Channel of a bag; the byte fields hold the raw record contents, including the leading IDs.
 
     Attributes:
-        name: fully qualified topic.
+        name: name of the topic.
         type: message type; may be empty.
         encoding: serialization of the messages.
-        qos: profiles offered by the publishers.
+        qos: profiles of the publishers, as far as they can be parsed.
+        digest: hash of the message type; may be empty.
+        schema: content of the schema record; None without a schema.
+        channel: content of the channel record.
     """
 
     name: str
     type: str
     encoding: str
     qos: tuple[Qos, ...]
+    digest: str
+    schema: bytes | None
+    channel: bytes
 
 
 class Output(Protocol):
@@ -179,7 +184,8 @@ class BagWriter:
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
         self._about: dict[str, str] = {}
-        self._topics: dict[ListedTopic, tuple[str, list[int]]] = {}  # hash of the type, and channels
+        # Channels with equal name, type, encoding and QoS share an entry in the metadata: the first, and all numbers.
+        self._topics: dict[tuple[object, ...], tuple[Topic, list[int]]] = {}
         self._channels: dict[str, int] = {}  # channels of the written topics, by topic
         self._schemas: dict[bytes | None, int] = {}  # by content of the record
         try:
@@ -218,25 +224,19 @@ class BagWriter:
     def copy_topic(self, topic: str, msgtype: str, qos: Sequence[Qos], *, definition: str, digest: str) -> None:
         """Announce a topic of a type that this package may not know, with the text and hash of its definition."""
         said = {"offered_qos_profiles": _yaml(dump_qos_v9(list(qos))).strip(), "topic_type_hash": digest}
-        records = schema_content(msgtype, "ros2msg", definition.encode()), channel_content(topic, "cdr", said)
-        self._channels[topic] = self.copy_channel(ListedTopic(topic, msgtype, "cdr", tuple(qos)), digest, records)
+        schema, channel = schema_content(msgtype, "ros2msg", definition.encode()), channel_content(topic, "cdr", said)
+        self._channels[topic] = self.copy_channel(Topic(topic, msgtype, "cdr", tuple(qos), digest, schema, channel))
 
-    def copy_channel(self, topic: ListedTopic, digest: str, records: Records) -> int:
-        """Announce a topic with the schema and channel records of another bag, whether or not they can be decoded.
-
-        Args:
-            topic: metadata entry of the topic.
-            digest: hash of the message type; may be empty.
-            records: content of the schema record (None without a schema) and of the channel record.
+    def copy_channel(self, topic: Topic) -> int:
+        """Announce a topic, also of another bag, whether or not its records can be decoded.
 
         Returns:
             Channel number to pass to `copy`.
         """
-        schema, channel = records
-        if schema not in self._schemas:
-            self._schemas[schema] = self._file.add_schema(schema) if schema is not None else 0
-        number = self._file.add_channel(channel, self._schemas[schema])
-        self._topics.setdefault(topic, (digest, []))[1].append(number)
+        if topic.schema not in self._schemas:
+            self._schemas[topic.schema] = self._file.add_schema(topic.schema) if topic.schema is not None else 0
+        number = self._file.add_channel(topic.channel, self._schemas[topic.schema])
+        self._topics.setdefault(topic[:4], (topic, []))[1].append(number)
         return number
 
     def copy(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
@@ -340,13 +340,15 @@ class BagWriter:
     def _metadata(self) -> dict[str, Any]:
         """Return the bag metadata (version 9) with the message counts of the file."""
         parts = [*self._parts, self._part()]
-        counts = {
-            topic: sum(part.counts.get(number, 0) for part in parts for number in numbers)
-            for topic, (_, numbers) in self._topics.items()
-        }
+        counted = [
+            (topic, sum(part.counts.get(number, 0) for part in parts for number in numbers))
+            for topic, numbers in self._topics.values()
+        ]
         firsts = [part.first_ns for part in parts if part.first_ns is not None]
         lasts = [part.last_ns for part in parts if part.last_ns is not None]
-        whole = _Part("", dict(enumerate(counts.values())), min(firsts, default=None), max(lasts, default=None))
+        whole = _Part(
+            "", dict(enumerate(count for _, count in counted)), min(firsts, default=None), max(lasts, default=None)
+        )
         topics = [
             {
                 "topic_metadata": {
@@ -354,11 +356,11 @@ class BagWriter:
                     "type": topic.type,
                     "serialization_format": topic.encoding,
                     "offered_qos_profiles": dump_qos_v9(list(topic.qos)),
-                    "type_description_hash": digest,
+                    "type_description_hash": topic.digest,
                 },
-                "message_count": counts[topic],
+                "message_count": count,
             }
-            for topic, (digest, _) in self._topics.items()
+            for topic, count in counted
         ]
         return {
             "version": 9,
