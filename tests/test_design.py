@@ -22,7 +22,8 @@ DRIVE = {
     "mode_frequency": [5654.9, 10053.1], "mode_damping": [0.02, 0.02], "mode_participation": [0.02, 0.01],
 }  # fmt: skip
 OTHER = {**DRIVE, "natural_frequency": 1080.0, "mode_frequency": [5400.0, 10300.0], "mode_participation": [0.03, 0.01]}
-FAST = ["nominal_rpm=3000.0", "spindle_encoder.revolutions=30", "learning_controller.feedback_delay=640"]
+TURNS = "spindle_encoder.revolutions=30"
+FAST = [TURNS, "nominal_rpm=3000.0", "learning_controller.feedback_delay=640"]
 FAST += ["spindle_encoder.deviation_amplitude=[0.0]", "electrodynamic_actuator.max_acceleration=1000.0"]
 FAST += ["electrodynamic_actuator.noise_rms=50e-9", "spindle_encoder.counts_per_revolution=4096"]
 
@@ -71,7 +72,9 @@ def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
     names = ",".join(f"electrodynamic_actuator.{name}" for name in OTHER)
     (tmp_path / "drive.drives.csv").write_text(names + "\n" + ",".join(f'"{value}"' for value in OTHER.values()) + "\n")
     words = ["design", "piston", "--drive", "drive.yaml", "-o", "mine.yaml", "--json"]
-    done = CliRunner().invoke(main, [*words, *(word for each in FAST for word in ("--set", each))])
+    done = CliRunner().invoke(
+        main, [*words, *(word for each in FAST[1:] for word in ("--set", each)), "--revolutions", "16"]
+    )
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert (found["drives"], found["laws"][0]["law"]) == (2, "disturbance")
