@@ -35,6 +35,9 @@ class Listener:
         node: node in the namespace of the cell.
         live: view of the runs.
         over: returns True when nothing more is to be shown.
+
+    Attributes:
+        stopped: set from outside to end the work, after all received messages are shown.
     """
 
     def __init__(self, node: Node, live: LiveRuns, over: Callable[[], bool] = lambda: False) -> None:
@@ -43,11 +46,7 @@ class Listener:
         self._subscriptions: dict[str, tuple[Subscription, str]] = {}
         self._heard = self._heard_before = 0
         self._failure: LatheError | None = None
-        self._stop = False
-
-    def stop(self, *_: object) -> None:
-        """Stop after all received messages are shown; a signal handler."""
-        self._stop = True
+        self.stopped = threading.Event()
 
     def run(self) -> list[ShownRun]:
         """Show one run after the other until stopped.
@@ -63,7 +62,7 @@ class Listener:
         os.nice(_NICE)  # only this thread; the DDS threads keep their priority, and so lose fewer messages
         due = 0.0
         try:
-            while not (self._stop or self._over()):
+            while not (self.stopped.is_set() or self._over()):
                 if not shower.is_alive():
                     break
                 if (now := time.monotonic()) >= due:

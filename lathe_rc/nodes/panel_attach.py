@@ -25,7 +25,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.names import checked_namespace
 from lathe_rc.nodes.listener import Listener
-from lathe_rc.nodes.standalone_node import standalone_node
+from lathe_rc.nodes.standalone_node import set_by_signal, standalone_node
 from lathe_rc.nodes.topic_recorder import LISTENS
 from lathe_rc.view import page_server, panel
 from lathe_rc.view.page_server import Site
@@ -185,8 +185,7 @@ def attach(
         live.view.know(scenario)
         site = panel.with_loops(panel.attached_site(live.view, cell, asking), loop)
         listener = Listener(node, live)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, listener.stop)
+        set_by_signal(listener.stopped)
         try:
             with page_server.serving(site, port) as address:
                 page_server.announce(address, say, browser=browser)

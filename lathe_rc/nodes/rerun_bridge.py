@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Executable: the ``rerun_bridge``, which shows a running cell in Rerun without taking part in it (see `Listener`)."""
 
-import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -13,7 +12,7 @@ from lathe_rc.cell.beside import RERUN_BRIDGE as KIND
 from lathe_rc.cell.beside import RerunBridgeParameters
 from lathe_rc.nodes import arguments
 from lathe_rc.nodes.listener import Listener
-from lathe_rc.nodes.standalone_node import standalone_node
+from lathe_rc.nodes.standalone_node import set_by_signal, standalone_node
 from lathe_rc.view.live_runs import ShownRun
 from lathe_rc.view.rerun_live import Live
 from lathe_rc.view.rerun_output import Output, require
@@ -40,8 +39,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
         with output:
             live = Live(output.open, rate=parameters.rate, say=node.get_logger().info, scenario=known)
             bridge = Listener(node, live, lambda: output.ended or bool(parameters.once and live.shown))
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, bridge.stop)
+            set_by_signal(bridge.stopped)
             return bridge.run()
 
 
