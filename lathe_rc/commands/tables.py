@@ -29,9 +29,9 @@ def console(*, soft_wrap: bool = True) -> Console:
     return out
 
 
-def spread(whole: int, count: int = 10) -> list[int]:
-    """Return up to ``count`` indices below ``whole``, including the first and the last, denser at the beginning."""
-    return sorted({round(place) - 1 for place in np.geomspace(1, whole, count).tolist()})
+def spread(whole: int) -> list[int]:
+    """Return up to ten indices below ``whole``, including the first and the last, denser at the beginning."""
+    return sorted({round(place) - 1 for place in np.geomspace(1, whole, 10).tolist()})
 
 
 def broken(columns: Sequence[str], width: int) -> list[str]:

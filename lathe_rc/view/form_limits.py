@@ -28,9 +28,7 @@ class Finding:
     mood: str = ""
 
 
-def form_limits(
-    profiles: Samples, *, excess: float = 0.0, learning: bool = False, causes: Iterable[str] = ()
-) -> Iterator[Finding]:
+def form_limits(profiles: Samples, *, excess: float, learning: bool, causes: Iterable[str]) -> Iterator[Finding]:
     """Yield findings on the form error and on its repeatable and variable parts; none for fewer than 4 revolutions.
 
     Args:

@@ -88,7 +88,7 @@ def _at(curve: LoopCurve) -> int:
     return int(np.argmin(np.abs(curve.waves - max(curve.margin.waves, LEAST))))
 
 
-def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec, side: float = 0.0) -> Rows:
+def _worst(curve: LoopCurve, place: Rows, label: str, shade: Spec, side: float) -> Rows:
     """Return the mark of the least margin with its label, in the colour of another label.
 
     Args:

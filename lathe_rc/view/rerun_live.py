@@ -92,6 +92,6 @@ class Live(LiveRuns):
     """
 
     def __init__(
-        self, open_recording: Open, *, rate: float, say: Callable[[str], None], scenario: Scenario | None = None
+        self, open_recording: Open, *, rate: float, say: Callable[[str], None], scenario: Scenario | None
     ) -> None:
         super().__init__(lambda block, types: _RunView(block, types, open_recording, rate, say, scenario))

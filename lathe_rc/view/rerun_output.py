@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
 from lathe_rc import allowed_code, extras
-from lathe_rc.cell.beside import RERUN_PORT, RerunOutput
+from lathe_rc.cell.beside import RerunOutput
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def end_viewer(process: "subprocess.Popen[bytes]") -> None:
     process.wait()
 
 
-def viewer(kind: RerunOutput, port: int = RERUN_PORT) -> Viewer:
+def viewer(kind: RerunOutput, port: int) -> Viewer:
     """Return the viewer command for ``spawn`` or ``serve``.
 
     Args:
