@@ -12,7 +12,7 @@ counts as silent, whatever DDS reports.
 import os
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -61,9 +61,17 @@ def has_ended(member: Announcement) -> bool:
     except (OSError, OverflowError):  # no process number
         return False
     try:
-        return bool(select.select([process], [], [], 0)[0])
+        return bool(_readable([process]))
     finally:
         os.close(process)
+
+
+def _readable(processes: Iterable[int]) -> set[int]:
+    """Return those of the process descriptors whose process has ended."""
+    poll = select.poll()  # select.select refuses descriptors from 1024 on
+    for process in processes:
+        poll.register(process, select.POLLIN)
+    return {process for process, _ in poll.poll(0)}
 
 
 class Watch:
@@ -131,9 +139,5 @@ class Watch:
         """Return the members whose process on this machine has ended."""
         if not self._processes:
             return set()
-        poll = select.poll()
-        names = {}
-        for name, process in self._processes.items():
-            poll.register(process, select.POLLIN)
-            names[process] = name
-        return {names[process] for process, _ in poll.poll(0)}
+        ended = _readable(self._processes.values())
+        return {name for name, process in self._processes.items() if process in ended}
