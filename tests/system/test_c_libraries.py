@@ -63,14 +63,14 @@ def test_cmake_builds_both_libraries_and_the_example(tmp_path):
 def test_valgrind_finds_nothing(tmp_path):
     exported = export_nodes(load("piston"), ["learning_controller"], tmp_path / "law", samples=20_000)
     assert "ERROR SUMMARY: 0 errors" in told(
-        exported, "valgrind", "--error-exitcode=7", built(exported.place), samples=100_000
+        exported, "valgrind", "--error-exitcode=7", built(exported.place), samples=1_000_000
     )
 
 
 def test_the_address_sanitizer_finds_nothing(tmp_path):
     exported = export_nodes(load("full_cell"), place=tmp_path / "cell", samples=20_000)
     flags = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover"]
-    told(exported, built(exported.place, *flags), samples=200_000)
+    told(exported, built(exported.place, *flags), samples=1_000_000)
 
 
 @pytest.mark.parametrize(

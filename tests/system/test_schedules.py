@@ -12,7 +12,7 @@ from deliberate_faults import FAULTS
 from simulation import play
 
 pytestmark = pytest.mark.system
-SCHEDULES, PIECE = sized(50_000), 250
+SCHEDULES, PIECE = sized(100_000), 500
 
 
 def _broken(first: int) -> list[str]:
@@ -23,7 +23,7 @@ def _broken(first: int) -> list[str]:
 @pytest.mark.timeout(1500)
 def test_cells_keep_their_promises_under_many_schedules():
     with ProcessPoolExecutor() as pool:
-        broken = [text for texts in pool.map(_broken, range(1000, 1000 + SCHEDULES, PIECE)) for text in texts]
+        broken = [text for texts in pool.map(_broken, range(3000, 3000 + SCHEDULES, PIECE)) for text in texts]
     assert not broken, "\n".join(broken[:10])
 
 
