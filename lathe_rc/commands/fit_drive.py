@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-import numpy.typing as npt
 import yaml
 
 from lathe_rc import files
@@ -18,6 +17,7 @@ from lathe_rc.analysis import drive_measurement, frequency_response, modal_fit
 from lathe_rc.analysis.frequency_response import Hold
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.modal_fit import ModalFit, ResponseData, StepData
+from lathe_rc.arrays import Array
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture, tables
@@ -26,7 +26,6 @@ from lathe_rc.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 _NOTHING = 1e-6  # relative error of a model

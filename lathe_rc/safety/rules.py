@@ -14,7 +14,6 @@ import numpy.typing as npt
 from lathe_rc.arrays import Array, Integers, put
 from lathe_rc.jit import inlined, kernel
 
-Places = Integers
 Pulses = npt.NDArray[np.uint8]
 
 THRESHOLD, RATE, INDEX, GROWTH = range(4)  #: numbers of the rules in the table
@@ -266,10 +265,10 @@ class Watch(NamedTuple):
         values: value at that sample, shape (rules,).
     """
 
-    plan: Places
+    plan: Integers
     memory: Array
-    raised: Places
-    places: Places
+    raised: Integers
+    places: Integers
     values: Array
 
 

@@ -7,9 +7,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.view.pages import own_file
-
-Array = npt.NDArray[np.float64]
 
 
 @cache

@@ -12,8 +12,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.view.diverging import colours
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
-Array = npt.NDArray[np.float64]
-
 PITCH = 0.5e-3  #: distance of revolutions that lie at the same height [m]
 TYPES = {"stl": "model/stl", "glb": "model/gltf-binary"}  #: media types of the files, by ending
 _MM = 1e3

@@ -14,10 +14,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.arrays import Array
 from lathe_rc.cell.loops import Loop, loops, watches
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -29,8 +29,6 @@ from lathe_rc.view.form_limits import form_limits, varying_speed
 from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.rerun_part import Outlook, Scale
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
-
-Array = npt.NDArray[np.float64]
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]

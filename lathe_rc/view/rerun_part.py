@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lathe_rc.arrays import Array
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.time_master import TimeMasterParameters
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.view import diverging
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 
-Array = npt.NDArray[np.float64]
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
 

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from lathe_rc.analysis.metrology import undulations
+from lathe_rc.arrays import Array
 from lathe_rc.errors import LatheError
-
-Array = npt.NDArray[np.float64]
 
 ANGLES = 360  #: number of sectors in a revolution
 HIGHEST = 50  #: highest harmonic [UPR]
