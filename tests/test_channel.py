@@ -34,12 +34,12 @@ def test_loaded_memory_goes_on_where_it_was_saved(tmp_path):
     assert first.recording.sparse[EVENTS].values["action"] == ["save"]
 
 
-@settings(max_examples=8)
+@settings(max_examples=15)
 @given(st.floats(1.2, 3.4), cuts)
 def test_frozen_memory_survives_saving_and_loading_at_any_place(turns, lengths):
     """Every point of the newest cycle has its place, whatever the ring's length and wherever the spindle is."""
     before = int(turns * TURN / (SPEED * STEP))
-    lengths = [before, *(8 * n for n in lengths)]
+    lengths = [before, *(20 * n for n in lengths)]
     revolutions = (sum(lengths) + 0.5) * SPEED * STEP / TURN
     kept, renewed = make(q=exponential(0.0067)), make(q=exponential(0.0067))
 

@@ -123,11 +123,11 @@ BOTH = ["learning_controller", "electrodynamic_actuator"]
     ],
 )
 def test_nodes_in_plain_rclpy_take_part_in_a_cell(domain, tmp_path, foreign, together):
-    """The programs of examples/, alone and together, take part for 700 blocks, and do what their law says."""
-    long = {"revolutions": 12.0}
+    """The programs of examples/, alone and together, take part for 1000 blocks, and do what their law says."""
+    long = {"revolutions": 17.0}
     with cell(domain, tmp_path / "bag", foreign, together, spindle_encoder=long) as (processes, theirs):
         told = processes.wait_for_end()
-        assert told["complete"]["blocks"] >= 700
+        assert told["complete"]["blocks"] >= 1000
         said = {name: process.communicate()[0] for name, process in theirs.items()}
         assert {name: process.returncode for name, process in theirs.items()} == dict.fromkeys(foreign, 0), said
         log = "\n".join(processes._log("spindle_encoder"))

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 from cells import cuts
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from machines import assert_refused, refusals
@@ -105,7 +105,6 @@ def test_first_harmonic_is_the_describing_function(amplitude):
     assert harmonic / amplitude == pytest.approx(expected, abs=1e-6)
 
 
-@settings(max_examples=20)
 @given(bouc_wen_models(), paths)
 def test_bouc_wen_obeys_its_differential_equation(model, path):
     """dh = A·du - β·h·|du| - γ·|h|·du in steps of a thousandth of the path's own, by Heun's rule."""

@@ -91,7 +91,10 @@ FINE = {"fine_use_command": False, "fine_use_reference": True}
     ("one", "drive", "values"),
     [
         ("loaded_drive", "electrodynamic_actuator", {}),
-        ("loaded_series_drive", "series_drive", {**FINE, "fine_compensates": ["coarse"]}),
+        ("loaded_series_drive", "series_drive", FINE),
+        pytest.param(
+            "loaded_series_drive", "series_drive", {**FINE, "fine_compensates": ["coarse"]}, marks=pytest.mark.system
+        ),
     ],
 )
 def test_without_a_force_on_them_drives_and_their_cut_are_those_of_two_nodes(one, drive, values):
@@ -274,10 +277,10 @@ def chatter(machine, stiffness, period, samples, kick):
     return (made["position"] + made["extension"])[engagement:]
 
 
-@pytest.mark.parametrize("factor", [0.97, 1.03])
+@pytest.mark.parametrize("factor", [0.99, 1.01])
 @pytest.mark.parametrize("name", ["alone", "series"])
 def test_the_cut_chatters_beyond_the_limit_of_the_drive_s_compliance(name, factor):
-    """3 % below the limit a kick dies away, 3 % above it grows, as the characteristic root says."""
+    """1 % below the limit a kick dies away, 1 % above it grows, as the characteristic root says."""
     servo, stack = {**SERVO, "damping": 0.1}, {**STACK, "tool_damping": 0.05}
     formula = compliance(**servo) if name == "alone" else compliance_in_series(**SERVO, **stack)
     top = tuple(0.4 * each for each in formula.numerator)

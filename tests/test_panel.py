@@ -117,6 +117,12 @@ def test_a_run_with_the_panel_has_the_digests_of_one_without(opened, tmp_path):
             r"falls by [\d.]+% a revolution; in tolerance after some \d+ more",
         ),
         (
+            "learning_controller",
+            {"learning_gain": 0.9},
+            r"^\d+% .* repeats from revolution to revolution, most at 2 waves",
+        ),
+        ("electrodynamic_actuator", {"noise_rms": 1e-6}, r"^\d+% .* changes from revolution to revolution: noise\.$"),
+        (
             "electrodynamic_actuator",
             {"command_velocity": 5e-3},
             r"^electrodynamic_actuator is at the limits of its command",
@@ -124,7 +130,7 @@ def test_a_run_with_the_panel_has_the_digests_of_one_without(opened, tmp_path):
     ],
 )
 def test_the_panel_says_what_limits_the_form_error(opened, node, values, limit):
-    """As in the report from the last revolutions, and what limits a command now."""
+    """Learning, Q, noise and the limits of a command, in four variants of one cell."""
     shown = opened(cells.scenario(spindle_encoder={"revolutions": 30.2}, tool={"tolerance": 1e-9}, **{node: values}))
     shown.ask("start")
     assert re.search(limit, shown.until(lambda now: now["state"] == "ended")["limits"][0])

@@ -29,10 +29,10 @@ def test_error_falls_as_the_spec_says(step):
     assert errors[[0, 1, 3, 7]] == pytest.approx([0.105, 5.4e-3, 2.2e-3, 1.2e-3], rel=0.03)
 
 
-def test_coarse_steps_agree_with_fine_ones():
-    fine, *found = (simulate(Case(periods=4, step=size), NOMINAL).period_max_error for size in (2e-4, STEP, COARSEST))
-    for coarse, within in zip(found, (3e-3, 6e-3), strict=True):
-        assert coarse == pytest.approx(fine, rel=within)
+@pytest.mark.parametrize(("step", "within"), [(STEP, 3e-3), (COARSEST, 6e-3)])
+def test_coarse_steps_agree_with_fine_ones(step, within):
+    coarse, fine = (simulate(Case(periods=4, step=size), NOMINAL).period_max_error for size in (step, 2e-4))
+    assert coarse == pytest.approx(fine, rel=within)
 
 
 @pytest.mark.parametrize("step", [0.001, STEP])
@@ -53,7 +53,7 @@ def test_published_law_diverges_slowly_and_eq_15_shows_it(step):
     assert filtered.period_integral[-1] == pytest.approx(filtered.period_integral[0], rel=0.01)
 
 
-@pytest.mark.parametrize("periods", [105, pytest.param(400, marks=pytest.mark.system)])
+@pytest.mark.parametrize("periods", [120, pytest.param(400, marks=pytest.mark.system)])
 def test_filter_keeps_the_error_small_at_every_corner(periods):
     """The filter keeps the error below 1e-4 from period 100 on, at all 32 corners of the drive."""
     for drive in corners():
@@ -82,8 +82,8 @@ def test_quantisation_and_its_gains():
     published = simulate(Case(periods=100, step=STEP, quantisation=1e-4), NOMINAL).period_max_error
     assert 0.08 < published[50:].max() < 0.15
     for drive in corners():
-        case = Case(periods=35, step=COARSEST, quantisation=1e-4, gains=PRESETS["quantised"])
-        assert simulate(case, drive).period_max_error[25:].max() < 4e-4
+        case = Case(periods=60, step=COARSEST, quantisation=1e-4, gains=PRESETS["quantised"])
+        assert simulate(case, drive).period_max_error[30:].max() < 4e-4
 
 
 def test_json_has_what_was_asked_for(result):
@@ -99,7 +99,7 @@ def test_json_has_what_was_asked_for(result):
 
 
 def test_corners_are_named_and_the_worst_is_told():
-    result = STUDY.run(STUDY.parameters(corners=True, periods=2, step_ms=5.0, quantisation=1e-4, preset="quantised"))
+    result = STUDY.run(STUDY.parameters(corners=True, periods=2, quantisation=1e-4, preset="quantised"))
     rows = result.to_json()["corners"]
     assert np.array_equal([[row[name] for name in ("K", "a1", "a2", "a3", "a4")] for row in rows], corners())
     assert all(len(row["period_max_error"]) == 2 for row in rows)

@@ -75,7 +75,7 @@ def test_the_address_sanitizer_finds_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "nodes"),
-    [("robust", ["disturbance_controller"]), ("two_channel", [])],
+    [("piston", ["learning_controller"]), ("robust", ["disturbance_controller"]), ("two_channel", [])],
 )
 def test_64_bit_arm_has_the_bits_of_the_engine(name, nodes, tmp_path):
     """Cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""

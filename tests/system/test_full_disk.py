@@ -10,6 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from lathe_rc import messages
 from lathe_rc.bag.check import check
+from lathe_rc.bag.repairing.recover import recover
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.errors import LatheError
 
@@ -58,3 +59,11 @@ def test_a_disk_that_is_too_small_from_the_start_is_left_as_it_was(small_disk):
     with pytest.raises(LatheError, match=r"cannot write \(No space left on device\); make room"):
         BagWriter(small_disk / "bag", compression="none", chunk_size=2**16, about={"text": "ab\n" * 200_000})
     assert not list(small_disk.iterdir())
+
+
+@pytest.mark.parametrize("small_disk", ["4M"], indirect=True)
+def test_a_full_disk_ends_a_recovery_without_half_a_bag(small_disk):
+    fill(small_disk / "bag", {})
+    with pytest.raises(LatheError, match="No space left on device"):
+        recover(small_disk / "bag", small_disk / "new")
+    assert [path.name for path in small_disk.iterdir()] == ["bag"]

@@ -57,13 +57,16 @@ addEventListener("load", async () => {
 """
 
 
-def test_a_dragged_setting_shows_the_margins_and_errors_of_a_run_to_the_last_digit(tmp_path):
+@pytest.mark.parametrize(("width", "dark"), [(1440, False), (500, True)])
+def test_a_dragged_setting_shows_the_margins_and_errors_of_a_run_to_the_last_digit(tmp_path, width, dark):
     """And a refused one the refusal; the scenario that the page writes has the values of the page."""
     site = LoopPage(VariedLoop(load("piston"), 20.0), tmp_path / "dragged.yaml").site()
     script = _DRAG.replace("VALUES", "[0.003, 0.00139]")
     pages = {"": replace(site.pages[""], scripts=[*site.pages[""].scripts, script])}
     with serving(replace(site, pages=pages)) as address:
-        visit = Visit(address, tmp_path, "--window-size=500,900", "--blink-settings=preferredColorScheme=0")
+        visit = Visit(
+            address, tmp_path, f"--window-size={width},900", f"--blink-settings=preferredColorScheme={int(not dark)}"
+        )
     assert visit.console == []
     assert visit.requests == []
     refused, accepted, end = json.loads(html.unescape(re.search(r"<title>(.*)</title>", visit.document)[1]))

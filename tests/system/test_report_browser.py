@@ -151,15 +151,19 @@ frame.onload = () => setTimeout(() => {
 </script>"""
 
 
-def test_a_telephone_shows_the_page_in_the_dark_without_scrolling_sideways(page, tmp_path):
+@pytest.mark.parametrize(
+    ("scheme", "paper", "ink", "labels"),
+    [("0", "rgb(22, 24, 26)", "rgb(221, 221, 221)", "#a0a0a0"), ("1", "rgb(255, 255, 255)", "rgb(34, 34, 34)", "#666")],
+    ids=["dark", "light"],
+)
+def test_a_telephone_shows_the_page_without_scrolling_sideways(page, tmp_path, scheme, paper, ink, labels):
     frame = tmp_path / "frame.html"
     text = json.dumps(page.read_text(encoding="utf-8")).replace("<", "\\u003c")
     frame.write_text(_FRAME.replace("PAGE", text), encoding="utf-8")
-    visit = Visit(frame, tmp_path, "--blink-settings=preferredColorScheme=0")
+    visit = Visit(frame, tmp_path, f"--blink-settings=preferredColorScheme={scheme}")
     told = json.loads(html.unescape(re.search(r"<title>(.*)</title>", visit.document)[1]))
     assert told["width"] == told["frame"] >= 400  # less a scroll bar
-    assert (told["paper"], told["ink"]) == ("rgb(22, 24, 26)", "rgb(221, 221, 221)")
-    assert told["labels"] == ["#a0a0a0"]
+    assert (told["paper"], told["ink"], told["labels"]) == (paper, ink, [labels])
     assert len(told["charts"]) == FIGURES
     assert all(250 < width <= 420 for width in told["charts"])
 
