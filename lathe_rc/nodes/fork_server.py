@@ -40,7 +40,9 @@ def _load(nodes: dict[str, Any]) -> None:
 
 def _become(request: dict[str, Any], report: int, log: int) -> NoReturn:
     """Turn a freshly forked process into a process of a cell."""
-    os.setsid()
+    # A group of its own for signals, but no session: Linux schedules sessions against each other (sched_autogroup), and
+    # each message would preempt its sender.
+    os.setpgid(0, 0)
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"] | {VARIABLE: str(report)})
