@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of what a node has discarded, and messages and requests that no event announces."""
-
-from functools import partial
+"""The executor of a process: everything that arrives is handed over once, and nothing to what has been destroyed."""
 
 import pytest
 from cells import until
@@ -9,51 +7,19 @@ from cells import until
 pytest.importorskip("rclpy")
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.experimental.events_executor import EventsExecutor
 from std_msgs.msg import Empty, String
 from std_srvs.srv import Trigger
 
-from lathe_rc.nodes.executor import Events, drain_missed_messages
+from lathe_rc.nodes.executor import Events
 
 
 @pytest.fixture
-def watcher(ghost):
-    node = rclpy.create_node("watcher")
-    node.discarded = []
-    yield node
-    node.destroy_node()
-
-
-def test_an_event_of_what_has_been_discarded_is_dropped(ghost, watcher):
-    """Had it been destroyed at once, EventsExecutor would raise InvalidHandle, or crash the process."""
-    matched, discarded = [], []
-    publisher, go = ghost.create_publisher(Empty, "/watched", 1), ghost.create_publisher(Empty, "/go", 1)
-    events_of = SubscriptionEventCallbacks(matched=matched.append)
-    watched = watcher.create_subscription(Empty, "/watched", lambda _: None, 1, event_callbacks=events_of)
-
-    def discard(_):
-        if discarded:
-            return
-        watcher.discarded.append(partial(watcher.destroy_subscription, watched))
-        ghost.destroy_publisher(publisher)
-        until(lambda: not watched.get_publisher_count())  # from then on the event is on its way
-        discarded.append(True)
-
-    watcher.create_subscription(Empty, "/go", discard, 1)
-    events = Events([watcher])
-    until(lambda: matched, lambda: events.spin(0.1))
-
-    def call():
-        go.publish(Empty())
-        events.spin(0.1)
-
-    until(lambda: discarded, call)
-    heard = []
-    watcher.create_subscription(Empty, "/go", heard.append, 1)
-    until(lambda: heard, call)  # then the event has had its turn as well
-    assert len(matched) == 1
-    assert not watcher.discarded
+def node():
+    made = rclpy.create_node("spun", namespace="/haunted")
+    yield made
+    made.destroy_node()
 
 
 def answered(_, response):
@@ -62,40 +28,62 @@ def answered(_, response):
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_what_nobody_has_announced_is_handed_over_once(ghost, raw):
-    heard = []
-    reader = ghost.create_subscription(String, "told", heard.append, 10, raw=raw)
-    writer = ghost.create_publisher(String, "told", 10)
-    executor = EventsExecutor()
-    executor.add_node(ghost)
-    until(
-        lambda: reader.get_publisher_count() and writer.get_subscription_count(),
-        lambda: executor.spin_once(timeout_sec=0.01),
-    )
-    for word in ("one", "two"):
+def test_each_message_is_handed_over_once(ghost, node, raw):
+    heard, writer = [], ghost.create_publisher(String, "/told", 200)
+    node.create_subscription(String, "/told", heard.append, 200, raw=raw)
+    until(writer.get_subscription_count)
+    words = [f"{k:03}" for k in range(150)]  # more than are taken at a time
+    for word in words:
         writer.publish(String(data=word))
-    # Before the executor has looked, though it has been told
-    until(lambda: len(heard) >= 2, lambda: drain_missed_messages(ghost))
-    assert [bytes(each)[8:11] if raw else each.data.encode() for each in heard] == [b"one", b"two"]
-    for _ in range(10):
-        executor.spin_once(timeout_sec=0.0)
-    writer.publish(String(data="end"))
-    until(lambda: len(heard) >= 3, lambda: executor.spin_once(timeout_sec=0.1))
-    assert len(heard) == 3
-    executor.shutdown()
+    events = Events([node])
+    until(lambda: len(heard) >= len(words), lambda: events.spin(0.1))
+    events.spin(0.0)
+    assert [bytes(each)[8:11].decode() if raw else each.data for each in heard] == words
 
 
-def test_a_request_that_nobody_has_announced_is_answered(ghost):
-    ghost.create_service(Trigger, "ask", answered)
-    other = rclpy.create_node("asks", namespace="/haunted")
-    client = other.create_client(Trigger, "ask")
-    assert client.wait_for_service(60.0)
+def test_what_a_callback_has_destroyed_is_not_called(ghost, node):
+    """A message and an event of a subscription wait while another one's callback destroys it."""
+    matched, watched, gone = [], [], []
+    events_of = SubscriptionEventCallbacks(matched=matched.append)
+
+    def destroy(_):
+        if not gone:
+            gone.append(node.destroy_subscription(watcher))
+
+    node.create_subscription(Empty, "/go", destroy, 1)
+    watcher = node.create_subscription(Empty, "/watched", watched.append, 1, event_callbacks=events_of)
+    publisher, go = ghost.create_publisher(Empty, "/watched", 1), ghost.create_publisher(Empty, "/go", 1)
+    until(lambda: publisher.get_subscription_count() and go.get_subscription_count())
+    for each in (publisher, go):
+        each.publish(Empty())
+        assert each.wait_for_all_acked(Duration(seconds=60.0))  # from then on it is there, and the event, too
+    events = Events([node])
+    events.spin(0.0)
+    assert gone
+    heard = []
+    node.create_subscription(Empty, "/go", heard.append, 1)
+    until(lambda: heard, lambda: (go.publish(Empty()), events.spin(0.1)))
+    assert not watched
+    assert not matched
+
+
+def test_requests_and_events_have_their_turn_while_messages_keep_coming(ghost, node):
+    told, matched = ghost.create_publisher(Empty, "/flood", 1), []
+    node.create_subscription(Empty, "/flood", lambda _: told.publish(Empty()), 1)  # each message begets the next
+    node.create_service(Trigger, "ask", answered)
+    events = Events([node])
+    until(told.get_subscription_count)
+    told.publish(Empty())
+    client = ghost.create_client(Trigger, "ask")
+    until(client.service_is_ready, lambda: events.spin(0.1))
     answer = client.call_async(Trigger.Request())
+    late = SubscriptionEventCallbacks(matched=matched.append)
+    node.create_subscription(Empty, "/late", lambda _: None, 1, event_callbacks=late)
+    ghost.create_publisher(Empty, "/late", 1)
 
-    def look():
-        drain_missed_messages(ghost)  # nobody spins the one that answers
-        rclpy.spin_once(other, timeout_sec=0.01)
+    def turn():
+        events.spin(0.0)
+        rclpy.spin_once(ghost, timeout_sec=0.0)
 
-    until(answer.done, look)
+    until(lambda: answer.done() and matched, turn)
     assert answer.result().message == "here"
-    other.destroy_node()

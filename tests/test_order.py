@@ -73,8 +73,9 @@ def add(merger, message, *, with_bytes):
     topic, log_ns, data = message
     if topic in SPARSE:
         merger.add_sparse(topic, log_ns, data)
-        merger.release()
-    elif merger.add_block(topic, Decoder(KINDS[topic]).decode(data), data if with_bytes else None):
+    else:
+        merger.add_block(topic, Decoder(KINDS[topic]).decode(data), data if with_bytes else None)
+    if merger.ready:
         merger.release()
 
 
@@ -192,7 +193,8 @@ def test_blocks_that_do_not_fit_together_are_refused(tmp_path, blocks, why):
 
     def bring():
         for each in blocks:
-            if merger.add_block(topics[each.source][len(each.signals)], each):
+            merger.add_block(topics[each.source][len(each.signals)], each)
+            if merger.ready:
                 merger.release()
 
     with pytest.raises(LatheError, match=why):
@@ -204,7 +206,8 @@ def test_memory_does_not_grow_with_the_run(tmp_path):
     writer, merger = merger_of(tmp_path)
     for row in range(500):
         for topic in KINDS:
-            if merger.add_block(topic, block(topic, 8 * row, 8)):
+            merger.add_block(topic, block(topic, 8 * row, 8))
+            if merger.ready:
                 merger.release()
         assert len(merger._buffers) + len(merger._free) <= 2
     writer.close()

@@ -96,7 +96,7 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
         NotFiniteError: a sample is NaN or infinite; the error describes the first one.
     """
     # 0 times a finite number is 0, and NaN otherwise, so one product checks the whole block.
-    if array.dtype == np.float64 and np.dot(array, _ZEROS[: array.size]) != 0.0:
+    if array.dtype == np.float64 and array.dot(_ZEROS[: array.size]) != 0.0:
         bad = int(np.flatnonzero(~np.isfinite(array))[0])
         index = first + bad
         raise NotFiniteError(f"{source} sends {name} = {array[bad]} at sample {index}; allowed: finite numbers", index)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba.core.errors import NumbaError
 
 from lathe_rc.arrays import Integers
-from lathe_rc.compiled.struct_view import Struct, StructView, call
+from lathe_rc.compiled.struct_view import Struct, StructView, address, call
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.jit import cache_folder, kernel, read_kept
@@ -150,7 +150,7 @@ class CompiledStep:
         for place, array in zip(self._places, fields, strict=True):
             assert array.flags.c_contiguous, "kernels take it for contiguous"
             assert array.size == samples, "and as long as the block"
-            self._fields[place] = array.ctypes.data
+            self._fields[place] = address(array)
         self._reached[0] = BROKEN
         reason = _call(self.address, self.words, first, start, samples, self._fields, self._reached)
         if self._reached[0] == BROKEN:

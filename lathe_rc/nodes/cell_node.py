@@ -11,7 +11,6 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
-from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -48,6 +47,7 @@ _TICK = 0.02  # [s] between polls of the graph while members join
 _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
+_PROGRESS = f"{messages.PACKAGE}/msg/Progress"
 _MOST_DEFERRED = 8  # times the blocks in flight of each topic, until a node is ready and active
 
 T = TypeVar("T")
@@ -138,10 +138,7 @@ class CellNode(LifecycleNode):
         role: role of the node; None unless configured.
         outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
         due: messages have arrived since the last call of `work`.
-        handled: number of messages received so far.
         refused_messages: counter of rejected messages from outside the cell.
-        discarded: functions that destroy the publishers, subscriptions and services from before the clean-up; the
-            process calls them.
         next_tick: monotonic time of the next call of `tick` [s].
     """
 
@@ -161,13 +158,12 @@ class CellNode(LifecycleNode):
         self.reporter = reporter
         self.exchange = exchange
         self.next_tick = time.monotonic()
-        self.handled, self.due = 0, False
+        self.due = False
         self.full_name = self.get_fully_qualified_name()
         self.namespace = self.get_namespace().rstrip("/") + "/"
         self.refused_messages = RefusedMessages(self._report_refused)
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._endpoints_of_rclpy = self._endpoints()
-        self.discarded: list[Callable[[], object]] = []
         self._service_change_state.callback = self._refusing(self._service_change_state.callback)
         self._forget()
 
@@ -322,7 +318,8 @@ class CellNode(LifecycleNode):
             self.watch.close()
         destroyers: list[Any] = [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
         for before, now, destroy in zip(self._endpoints_of_rclpy, self._endpoints(), destroyers, strict=True):
-            self.discarded += [partial(destroy, endpoint) for endpoint in now - before]
+            for endpoint in now - before:
+                destroy(endpoint)
         declare.release(self, self.table.rows())
         self._forget()
 
@@ -430,15 +427,16 @@ class CellNode(LifecycleNode):
         if first and self.role is not None:
             self.role.failed()
 
-    def attempt(self, step: Callable[[], object]) -> None:
+    def attempt(self, step: Callable[..., object], *arguments: object) -> None:
         """Run a step whose error fails the node, then perform the protocol's pending actions."""
         try:
-            step()
+            step(*arguments)
         except ForeignMessage as refused:
             self._refuse(refused)
         except LatheError as error:
             self.fail(error)
-        self._perform_actions()
+        if self.protocol.actions:
+            self._perform_actions()
 
     def _look(self) -> None:
         """Pass the time, the state of the other members and the ROS graph to the protocol."""
@@ -544,7 +542,7 @@ class CellNode(LifecycleNode):
         if self.exchange.master:
             self.exchange.master(progress)
         if not self.exchange.master or self._read_elsewhere:
-            self._host["progress"].publish(ProgressMessage(**asdict(progress)))
+            self._host["progress"].publish(messages.encode(_PROGRESS, progress))
 
     def _wait_for_acknowledgement(self, publishers: Sequence[Publisher], patience: float) -> None:
         for publisher in publishers:
@@ -566,10 +564,9 @@ class CellNode(LifecycleNode):
         """
 
         def call(message: Any) -> None:
-            self.handled += 1
             self.due = True
             if self._host and (always or not self.protocol.failure):
-                self.attempt(partial(callback, message))
+                self.attempt(callback, message)
 
         return call
 
@@ -582,7 +579,8 @@ class CellNode(LifecycleNode):
 
         def call(message: Any) -> None:
             if self.protocol.active and not self._is_early():
-                self._take_up()
+                if self._deferred:
+                    self._take_up()
                 callback(message)
             elif self.protocol.active or self.table.window:
                 self._deferred.append((callback, message))

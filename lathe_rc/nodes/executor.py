@@ -1,68 +1,106 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Event loop of a process: waits for messages, requests and events of its nodes and calls their callbacks."""
+"""Executor of a process: takes the messages, requests and events of its nodes, and calls their callbacks."""
 
+import time
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 from rclpy.executors import Executor
-from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.ports import taken
-
 _MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
+_LOOK = 0.02  # [s] between looks at requests and events while messages keep coming: a look costs as much as 20 messages
+_SERIES = 0.1  # [s] after a request in which every wait is a look, so that a series of requests is answered at once
 
 
 class Events:
-    """Event executor of the nodes of a process.
+    """Executor of the nodes of a process, in place of rclpy's, which cost more than the messages themselves.
 
-    No publisher, subscription or service may be removed from EventsExecutor while it spins: the executor then drops
-    the entity's pending events without holding the interpreter's lock, which crashes the process
-    (rclpy's issue 1644). So discarded entities of a node are kept until the whole executor is replaced by a new one.
+    The messages that have arrived are taken without a wait. A process without any waits: for messages only if it has
+    looked at requests and events just now, otherwise for these as well.
 
     Args:
-        nodes: nodes of this process.
+        nodes: nodes of this process; they have no clients, timers and guard conditions.
     """
 
-    def __init__(self, nodes: Sequence[CellNode]) -> None:
+    def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
-        self._executor = self._made()
+        self._changed = True
+        self._look_due = self._series_end = 0.0
+        for node in nodes:
+            node.executor = cast("Executor", self)
 
-    def _made(self) -> Executor:
-        executor = EventsExecutor()
-        for node in self._nodes:
-            executor.add_node(node)
-        return executor
+    def add_node(self, node: Node) -> None:
+        """Accept a node; rclpy calls it when the node's executor is set."""
+
+    def wake(self) -> None:
+        """Note that a node has created or destroyed a publisher, subscription or service; rclpy calls it."""
+        self._changed = True
 
     def spin(self, wait: float) -> None:
-        """Wait for the next event, at most ``wait`` [s], and call its callback."""
-        # EventsExecutor.spin() hangs in Jazzy and Kilted; a loop of spin_once() works and reacts to signals.
-        self._executor.spin_once(timeout_sec=wait)
-        if any(node.discarded for node in self._nodes):
-            self._executor.shutdown()
-            for node in self._nodes:
-                while node.discarded:
-                    node.discarded.pop()()
-            self._executor = self._made()
+        """Call the callbacks of what has arrived; if no message has, wait for the next event, at most ``wait`` [s]."""
+        if self._changed:
+            self._list_endpoints()
+        taken, now = self._take(), time.monotonic()
+        if looks := now >= self._look_due or now < self._series_end:
+            self._look_due = now + _LOOK
+        if looks or not taken:
+            self._wait(0.0 if taken else wait if looks else min(wait, self._look_due - now), looks=looks)
+            self._take()
 
+    def _list_endpoints(self) -> None:
+        self._changed = False
+        self._inlets = [
+            (inlet, partial(cast("Any", inlet.handle).take_message, inlet.msg_type, inlet.raw))
+            for node in self._nodes
+            for inlet in node.subscriptions
+        ]
+        self._services = [service for node in self._nodes for service in node.services]
+        self._others: list[Any] = [waitable for node in self._nodes for waitable in node.waitables]
+        events = sum(other.get_num_entities().num_events for other in self._others)
+        sizes = (len(self._inlets), 0, 0, 0, len(self._services), events)
+        self._set = rclpy_implementation.WaitSet(*sizes, self._nodes[0].context.handle)
 
-def drain_missed_messages(node: Node) -> None:
-    """Process messages and requests of a node for which no event was raised; call this periodically.
+    def _take(self) -> bool:
+        """Take the messages that have arrived; return True if there were any."""
+        any_taken = False
+        for inlet, take in self._inlets:
+            for _ in range(_MOST):
+                if self._changed:  # the callback may have destroyed the subscription
+                    return any_taken
+                if (found := take()) is None:
+                    break
+                any_taken = True
+                inlet.callback(found[0])
+        return any_taken
 
-    When EventsExecutor adds a subscription or a service, rmw_fastrtps first counts the waiting messages and then sets
-    the callback for new ones (since its pull request 657). A message in between raises no event, and from then on each
-    event takes the previous message: the newest one waits for the next event. A cell that misses the last message
-    before the start blocks forever.
-    """
-    for subscription in [*node.subscriptions]:
-        for message, _ in taken(subscription, _MOST):
-            subscription.callback(message)
-    for service in [*node.services]:
-        kind: Any = service.srv_type  # rclpy's type hints lack its requests and responses
+    def _wait(self, wait: float, *, looks: bool) -> None:
+        """Wait for messages, and if this is a look, also for requests and events, whose callbacks are called."""
+        if self._changed:
+            return
+        ready, services, others = self._set, self._services if looks else (), self._others if looks else ()
+        ready.clear_entities()
+        for inlet, _ in self._inlets:
+            ready.add_subscription(inlet.handle)
+        places = [ready.add_service(service.handle) for service in services]
+        for other in others:
+            other.add_to_wait_set(ready)
+        ready.wait(round(wait * 1e9))
+        for other in [other for other in others if other.is_ready(ready)]:
+            if not self._changed:
+                other.callback(other.take_data())
+        for service, place in zip(services, places, strict=True):
+            if not self._changed and ready.is_ready("service", place):
+                self._answer(service)
+
+    def _answer(self, service: Any) -> None:
+        kind = service.srv_type
         with service.handle:
             for _ in range(_MOST):
                 request, header = service.handle.service_take_request(kind.Request)
                 if header is None:
-                    break
+                    return
                 service.send_response(service.callback(request, kind.Response()), header)
+                self._series_end = time.monotonic() + _SERIES

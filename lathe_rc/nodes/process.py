@@ -37,7 +37,7 @@ from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.encoder_role import EncoderRole
 from lathe_rc.nodes.exchange import Exchange
-from lathe_rc.nodes.executor import Events, drain_missed_messages
+from lathe_rc.nodes.executor import Events
 from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
@@ -48,7 +48,6 @@ _MESSAGES = (  # message and service types of the nodes, rclpy's own services in
     *("lifecycle_msgs.srv", "diagnostic_msgs.msg", "rosgraph_msgs.msg", "type_description_interfaces.srv"),
 )
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29  # from <linux/prctl.h>
-_LONGEST_BURST = 0.02  # [s] of taking messages until nodes compute
 _LONGEST_WAIT = 0.1  # [s] between checks of signals and the harness
 
 
@@ -138,21 +137,13 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT
-                for node in nodes:
-                    drain_missed_messages(node)
                 if reporter.orphaned:
                     return
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
-        events.spin(min(max(wait, 0.0), _LONGEST_WAIT))
-        # Take all messages that have arrived before computing: a burst of inputs becomes a burst of outputs, and
+        # All messages that have arrived are taken before computing: a burst of inputs becomes a burst of outputs, and
         # neighbours wake up once for all of it. The wake-up is the most expensive part of a hop.
-        # A flood must not block signals and neighbours.
-        handled, end = -1, time.monotonic() + _LONGEST_BURST
-        while handled < (handled := sum(node.handled for node in nodes)) and not stop.signal:
-            events.spin(0.0)
-            if time.monotonic() >= end:
-                break
+        events.spin(min(max(wait, 0.0), _LONGEST_WAIT))
         _work(nodes, stop, due)
 
 

@@ -334,7 +334,6 @@ class RecorderRole(Role):
             self._write(stamp, topic, data)
         else:
             self._merger.add_sparse(topic, stamp, data)
-            self._drain()
 
     def _on_message(self, queue: BlockQueue, data: bytes) -> None:
         """Record a block from a node in another process."""
@@ -347,8 +346,8 @@ class RecorderRole(Role):
         queue.blocks.clear()
         if self._merger is None:
             self._write_unsorted(queue, block, data)
-        elif self._merger.add_block(queue.topic, block, data):
-            self._drain()
+        else:
+            self._merger.add_block(queue.topic, block, data)
 
     def _on_run(self, queue: BlockQueue, run: Run) -> None:
         """Record blocks from a node in this process; their messages at chosen samples have arrived before."""
@@ -359,12 +358,10 @@ class RecorderRole(Role):
         whole = run.block
         if self._merger is not None:
             if len(run.companions) == 1:
-                ready = self._merger.add_block(queue.topic, whole)
+                self._merger.add_block(queue.topic, whole)
             else:
                 numbers = np.array(run.companions)
-                ready = self._merger.add_blocks(queue.topic, whole.first_index, whole.signals, numbers, last=whole.last)
-            if ready:
-                self._drain()
+                self._merger.add_blocks(queue.topic, whole.first_index, whole.signals, numbers, last=whole.last)
             return
         encoder = self._encoder(queue.type, whole.run_id, whole.source, whole.step_ns)
         for block in run.blocks(self.table.block_size):
@@ -389,8 +386,12 @@ class RecorderRole(Role):
         self.node.completed(self._blocks, self._samples, last=True)
         self.node.complete_part()
 
+    def work(self) -> None:
+        """Write the blocks that are complete on all topics (implements `Role`)."""
+        if self._merger is not None and self._merger.ready and not self.node.protocol.over:
+            self._drain()
+
     def _drain(self) -> None:
-        """Write every block that is complete on all topics."""
         assert self._merger is not None
         self._merger.release()
         self._log_ns, self._blocks = self._merger.log_ns, self._merger.rows
@@ -411,7 +412,7 @@ class RecorderRole(Role):
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
         if self._snapshots is not None and not complete:
             cause = f"{self.node.get_name()}: {self.node.protocol.failure or 'interrupted'}"
-            self.node.attempt(partial(self._snapshots.interrupt, cause))
+            self.node.attempt(self._snapshots.interrupt, cause)
         if self._merger is not None:
             self.node.attempt(self._merger.write_rest)
         try:

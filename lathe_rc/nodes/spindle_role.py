@@ -5,7 +5,6 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
 from typing import cast
 
 from lathe_rc_msgs.msg import Progress as ProgressMessage
@@ -283,7 +282,7 @@ class SpindleRole(StageRole):
         for _ in range(len(self._reported)):  # reports on blocks released here are processed later
             report = self._reported.popleft()
             self.node.due = self.node.due or bool(self._reported)  # after an error the rest follows in the next turn
-            self.node.attempt(partial(self.leads.hear_progress, report, time.monotonic()))
+            self.node.attempt(self.leads.hear_progress, report, time.monotonic())
         if self.inputs.ports and self.chain is None:
             self.release()  # feedback blocks may allow further releases
 

@@ -259,7 +259,7 @@ class StageRole(Role):
 
     def _keep_event(self, action: str, place: float) -> None:
         if self.restart is not None and not self.node.protocol.over:
-            self.node.attempt(partial(self.restart.keep_event, action, place))
+            self.node.attempt(self.restart.keep_event, action, place)
 
     @property
     def tunable(self) -> tuple[str, ...]:

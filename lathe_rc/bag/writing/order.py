@@ -84,8 +84,13 @@ class Merger:
 
     # ---- input ---------------------------------------------------------------------------------------
 
-    def add_block(self, topic: str, block: Block, data: bytes | None = None) -> bool:
-        """Add a block and return whether all topics have delivered the next row, so that `release` may write it.
+    @property
+    def ready(self) -> bool:
+        """Return whether all topics have delivered the next row, so that `release` may write it."""
+        return not self._late
+
+    def add_block(self, topic: str, block: Block, data: bytes | None = None) -> None:
+        """Add a block.
 
         Args:
             topic: fully qualified topic.
@@ -104,10 +109,10 @@ class Merger:
         source = self._topics[place].source
         if block.companions > self._written[source] and source not in self._lost:
             self._needs.append((row, source, block.companions))
-        return self._brought(place, row + 1)
+        self._brought(place, row + 1)
 
-    def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> bool:
-        """Add consecutive blocks whose sparse messages have all been added; return the same as `add_block`.
+    def add_blocks(self, topic: str, first: int, signals: Signals, companions: Samples, *, last: bool) -> None:
+        """Add consecutive blocks whose sparse messages have all been added.
 
         Args:
             topic: fully qualified topic.
@@ -133,7 +138,6 @@ class Merger:
             buffer.put_many(place, within, part, numbers, last=last and stop == samples)
             self._brought(place, row + count)
             done = stop
-        return not self._late
 
     def add_sparse(self, topic: str, log_ns: int, data: bytes) -> None:
         """Add a sparse message."""
@@ -184,13 +188,12 @@ class Merger:
         self._final = row
         self._finals += 1
 
-    def _brought(self, place: int, end: int) -> bool:
+    def _brought(self, place: int, end: int) -> None:
         # Only a topic that has not yet delivered the next row can complete it, so callers need not check all topics for
         # each block.
         if self._ends[place] == self.rows:
             self._late -= 1
         self._ends[place] = end
-        return not self._late
 
     def _find(self, row: int, samples: int) -> tuple[RowBuffer, int]:
         """Return the buffer of a row, and the row's index in this buffer."""
