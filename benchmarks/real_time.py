@@ -145,6 +145,7 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         except PermissionError as error:
             say(f"  {name}: not permitted here ({error.strerror})")
             settings[name] = {"permitted": False}
-    settings["single_threaded"] = told("SingleThreadedExecutor", paced(_SETTING, "processes", executor="single"))
+    single = "SingleThreadedExecutor"
+    settings["single_threaded"] = told(single, paced(_SETTING, "processes", executor=single))
     found["settings"] = settings
     return found

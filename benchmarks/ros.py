@@ -12,10 +12,10 @@ the 13 close within 64 samples, which excludes longer blocks. The figures are:
   drive, tool, recorder, spindle again. It includes the nodes' computing.
 
 References are the same cell with one message per sample (``benchmarks.naive.piston``), paced by a timer, which loses
-samples, or in lockstep; lathe_rc with a SingleThreadedExecutor (``benchmarks.naive.container``); and bare transport
-(``benchmarks.transport``): the processes of the piston, one per node, pass the bytes of the same messages along the
-same topics and compute nothing. ``bare_transport_ratio`` is the pace of the cell over that of bare transport, the limit
-of the middleware.
+samples, or in lockstep; lathe_rc with the executors of rclpy (``benchmarks.naive.container``); and bare transport
+(``benchmarks.transport``): the processes of the piston or the full cell, one per node, pass the bytes of the same
+messages along the same topics and compute nothing. ``bare_transport_ratio`` is the pace of the cell over that of bare
+transport, the limit of the middleware.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,9 +55,10 @@ _RATE = 64000  # [Hz]
 _ROUNDS, _BARE_ROUNDS, _QUICK_SHARE = 3, 7, 0.3
 _NAIVE = {"timer": (6000, 2000), "lockstep": (3000, 500)}  # samples by pace: in full, quick
 _PATIENCE = 60.0  # [s]
-#: Simulated revolutions of the piston beside bare transport, which takes a third of its time, by block size.
-_BARE = {64: 180, 256: 300, 1024: 450}
+#: Simulated revolutions beside bare transport, by scenario and block size.
+_BARE = {"piston": {64: 240, 256: 600, 1024: 900}, "full_cell": {64: 20}}
 _BARE_TARGET = 0.6
+_OF_RCLPY = ("EventsExecutor", "SingleThreadedExecutor")
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def figures(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _cells(
-    name: str, sizes: Sequence[int], arrangements: Sequence[str], rounds: int, say: Say, share: float = 1.0
+    name: str, sizes: Iterable[int], arrangements: Sequence[str], rounds: int, say: Say, share: float = 1.0
 ) -> dict[str, Any]:
     """A scenario for some block sizes, arranged in some ways, in turn."""
     found: dict[str, Any] = {}
@@ -187,7 +188,7 @@ def _cells(
 
 
 def _alone(scenario: Scenario) -> float:
-    """Real-time factor of the piston with one process a node."""
+    """Real-time factor with one process a node."""
     return run(scenario, partial(split, arrangement="processes")).real_time_factor
 
 
@@ -195,18 +196,18 @@ def _pace(transport: Transport) -> float:
     return transport.run().real_time_factor
 
 
-def _bare_transport(sizes: Sequence[int], rounds: int, say: Say, share: float = 1.0) -> dict[str, Any]:
-    """The piston, one process a node, beside its messages alone, by turns."""
+def _bare_transport(name: str, sizes: Iterable[int], rounds: int, say: Say, share: float = 1.0) -> dict[str, Any]:
+    """A scenario, one process a node, beside its messages alone, by turns."""
     found: dict[str, Any] = {}
     for size in sizes:
-        scenario = load("piston", block_size=size, spindle_encoder__revolutions=share * _BARE[size])
+        scenario = load(name, block_size=size, spindle_encoder__revolutions=share * _BARE[name][size])
         with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
             transport = Transport(harness.with_recorder(scenario, Path(folder) / "bag", keep=True), Path(folder))
             turns = {"cell": partial(_alone, scenario), "bare": partial(_pace, transport)}
             paces = sides.alternate(turns, rounds)
         ratio = sides.ratio(paces["cell"], paces["bare"])
-        say(f"  blocks of {size}: {ratio['median']:.2f} of the pace of bare transport")
-        found[f"block_{size}"] = {
+        say(f"  {name}, blocks of {size}: {ratio['median']:.2f} of the pace of bare transport")
+        found[f"{name}_block_{size}"] = {
             "cell_real_time_factor": sides.spread(paces["cell"]),
             "bare_real_time_factor": sides.spread(paces["bare"]),
             "bare_transport_ratio": ratio,
@@ -228,18 +229,17 @@ def _latency(rounds: int) -> dict[str, Any]:
 
 
 def _executors(rounds: int) -> dict[str, Any]:
-    """The piston with either executor."""
+    """The piston with our executor and those of rclpy."""
     scenario = load("piston", spindle_encoder__revolutions=REVOLUTIONS["piston"][64])
 
     def side(executor: str) -> float:
         with container(LATHE_BENCH_EXECUTOR=executor):
-            return run(scenario, partial(split, arrangement="processes")).real_time_factor
+            return _alone(scenario)
 
-    found = sides.alternate({each: partial(side, each) for each in ("events", "single")}, rounds)
+    found = sides.alternate({each or "own": partial(side, each) for each in ("", *_OF_RCLPY)}, rounds)
     return {
-        "events_real_time_factor": sides.spread(found["events"]),
-        "single_threaded_real_time_factor": sides.spread(found["single"]),
-        "events_over_single_threaded_ratio": sides.ratio(found["events"], found["single"]),
+        each: {"real_time_factor": sides.spread(paces), "own_ratio": sides.ratio(found["own"], paces)}
+        for each, paces in found.items()
     }
 
 
@@ -303,15 +303,17 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
         found["piston_5_nodes"] = _cells("piston", [64], ["processes", "composed"], 1, say, _QUICK_SHARE)
         ours = found["piston_5_nodes"]["block_64"]["processes"]["real_time_factor"]["median"]
         say("  bare transport")
-        found["bare_transport"] = _bare_transport([64], 1, say, _QUICK_SHARE)
+        found["bare_transport"] = _bare_transport("piston", [64], 1, say, _QUICK_SHARE)
         say("  a message a sample")
         return {**found, "naive": _naive(lambda: float(ours), quick=True)}
     arrangements = ["processes", "grouped", "composed"]
     for name, sizes in REVOLUTIONS.items():
         count = len(harness.with_recorder(load(name), Path("bag"), keep=True).nodes)
-        found[f"{name}_{count}_nodes"] = _cells(name, list(sizes), arrangements, _ROUNDS, say)
+        found[f"{name}_{count}_nodes"] = _cells(name, sizes, arrangements, _ROUNDS, say)
     say("  bare transport")
-    found["bare_transport"] = _bare_transport(list(_BARE), _BARE_ROUNDS, say)
+    found["bare_transport"] = {}
+    for name, sizes in _BARE.items():
+        found["bare_transport"] |= _bare_transport(name, sizes, _BARE_ROUNDS, say)
     say("  one block in flight")
     found["latency_per_hop_us"] = _latency(_ROUNDS)
     say("  executors")

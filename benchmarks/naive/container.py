@@ -1,21 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """`lathe_rc.nodes.container` as it is, but for what the environment asks for.
 
-LATHE_BENCH_EXECUTOR=single   a SingleThreadedExecutor in place of the EventsExecutor
+LATHE_BENCH_EXECUTOR=NAME     an executor of rclpy, EventsExecutor or SingleThreadedExecutor, in place of our own
 LATHE_BENCH_DURATIONS=FILE    how late each block was and how long it took are written there [s], not only counted
 """
 
 import atexit
 import os
+from collections.abc import Sequence
 
 import numpy as np
-import rclpy.executors
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
 
 from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.nodes import container, process
 from lathe_rc.protocol import pace, time_master
 
 EXECUTOR, DURATIONS = "LATHE_BENCH_EXECUTOR", "LATHE_BENCH_DURATIONS"
+
+
+class _OfRclpy:
+    """The executor that the environment names, in place of `lathe_rc.nodes.executor.Events`."""
+
+    def __init__(self, nodes: Sequence[Node]) -> None:
+        made = {"EventsExecutor": EventsExecutor, "SingleThreadedExecutor": SingleThreadedExecutor}
+        self._executor = made[os.environ[EXECUTOR]]()
+        for node in nodes:
+            self._executor.add_node(node)
+
+    def spin(self, wait: float) -> None:
+        """See `lathe_rc.nodes.executor.Events`."""
+        self._executor.spin_once(timeout_sec=wait)
 
 
 class _Kept(Durations):
@@ -43,8 +60,8 @@ def _keep(file: str) -> None:
 
 def main() -> None:
     """Run the nodes."""
-    if os.environ.get(EXECUTOR) == "single":
-        setattr(process, "EventsExecutor", rclpy.executors.SingleThreadedExecutor)  # noqa: B010 - it is only imported there
+    if os.environ.get(EXECUTOR):
+        setattr(process, "Events", _OfRclpy)  # noqa: B010 - it is only imported there
     if DURATIONS in os.environ:
         for module in (pace, time_master):
             setattr(module, "Durations", _Kept)  # noqa: B010 - likewise
