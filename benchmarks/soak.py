@@ -215,7 +215,6 @@ def stop(scale: int, random: Random) -> Mapping[str, Any]:
     return {
         "stops": count,
         "stalls_named": watch.seen["stall"],
-        "seen_by_the_harness_after_ms": _times(watch.witnessed),
         "samples": result.samples,
         "same_digest": result.digest == plain.digest,
         "failed": int(result.digest != plain.digest),

@@ -11,7 +11,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 _MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
-_LOOK = 0.02  # [s] between looks at requests and events while messages keep coming: a look costs as much as 20 messages
+# [s] between looks at requests and events while messages keep coming, by node and at most: a look costs as much as 20
+# messages of each node.
+_LOOK, _LONGEST_LOOK = 0.02, 0.1
 _SERIES = 0.1  # [s] after a request in which every wait is a look, so that a series of requests is answered at once
 
 
@@ -28,6 +30,7 @@ class Events:
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
         self._changed = True
+        self._look_period = min(_LOOK * len(nodes), _LONGEST_LOOK)
         self._look_due = self._series_end = 0.0
         for node in nodes:
             node.executor = cast("Executor", self)
@@ -44,11 +47,15 @@ class Events:
         if self._changed:
             self._list_endpoints()
         taken, now = self._take(), time.monotonic()
-        if looks := now >= self._look_due or now < self._series_end:
-            self._look_due = now + _LOOK
-        if looks or not taken:
-            self._wait(0.0 if taken else wait if looks else min(wait, self._look_due - now), looks=looks)
-            self._take()
+        looks = now >= self._look_due or now < self._series_end
+        if taken and not looks:
+            return
+        if looks:
+            self._look_due = now + self._look_period
+        else:
+            wait = min(wait, self._look_due - now)
+        self._wait(0.0 if taken else wait, looks=looks)
+        self._take()
 
     def _list_endpoints(self) -> None:
         self._changed = False
