@@ -295,6 +295,7 @@ class CellNode(LifecycleNode):
     def _begin_to_exchange(self) -> None:
         """Create the publishers and subscriptions of the protocol."""
         add = self.create_publisher
+        messages.encode(_PROGRESS, Progress("", "", 0, 0, 0))  # the first time takes 2 ms, too long for a running cell
         self._host = {
             "members": add(Member, "members", latched_qos(1)),
             "progress": add(ProgressMessage, "progress", latched_qos(1)),  # a late reader needs the newest one
@@ -579,8 +580,7 @@ class CellNode(LifecycleNode):
 
         def call(message: Any) -> None:
             if self.protocol.active and not self._is_early():
-                if self._deferred:
-                    self._take_up()
+                self._take_up()
                 callback(message)
             elif self.protocol.active or self.table.window:
                 self._deferred.append((callback, message))

@@ -48,7 +48,7 @@ class Events:
             self._list_endpoints()
         taken, now = self._take(), time.monotonic()
         looks = now >= self._look_due or now < self._series_end
-        if taken and not looks:
+        if self._changed or (taken and not looks):
             return
         if looks:
             self._look_due = now + self._look_period
@@ -85,8 +85,6 @@ class Events:
 
     def _wait(self, wait: float, *, looks: bool) -> None:
         """Wait for messages, and if this is a look, also for requests and events, whose callbacks are called."""
-        if self._changed:
-            return
         ready, services, others = self._set, self._services if looks else (), self._others if looks else ()
         ready.clear_entities()
         for inlet, _ in self._inlets:
