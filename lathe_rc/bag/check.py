@@ -135,13 +135,13 @@ def check(path: Path) -> Findings:
         InputError: the path is not a bag, or the bag is damaged and needs `lathe_rc.bag.repairing.recover`.
     """
     findings, digester = Findings(), Digester()
-    with Source(path) as source:
+    with Source(path, altered=True) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
         part, findings.first = span_of(source.about), first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {t: _Sparse(t, k, findings) for t, k in types.items() if k in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
-        findings.wrong += source.contradictions
+        findings.wrong += source.altered + source.contradictions
         findings.foreign = provenance.foreign(source.about)
         findings.unread = list(map(str, source.unread))
         for topic, log_ns, data in source.messages():

@@ -5,10 +5,11 @@ The memory and time for reading metadata are bounded. Settings missing from a Qo
 """
 
 import errno
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
+from itertools import zip_longest
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -16,9 +17,11 @@ import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from lathe_rc.bag.reading import limits
+from lathe_rc.errors import shown
 from lathe_rc.files import contents
 
 NAME = "metadata.yaml"
+_ROOT = "rosbag2_bagfile_information"
 
 Kind = TypeVar("Kind", bound=Enum)
 
@@ -51,6 +54,10 @@ class Metadata:
         span: first and last log time [ns]; None without messages.
         topics: topics by name.
         about: strings that the recorder added to the metadata.
+        count: number of messages.
+        counts: number of messages of each file, as far as stated.
+        tree: all content, in maps, lists and strings.
+        source: content of the file, in bytes; empty if the metadata are from elsewhere.
     """
 
     files: tuple[str, ...]
@@ -59,6 +66,10 @@ class Metadata:
     span: tuple[int, int] | None
     topics: Mapping[str, Topic]
     about: Mapping[str, str]
+    count: int
+    counts: Mapping[str, int]
+    tree: Mapping[str, Any]
+    source: bytes = b""
 
 
 def read(folder: Path) -> Metadata:
@@ -69,11 +80,23 @@ def read(folder: Path) -> Metadata:
         OSError: the metadata cannot be read.
     """
     try:
-        text = contents(folder / NAME, limits.MOST_METADATA).decode()
+        source = contents(folder / NAME, limits.MOST_METADATA)
     except OSError as error:
         most = f"; allowed: up to {limits.MOST_METADATA} B" if error.errno == errno.EFBIG else ""
         raise ValueError(f"{NAME}: {error.strerror}{most}") from None
-    bag = _of(read_yaml(text, NAME), "rosbag2_bagfile_information", dict)
+    return replace(_made(_of(read_yaml(source.decode(), NAME), _ROOT, dict)), source=source)
+
+
+def sealed(text: str) -> Metadata:
+    """Parse the copy of the metadata that a bag's seal contains.
+
+    Raises:
+        ValueError: see `read`.
+    """
+    return _made(_of({_ROOT: read_yaml(text, NAME)}, _ROOT, dict))
+
+
+def _made(bag: Mapping[str, Any]) -> Metadata:
     names = [PurePath(str(name)).name for name in _of(bag, "relative_file_paths", list)]
     files = tuple(dict.fromkeys(names))
     if len(files) > limits.MOST_FILES or not all(files):
@@ -81,8 +104,8 @@ def read(folder: Path) -> Metadata:
     mode, form = (str(bag.get(key, "")) for key in ("compression_mode", "compression_format"))
     if mode.lower() not in ("", "none") and (mode.lower() not in ("file", "message") or form != "zstd"):
         raise ValueError(f"{NAME}: compression {form[:64]!r} by {mode[:64]!r}; allowed: zstd, by file or message")
-    span = None
-    if _number(_of(bag, "message_count", str)):
+    span, count = None, _number(_of(bag, "message_count", str))
+    if count:
         first = _number(_of(_of(bag, "starting_time", dict), "nanoseconds_since_epoch", str))
         span = first, first + _number(_of(_of(bag, "duration", dict), "nanoseconds", str))
     custom = bag.get("custom_data")
@@ -94,7 +117,42 @@ def read(folder: Path) -> Metadata:
         span,
         _topics(_of(bag, "topics_with_message_count", list)),
         {key[:256]: text[: limits.MOST_TEXT] for key, text in texts if isinstance(text, str)},
+        count,
+        _counts(bag.get("files")),
+        bag,
     )
+
+
+def _counts(listed: object) -> dict[str, int]:
+    """Return the number of messages of each file that the metadata state; recorders before version 5 stated none."""
+    files = listed if isinstance(listed, list) else []
+    return {
+        PurePath(str(each.get("path"))).name: _number(_of(each, "message_count", str))
+        for each in files
+        if isinstance(each, dict) and "message_count" in each
+    }
+
+
+def differences(told: object, sealed: object, where: str = "") -> Iterator[str]:
+    """Yield the places at which the content of metadata.yaml is not the sealed one, with both values."""
+    if isinstance(told, dict) and isinstance(sealed, dict):
+        for key in dict.fromkeys([*sealed, *told]):
+            yield from differences(told.get(key), sealed.get(key), f"{where}.{key}" if where else str(key))
+    elif isinstance(told, list) and isinstance(sealed, list):
+        for number, pair in enumerate(zip_longest(told, sealed)):
+            yield from differences(*pair, f"{where}[{number}]")
+    elif told != sealed:
+        lines = zip_longest(_lines(told), _lines(sealed), fillvalue="")
+        now, before = next((pair for pair in lines if pair[0] != pair[1]), ("", ""))
+        yield f"{NAME}: {shown(where)} is {_short(now)}, sealed: {_short(before)}"
+
+
+def _lines(value: object) -> list[str]:
+    return value.splitlines() if isinstance(value, str) else [] if value is None else [f"a {type(value).__name__}"]
+
+
+def _short(line: str) -> str:
+    return repr(shown(line, 80)) if line.strip() else "nothing"
 
 
 def _topics(listed: list[object]) -> dict[str, Topic]:

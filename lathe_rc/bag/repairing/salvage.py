@@ -27,6 +27,7 @@ from lathe_rc.bag.reading.metadata import check_name, qos_of_text
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told, parsed
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
+from lathe_rc.bag.seal import LIBRARY, FileSeal, Seal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.bag.writing.writer import Topic, definition
@@ -70,7 +71,8 @@ class Salvage:
         copied: callback for the opcode and content of each attachment, and of metadata from other software.
         topics: all topics that can be copied.
         profile: profile of the MCAP files.
-        about: strings from the bag's metadata.
+        about: strings from the bag's metadata; those under its seal, once all messages have been read.
+        origin: in words, the seal of the bag or the lack of one; empty for bags of other recorders.
         damage: kind and location of the damage, one line per damaged place.
         lost_bytes: number of bytes in the files that yielded no message.
         saved: number of recovered messages, set by `recover`.
@@ -86,6 +88,7 @@ class Salvage:
     copied: Callable[[int, bytes], None] = lambda _opcode, _content: None
     topics: dict[Topic, None] = field(default_factory=dict)
     about: dict[str, str] = field(default_factory=dict)
+    origin: str = ""
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
     saved: int = 0
@@ -95,13 +98,15 @@ class Salvage:
     _described: int = 0  # total length of strings and definitions [characters]
     _counted: int | None = None  # number of messages stated in the file being read
     _ended: bool = True  # whether that file is complete
+    _seals: list[Seal] = field(default_factory=list)  # those that hold
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
         if not self._files:
             raise InputError(f"{self.path}: no bag; allowed: a folder with .mcap or .db3 files, or such a file")
         self._metadata = self._read_metadata()
-        self.profile = self._profile(self._files[0])
+        header = self._header(self._files[0])
+        self.profile, self._is_ours = header.profile, header.library == LIBRARY
 
     def _read_metadata(self) -> metadata.Metadata | None:
         """Return the metadata of a folder; None if they are missing or unreadable."""
@@ -115,16 +120,17 @@ class Salvage:
             return None
         return told
 
-    def _profile(self, file: Path) -> str:
-        """Return the profile of an MCAP file."""
+    def _header(self, file: Path) -> Header:
+        """Return the header of an MCAP file; that of a file of rosbag2 if there is none."""
+        unknown = Header(ROS2, "")
         if file.suffix != ".mcap":
-            return ROS2
+            return unknown
         with file.open("rb") as stream:
             size = min(file.stat().st_size, MOST_TEXT)
             first = next(iter(SoundRecords(stream, size, lambda _why, _lost: None)), None)
         if first is None or first.opcode != Opcode.HEADER:
-            return ROS2
-        return str(parsed(Header, first.content).profile)
+            return unknown
+        return parsed(Header, first.content)
 
     def __iter__(self) -> Iterator[Message]:
         """Yield the intact messages in the order of the files."""
@@ -146,6 +152,19 @@ class Salvage:
         told = sum(topic.count for topic in self._metadata.topics.values()) if self._metadata else None
         self._miss(metadata.NAME, told, read)
         self.lossy |= bool(self.missing or self.skipped) or not (complete or told == read)
+        self._take_seal()
+
+    def _take_seal(self) -> None:
+        """Replace the strings of the metadata by the sealed ones, if the bag has a seal that holds."""
+        last = max(self._seals, key=lambda each: len(each.checksums), default=None)
+        if last is None or len(last.checksums) < len(self._files):  # the last file was never closed
+            self.origin = "a bag without a seal that holds" if self._is_ours else ""
+            return
+        self.origin, sealed = f"the bag with seal {last}", metadata.sealed(last.text)
+        if self._metadata and not last.covers(self._metadata.source):
+            for what in metadata.differences(self._metadata.tree, sealed.tree):
+                self._tell(what)
+        self.about = dict(sealed.about)
 
     def _miss(self, name: str, counted: int | None, read: int) -> None:
         if counted is not None and counted > read:
@@ -225,10 +244,12 @@ class Salvage:
         with file.open("rb") as stream:
             sound = SoundRecords(stream, file.stat().st_size, told)
             sound.check_sums()
-            known, unchecked = _Definitions(self, sound), 0
+            known, unchecked, sealed = _Definitions(self, sound), 0, FileSeal()
             for record in () if sound.summary_wrong else sound.summary():
                 known.add(record.opcode, record.content, checked=record.checked)
             for record in sound:
+                with suppress(ValueError):
+                    sealed.take(record.opcode, record.content)
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = parsed(Statistics, record.content).message_count
                 for content, found in sound.inside(record):
@@ -243,6 +264,7 @@ class Salvage:
                             yield Message(topic, sequence, log_ns, publish_ns, content[begin:end])
                             unchecked += not record.checked
             known.finish()
+            self._seals += [sealed.seal] if sealed.seal else []
             self._ended = sound.ended
             if unchecked and sound.data_wrong:
                 self._tell(f"{file.name}: {unchecked} messages have no checksum of their own; some may be wrong")

@@ -18,6 +18,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from lathe_rc import messages
+from lathe_rc.bag import seal
 from lathe_rc.bag.writing.mcap_file import McapFile, channel_content, schema_content
 from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.errors import InputError, LatheError
@@ -127,12 +128,13 @@ def refuse_existing(path: Path) -> None:
 
 
 class _Part(NamedTuple):
-    """Completed file of a bag: name, messages by channel, smallest and largest log time [ns], None without messages."""
+    """File of a bag: name, messages by channel, first and last log time [ns], None without messages; data checksum."""
 
     name: str
     counts: Mapping[int, int]
     first_ns: int | None
     last_ns: int | None
+    checksum: int = 0
 
     def span(self) -> dict[str, Any]:
         """Return start, duration and number of messages as in the metadata of a bag."""
@@ -265,13 +267,12 @@ class BagWriter:
             following = f"{self._path.name}_{len(self._parts) + 1}.mcap"
             made = self._file.successor(self._path / following)
             made.add_metadata("lathe_rc", self._about)
-            self._file.free_room()
-            self._file.finish()
+            self._finish_file()
             self._parts.append(self._part())
             self._file, self._name, self._began_ns = made, following, log_ns
 
     def _part(self) -> _Part:
-        return _Part(self._name, self._file.counts, self._file.first_ns, self._file.last_ns)
+        return _Part(self._name, self._file.counts, self._file.first_ns, self._file.last_ns, self._file.checksum)
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to an announced topic.
@@ -324,18 +325,27 @@ class BagWriter:
 
     def _complete(self) -> None:
         """Write the index and metadata into the disk space reserved for them."""
-        tree = self._metadata()
         try:
-            self._file.free_room()
-            self._file.add_metadata("rosbag2", {"serialized_metadata": _yaml(tree).strip()}, last=True)
-            self._file.finish()
+            text = self._finish_file()
             beside = self._path / "metadata.yaml.tmp"
-            beside.write_text(_yaml({"rosbag2_bagfile_information": tree}), encoding="utf-8")
+            beside.write_bytes(text)
             beside.replace(self._path / "metadata.yaml")
         except OSError as error:
             raise LatheError(
                 f"{self._path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
             ) from None
+
+    def _finish_file(self) -> bytes:
+        """Seal the current file and complete it; return the content of metadata.yaml for a bag that ends with it."""
+        self._file.flush()
+        tree = self._metadata()
+        text = _yaml({"rosbag2_bagfile_information": tree}).encode()
+        checksums = tuple(part.checksum for part in (*self._parts, self._part()))
+        sealed = seal.Seal(_yaml(tree).strip(), checksums, seal.digest(text, checksums))
+        self._file.free_room()
+        self._file.add_metadata(seal.RECORD, sealed.record, last=True)
+        self._file.finish()
+        return text
 
     def _metadata(self) -> dict[str, Any]:
         """Return the bag metadata (version 9) with the message counts of the file."""
