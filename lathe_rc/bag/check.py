@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc import messages
+from lathe_rc import files, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
@@ -19,7 +19,6 @@ from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.files import contents, replacing
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness
 _MOST_FINDINGS = 20  # maximum number listed per topic
@@ -187,16 +186,18 @@ def recorded(path: Path) -> dict[str, str]:
     """Return the digests stored in a bag's folder by the harness; empty if there are none.
 
     Raises:
-        InputError: the file has an unexpected format.
+        InputError: the file is not as it was written.
     """
     file = path / DIGESTS
     if not path.is_dir() or not file.exists():
         return {}
     try:
-        told: Any = json.loads(contents(file, _MOST_DIGESTS))
+        content = files.contents(file, _MOST_DIGESTS)
+        files.unsealed(content)
+        told: Any = json.loads(content)
         return {str(topic): str(digest) for topic, digest in told["digest"].items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{file}: not what the harness writes; remove it") from None
+        raise InputError(f"{file}: damaged or changed since the run; remove it") from None
     except OSError as error:
         raise InputError(f"{file}: {error.strerror}; remove it") from None
 
@@ -217,7 +218,8 @@ def write_digests(path: Path, digest: Mapping[str, str]) -> None:
         LatheError: writing to the disk fails.
     """
     try:
-        with replacing(path / DIGESTS) as file:
-            file.write(json.dumps({"digest": dict(digest)}, indent=1).encode() + b"\n")
+        with files.replacing(path / DIGESTS) as file:
+            told = {"digest": dict(digest), "checksum": files.ROOM.decode()}
+            file.write(files.sealed(json.dumps(told, indent=1).encode() + b"\n"))
     except OSError as error:
         raise LatheError(f"{path / DIGESTS}: cannot write ({error.strerror}); the bag is complete without") from None

@@ -144,15 +144,12 @@ def differences(told: object, sealed: object, where: str = "") -> Iterator[str]:
     elif told != sealed:
         lines = zip_longest(_lines(told), _lines(sealed), fillvalue="")
         now, before = next((pair for pair in lines if pair[0] != pair[1]), ("", ""))
-        yield f"{NAME}: {shown(where)} is {_short(now)}, sealed: {_short(before)}"
+        now, before = ("missing" if value is None else repr(line[:80]) for value, line in ((told, now), (sealed, before)))
+        yield f"{NAME}: {shown(where)} is {now}, sealed: {before}"
 
 
 def _lines(value: object) -> list[str]:
     return value.splitlines() if isinstance(value, str) else [] if value is None else [f"a {type(value).__name__}"]
-
-
-def _short(line: str) -> str:
-    return repr(shown(line, 80)) if line.strip() else "nothing"
 
 
 def _topics(listed: list[object]) -> dict[str, Topic]:

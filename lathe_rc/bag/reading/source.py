@@ -262,9 +262,11 @@ class Source:
         if self.altered or not seals:
             return told
         self.seal = max(seals, key=lambda seal: len(seal.checksums))
-        sealed = metadata.sealed(self.seal.text)
-        if told and not self.seal.covers(told.source):
-            self.altered += metadata.differences(told.tree, sealed.tree)
+        if told and self.seal.covers(told.source):
+            sealed = told
+        else:
+            sealed = metadata.sealed(self.seal.text)
+            self.altered += metadata.differences(told.tree, sealed.tree) if told else []
         before = zip(sealed.files, self.seal.checksums[:-1], strict=False) if self.path.is_dir() else ()
         for name, checksum in before:
             if name not in files or files[name].sealed.checksum != checksum:
