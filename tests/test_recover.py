@@ -277,6 +277,17 @@ def test_copies_what_it_need_not_understand(tmp_path, profile):
     assert recover(tmp_path / "new", tmp_path / "again").saved == found.saved
 
 
+def test_a_hash_of_zeros_is_not_stated_in_the_metadata(tmp_path):
+    """A middleware that knows no hash of a type says so; rosbags would compare the zeros with the type's own hash."""
+    file, idl = tmp_path / "foreign.mcap", b"module my_msgs { module msg { struct Odd { int32 x; }; }; };"
+    with mcap_writer(file) as writer:
+        schema = writer.register_schema("my_msgs/msg/Odd", "ros2idl", idl)
+        channel = writer.register_channel("/odd", "cdr", schema, {"topic_type_hash": "RIHS01_" + "0" * 64})
+        writer.add_message(channel, 1, b"\0\1\0\0\7\0\0\0", 1)
+    recover(file, tmp_path / "new")
+    assert read_by_others(tmp_path / "new") == [("/odd", 1, b"\0\1\0\0\7\0\0\0")]
+
+
 LOGS = {
     "whole": lambda log: log,
     "cut": lambda log: log[:-5000],
@@ -616,6 +627,15 @@ def test_rows_that_are_no_messages_are_told(tmp_path):
         base.execute("UPDATE messages SET data = 'text' WHERE id = 3")
     found = recover(tmp_path / "bag", tmp_path / "new")
     assert (found.saved, found.skipped, found.lossy) == (len(sent) - 3, 3, True)
+
+
+@pytest.mark.parametrize("room", [0, 2**12])
+def test_a_full_disk_at_the_start_leaves_no_folder(tmp_path, room):
+    """So that the same command records once there is room, instead of refusing an existing folder."""
+    with files_up_to(room):
+        refused = lathe("run", "piston", "--revolutions", "2", "--bag", tmp_path / "bag")
+    assert (refused.exit_code in (1, 2), "(File too large)" in refused.stderr) == (True, True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_leaves_no_half_of_a_bag(tmp_path):

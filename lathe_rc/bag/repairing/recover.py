@@ -107,7 +107,7 @@ def _copied(
             writer.close()
         except BaseException:
             writer.abort()
-            shutil.rmtree(target)
+            shutil.rmtree(target, ignore_errors=True)  # a writer removes a bag of which nothing could be written
             raise
     except OSError as error:
         raise LatheError(f"{', '.join(map(str, paths))}: cannot be copied ({error.strerror or shown(error)})") from None

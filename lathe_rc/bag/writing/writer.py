@@ -28,6 +28,7 @@ Durability = Literal["volatile", "transient_local"]
 
 FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they do not fill a chunk [s]
 _FOREVER = QosTime(9223372036, 854775807)
+_UNKNOWN = 64 * "0"  # hash of a type from a middleware that has none; readers would compare it
 _NEVER = 2**63 - 1  # start of a bag without messages, as written by rosbags [ns]
 
 
@@ -184,27 +185,27 @@ class BagWriter:
                 path / self._name, chunk_size=chunk_size, compress=compression == "zstd", profile=profile
             )
         except OSError as error:
+            shutil.rmtree(path, ignore_errors=True)
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
+        self._is_gone = False  # the folder, of a bag whose first bytes could not be written
         self._about: dict[str, str] = {}
         # Channels with equal name, type, encoding and QoS share an entry in the metadata: the first, and all numbers.
         self._topics: dict[tuple[object, ...], tuple[Topic, list[int]]] = {}
         self._channels: dict[str, int] = {}  # channels of the written topics, by topic
         self._schemas: dict[bytes | None, int] = {}  # by content of the record
-        try:
-            self.tell(about)
-        except LatheError:
-            self.abort()
-            shutil.rmtree(path)
-            raise
+        self.tell(about)
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """Convert disk I/O errors into a one-line `LatheError`."""
+        """Convert disk I/O errors into a one-line `LatheError`, and remove a bag in which nothing is recorded yet."""
         try:
             yield
         except OSError as error:
-            is_empty = self._file.first_ns is None and not self._parts
-            before = "" if is_empty else "what was recorded before is readable: "
+            self._is_gone = self._file.first_ns is None and not self._parts
+            if self._is_gone:
+                self.abort()
+                shutil.rmtree(self._path, ignore_errors=True)
+            before = "" if self._is_gone else "what was recorded before is readable: "
             raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
 
     def tell(self, about: Mapping[str, str]) -> None:
@@ -325,6 +326,8 @@ class BagWriter:
 
     def _complete(self) -> None:
         """Write the index and metadata into the disk space reserved for them."""
+        if self._is_gone:
+            return
         try:
             text = self._finish_file()
             beside = self._path / "metadata.yaml.tmp"
@@ -366,7 +369,7 @@ class BagWriter:
                     "type": topic.type,
                     "serialization_format": topic.encoding,
                     "offered_qos_profiles": dump_qos_v9(list(topic.qos)),
-                    "type_description_hash": topic.digest,
+                    "type_description_hash": "" if topic.digest.endswith(_UNKNOWN) else topic.digest,
                 },
                 "message_count": count,
             }
