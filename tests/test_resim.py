@@ -140,10 +140,12 @@ def test_changes_that_cannot_be_are_refused(nodes, change, said):
     assert said in found.stderr
 
 
-def test_a_bag_without_a_scenario_says_what_is_missing(nodes, tmp_path):
-    shutil.copy(storage_of(nodes[0]), tmp_path / "alone.mcap")
+def test_a_lone_file_has_the_scenario_and_a_bag_without_one_says_what_is_missing(nodes, tmp_path):
+    bag = shutil.copytree(nodes[0], tmp_path / "bag")
+    assert resimulate(storage_of(bag)).different == []
+    retold(bag, dict.clear)
     with pytest.raises(InputError, match="the bag holds no scenario"):
-        resimulate(tmp_path / "alone.mcap")
+        resimulate(bag)
 
 
 @pytest.mark.parametrize("piece", [64, 1000, 65536])

@@ -39,6 +39,7 @@ class Findings:
         samples: number of samples of the dense topics, which all have the same length.
         first: first sample of a snapshot; 0 for a whole run.
         unread: topics that were not checked, because they are not ROS 2 topics.
+        origin: bags of which the bag was made, if it was not recorded.
     """
 
     wrong: list[str] = field(default_factory=list)
@@ -50,6 +51,7 @@ class Findings:
     samples: int = 0
     first: int = 0
     unread: list[str] = field(default_factory=list)
+    origin: list[str] = field(default_factory=list)
 
     @property
     def exit_code(self) -> int:
@@ -143,6 +145,7 @@ def check(path: Path) -> Findings:
         findings.wrong += source.altered + source.contradictions
         findings.foreign = provenance.foreign(source.about)
         findings.unread = list(map(str, source.unread))
+        findings.origin = provenance.origin(source.about)
         for topic, log_ns, data in source.messages():
             counts[topic] += 1
             if topic in dense:
