@@ -12,7 +12,7 @@ from sealed_bags import retold
 
 import lathe_rc
 from lathe_rc import messages
-from lathe_rc.bag import provenance, seal
+from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.errors import InputError
@@ -54,7 +54,9 @@ def other_run(name):
     """A file of another run in place of the bag's."""
 
     def change(bag):
-        shutil.copy(sealed_bags.made(bag.with_name("again") / "bag", learning_controller={"learning_gain": 0.5}) / name, bag)
+        shutil.copy(
+            sealed_bags.made(bag.with_name("again") / "bag", learning_controller={"learning_gain": 0.5}) / name, bag
+        )
 
     return change
 
@@ -73,7 +75,7 @@ def held(bag):
 
 def digits(indent):
     """One digit more in the first count that is indented like this."""
-    return metadata((b"\n%s\"message_count\": " % indent, b"\n%s\"message_count\": 1" % indent))
+    return metadata((b'\n%s"message_count": ' % indent, b'\n%s"message_count": 1' % indent))
 
 
 def base64(form):
@@ -137,8 +139,7 @@ def test_every_reader_refuses_a_changed_bag_with_one_line(bag, recorded, words, 
 
 def test_no_single_change_beside_the_data_changes_a_verdict_in_silence(bag):
     """Some bits, digits and lines of metadata.yaml, digests.json and the records; tests/system makes hundreds."""
-    commands = [command for command in sealed_bags.COMMANDS if command != ("resim",)]
-    sealed_bags.assert_none_is_silent(bag, 6, Random(20), *commands)  # noqa: S311
+    sealed_bags.assert_none_is_silent(bag, 3, Random(20), ("bag", "check"), ("measure",))  # noqa: S311
 
 
 def test_digests_of_another_run_are_another_verdict(bag):
@@ -147,14 +148,12 @@ def test_digests_of_another_run_are_another_verdict(bag):
 
 
 def test_without_metadata_the_sealed_copy_counts(bag):
-    """Each figure is as before, and what is missing is named."""
-    before = sealed_bags.verdicts(bag)
+    """Each figure is as before, and `check` names what is missing."""
+    before = sealed_bags.verdicts(bag, [("bag", "info")])
     (bag / "metadata.yaml").unlink()
-    after = sealed_bags.verdicts(bag)
-    assert "no metadata.yaml in that folder" in lathe("bag", "check", bag).stdout
-    assert {name: said for name, said in after.items() if name != "check"} == {
-        name: said for name, said in before.items() if name != "check"
-    }
+    assert sealed_bags.verdicts(bag, [("bag", "info")]) == before
+    checked = lathe("bag", "check", bag)
+    assert (checked.exit_code, "no metadata.yaml in that folder" in checked.stdout) == (1, True)
 
 
 def test_what_says_the_same_in_other_words_is_no_change(bag):
@@ -163,11 +162,10 @@ def test_what_says_the_same_in_other_words_is_no_change(bag):
     assert lathe("bag", "check", bag).exit_code == 0
 
 
-def test_a_bag_without_a_seal_is_named_unless_others_made_it(bag, monkeypatch):
-    """Of an earlier version of lathe_rc; `recover` seals a copy, which says so."""
-    monkeypatch.setattr(seal.Seal, "record", property(lambda sealed: {"serialized_metadata": sealed.text}))
-    old = sealed_bags.made(bag.with_name("old"))
-    monkeypatch.undo()
+def test_a_bag_of_an_earlier_version_has_no_seal_and_is_named(bag):
+    """`recover` makes a sealed copy, which says so."""
+    with sealed_bags.unsealed():
+        old = sealed_bags.made(bag.with_name("old"))
     with pytest.raises(InputError, match=r"old.mcap has no seal that holds: .* an earlier version"):
         Source(old)
     assert lathe("bag", "recover", old, "-o", bag.with_name("new")).exit_code == 0

@@ -216,7 +216,9 @@ def another(about: Mapping[str, str], key: str, said: str) -> dict[str, str]:
 
 def origin(about: Mapping[str, str]) -> list[str]:
     """Return the statements of a bag that was not recorded, but made of other bags."""
-    return [f"{word}: {shown(about[key])}" for key, word in ((RECOVERED, "recovered"), (COPIED, "copied")) if key in about]
+    return [
+        f"{word}: {shown(about[key])}" for key, word in ((RECOVERED, "recovered"), (COPIED, "copied")) if key in about
+    ]
 
 
 def namespace(about: Mapping[str, str]) -> str:

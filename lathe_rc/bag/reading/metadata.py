@@ -144,7 +144,9 @@ def differences(told: object, sealed: object, where: str = "") -> Iterator[str]:
     elif told != sealed:
         lines = zip_longest(_lines(told), _lines(sealed), fillvalue="")
         now, before = next((pair for pair in lines if pair[0] != pair[1]), ("", ""))
-        now, before = ("missing" if value is None else repr(line[:80]) for value, line in ((told, now), (sealed, before)))
+        now, before = (
+            "missing" if value is None else repr(line[:80]) for value, line in ((told, now), (sealed, before))
+        )
         yield f"{NAME}: {shown(where)} is {now}, sealed: {before}"
 
 
