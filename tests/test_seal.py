@@ -208,6 +208,16 @@ def test_recover_makes_a_bag_of_what_was_sealed(bag, recorded, tmp_path):
     assert told(tmp_path / "new")[1][provenance.SCENARIO] == told(recorded)[1][provenance.SCENARIO]
 
 
+def test_a_copy_of_a_bag_with_a_file_of_another_run_says_so(bag, tmp_path):
+    other_run("bag_1.mcap")(bag)
+    for words in (("copy",), ("recover",)):
+        found = lathe("bag", *words, bag, "-o", tmp_path / words[0])
+        assert (found.exit_code, "bag_1.mcap is not the file that was sealed" in found.stdout) == (3, True), (
+            found.output
+        )
+        assert ", of which files were exchanged" in "".join(provenance.origin(told(tmp_path / words[0])[1]))
+
+
 def test_a_recording_that_was_never_closed_has_no_seal(tmp_path):
     """A kill loses what the last file learned on the way; `recover` says so, and keeps what that file was told."""
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={"one": "1"})

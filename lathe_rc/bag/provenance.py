@@ -216,9 +216,8 @@ def another(about: Mapping[str, str], key: str, said: str) -> dict[str, str]:
 
 def origin(about: Mapping[str, str]) -> list[str]:
     """Return the statements of a bag that was not recorded, but made of other bags."""
-    return [
-        f"{word}: {shown(about[key])}" for key, word in ((RECOVERED, "recovered"), (COPIED, "copied")) if key in about
-    ]
+    words = {RECOVERED: "recovered", COPIED: "copied"}
+    return [f"{word}: {shown(about[key], 2000)}" for key, word in words.items() if key in about]
 
 
 def namespace(about: Mapping[str, str]) -> str:

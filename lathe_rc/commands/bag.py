@@ -81,6 +81,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             "topics": topics,
             "unread": [asdict(each) for each in source.unread],
             "about": dict(source.about),
+            "seal": source.seal.digest if source.seal else None,
             "contradictions": source.contradictions,
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
@@ -113,6 +114,8 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
         console.print(what)
     console.print(f"span: {span:.6g} s from {summary['start'] or format(summary['start_s'], '.6g') + ' s'} on")
     console.print(f"written: {summary['written']}")
+    if source.seal:
+        console.print(f"seal: {source.seal}")
     if summary["first_sample"]:
         console.print(f"recorded from sample {summary['first_sample']} of the run on")
     if summary["error_um"]:

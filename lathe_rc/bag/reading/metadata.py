@@ -5,11 +5,10 @@ The memory and time for reading metadata are bounded. Settings missing from a Qo
 """
 
 import errno
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
-from itertools import zip_longest
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -17,7 +16,6 @@ import yaml
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from lathe_rc.bag.reading import limits
-from lathe_rc.errors import shown
 from lathe_rc.files import contents
 
 NAME = "metadata.yaml"
@@ -125,33 +123,9 @@ def _made(bag: Mapping[str, Any]) -> Metadata:
 
 def _counts(listed: object) -> dict[str, int]:
     """Return the number of messages of each file that the metadata state; recorders before version 5 stated none."""
-    files = listed if isinstance(listed, list) else []
-    return {
-        PurePath(str(each.get("path"))).name: _number(_of(each, "message_count", str))
-        for each in files
-        if isinstance(each, dict) and "message_count" in each
-    }
-
-
-def differences(told: object, sealed: object, where: str = "") -> Iterator[str]:
-    """Yield the places at which the content of metadata.yaml is not the sealed one, with both values."""
-    if isinstance(told, dict) and isinstance(sealed, dict):
-        for key in dict.fromkeys([*sealed, *told]):
-            yield from differences(told.get(key), sealed.get(key), f"{where}.{key}" if where else str(key))
-    elif isinstance(told, list) and isinstance(sealed, list):
-        for number, pair in enumerate(zip_longest(told, sealed)):
-            yield from differences(*pair, f"{where}[{number}]")
-    elif told != sealed:
-        lines = zip_longest(_lines(told), _lines(sealed), fillvalue="")
-        now, before = next((pair for pair in lines if pair[0] != pair[1]), ("", ""))
-        now, before = (
-            "missing" if value is None else repr(line[:80]) for value, line in ((told, now), (sealed, before))
-        )
-        yield f"{NAME}: {shown(where)} is {now}, sealed: {before}"
-
-
-def _lines(value: object) -> list[str]:
-    return value.splitlines() if isinstance(value, str) else [] if value is None else [f"a {type(value).__name__}"]
+    files = (each for each in listed if isinstance(each, dict)) if isinstance(listed, list) else ()
+    told = ((PurePath(str(each.get("path"))).name, str(each.get("message_count"))) for each in files)
+    return {name: int(count) for name, count in told if count.isdecimal() and len(count) <= len(str(2**64))}
 
 
 def _topics(listed: list[object]) -> dict[str, Topic]:

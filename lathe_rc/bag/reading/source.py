@@ -25,6 +25,7 @@ from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
+from lathe_rc.bag.reading.sealed_metadata import compare
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
@@ -181,7 +182,8 @@ class Source:
             except _WRONG as error:
                 self.damage.append(f"{file.name}: {_reason(error)}")
         self._storages = [*by_name.values()]
-        told = self._sealed(told, by_name)
+        found = compare(told, {name: each.sealed for name, each in by_name.items()}, whole=self.path.is_dir())
+        self.seal, told, self.altered = found.seal, found.metadata, found.strangers + found.changes
         if told:
             self.about, self._packed = told.about, told.packed
         for storage in self._storages:
@@ -250,28 +252,6 @@ class Source:
             qos = before.qos if set(channel.qos) <= set(before.qos) else before.qos + channel.qos
             self.topics[channel.topic] = Topic(channel.type, qos, before.count + channel.count)
         self.unread = [Unread(*key, count) for key, count in unread.items()]
-
-    def _sealed(self, told: Metadata | None, files: Mapping[str, Storage]) -> Metadata | None:
-        """Return the sealed metadata, and note what differs from them; without a seal, return the metadata given."""
-        self.altered += [
-            f"{name} has no seal that holds: it was changed, never closed, or recorded by an earlier version"
-            for name, storage in files.items()
-            if storage.sealed.is_lacking
-        ]
-        seals = [storage.sealed.seal for storage in files.values() if storage.sealed.seal]
-        if self.altered or not seals:
-            return told
-        self.seal = max(seals, key=lambda seal: len(seal.checksums))
-        if told and self.seal.covers(told.source):
-            sealed = told
-        else:
-            sealed = metadata.sealed(self.seal.text)
-            self.altered += metadata.differences(told.tree, sealed.tree) if told else []
-        before = zip(sealed.files, self.seal.checksums[:-1], strict=False) if self.path.is_dir() else ()
-        for name, checksum in before:
-            if name not in files or files[name].sealed.checksum != checksum:
-                self.altered.append(f"{name} is not the file that was sealed under this name")
-        return sealed
 
     def _compare(self, told: Metadata, files: Mapping[str, Storage]) -> None:
         """Add the metadata that the files lack, and note where metadata and files contradict each other."""

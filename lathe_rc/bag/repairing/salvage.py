@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 
@@ -24,11 +25,12 @@ from lathe_rc import messages
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
+from lathe_rc.bag.reading.sealed_metadata import Agreement, compare
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told, parsed
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
-from lathe_rc.bag.seal import LIBRARY, FileSeal, Seal
+from lathe_rc.bag.seal import LIBRARY, FileSeal
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.bag.writing.writer import Topic, definition
 from lathe_rc.errors import InputError, shown
@@ -98,7 +100,7 @@ class Salvage:
     _described: int = 0  # total length of strings and definitions [characters]
     _counted: int | None = None  # number of messages stated in the file being read
     _ended: bool = True  # whether that file is complete
-    _seals: list[Seal] = field(default_factory=list)  # those that hold
+    _seals: dict[str, FileSeal] = field(default_factory=dict)  # by file
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
@@ -156,15 +158,18 @@ class Salvage:
 
     def _take_seal(self) -> None:
         """Replace the strings of the metadata by the sealed ones, if the bag has a seal that holds."""
-        last = max(self._seals, key=lambda each: len(each.checksums), default=None)
-        if last is None or len(last.checksums) < len(self._files):  # the last file was never closed
+        try:
+            found = compare(self._metadata, self._seals, whole=self.path.is_dir())
+        except ValueError:
+            found = Agreement(None, None)
+        if found.seal is None or found.metadata is None:
             self.origin = "a bag without a seal that holds" if self._is_ours else ""
             return
-        self.origin, sealed = f"the bag with seal {last}", metadata.sealed(last.text)
-        if self._metadata and not last.covers(self._metadata.source):
-            for what in metadata.differences(self._metadata.tree, sealed.tree):
-                self._tell(what)
-        self.about = dict(sealed.about)
+        for what in found.strangers + found.changes:
+            self._tell(what)
+        self.about = dict(found.metadata.about)
+        self.origin = f"the bag with seal {found.seal}" + ", of which files were exchanged" * bool(found.strangers)
+        self.lossy |= bool(found.strangers)
 
     def _miss(self, name: str, counted: int | None, read: int) -> None:
         if counted is not None and counted > read:
@@ -244,11 +249,12 @@ class Salvage:
         with file.open("rb") as stream:
             sound = SoundRecords(stream, file.stat().st_size, told)
             sound.check_sums()
-            known, unchecked, sealed = _Definitions(self, sound), 0, FileSeal()
+            known, unchecked = _Definitions(self, sound), 0
+            sealed = self._seals[file.name] = FileSeal()
             for record in () if sound.summary_wrong else sound.summary():
                 known.add(record.opcode, record.content, checked=record.checked)
             for record in sound:
-                with suppress(ValueError):
+                with suppress(ValueError, struct.error, EndOfFile):
                     sealed.take(record.opcode, record.content)
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = parsed(Statistics, record.content).message_count
@@ -264,7 +270,6 @@ class Salvage:
                             yield Message(topic, sequence, log_ns, publish_ns, content[begin:end])
                             unchecked += not record.checked
             known.finish()
-            self._seals += [sealed.seal] if sealed.seal else []
             self._ended = sound.ended
             if unchecked and sound.data_wrong:
                 self._tell(f"{file.name}: {unchecked} messages have no checksum of their own; some may be wrong")

@@ -147,6 +147,15 @@ class _Part(NamedTuple):
         }
 
 
+def _begun(path: Path, chunk_size: int, compression: Compression, profile: str) -> McapFile:
+    """Return the first file of a bag in a new folder, which is removed if the file cannot be created."""
+    try:
+        return McapFile(path, chunk_size=chunk_size, compress=compression == "zstd", profile=profile)
+    except OSError:
+        shutil.rmtree(path.parent, ignore_errors=True)
+        raise
+
+
 class BagWriter:
     """Writer of one bag.
 
@@ -181,11 +190,8 @@ class BagWriter:
         self._began_ns: int | None = None  # log time of the first message in the file
         try:
             path.mkdir(mode=0o755)
-            self._file = McapFile(
-                path / self._name, chunk_size=chunk_size, compress=compression == "zstd", profile=profile
-            )
+            self._file = _begun(path / self._name, chunk_size, compression, profile)
         except OSError as error:
-            shutil.rmtree(path, ignore_errors=True)
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
         self._is_gone = False  # the folder, of a bag whose first bytes could not be written
         self._about: dict[str, str] = {}
