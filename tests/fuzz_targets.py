@@ -29,7 +29,8 @@ from sealed_bags import unsealed
 from lathe_papers.formulas import step_fit
 from lathe_rc import data_file, files, harness, messages
 from lathe_rc.analysis import hysteresis_fit, reduced_order
-from lathe_rc.bag import check, provenance, reader, seal
+from lathe_rc.bag import check, provenance, reader
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.resimulation import resim

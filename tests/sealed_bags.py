@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap_damage import flipped, records_of
 
 from lathe_rc import harness
-from lathe_rc.bag import seal
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.errors import LatheError

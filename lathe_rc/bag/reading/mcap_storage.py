@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import MetadataIndex, Schema, Statistics
 
-from lathe_rc.bag import seal
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.chunk_messages import HEAD, Places, walk_whole
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, TooMuchError
 from lathe_rc.bag.reading.sound_records import MAGIC, Record, SoundRecords, parsed

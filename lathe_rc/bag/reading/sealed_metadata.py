@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of a bag's metadata and files with its seal (`lathe_rc.bag.seal`)."""
+"""Comparison of a bag's metadata and files with its seal (`lathe_rc.bag.reading.seal`)."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from itertools import islice, zip_longest
 
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.metadata import Metadata
-from lathe_rc.bag.seal import FileSeal, Seal
+from lathe_rc.bag.reading.seal import FileSeal, Seal
 from lathe_rc.errors import shown
 
 _MOST_CHANGES = 1000  # maximum number listed
@@ -18,7 +18,7 @@ class Agreement:
     """Agreement of a bag with its seal.
 
     Attributes:
-        seal: seal of the bag; None if it has none that holds.
+        seal: seal of the bag; None if no seal holds.
         metadata: the sealed metadata; without a seal, those of the bag's folder, if it has any.
         strangers: files that are not the sealed ones, or that lathe_rc wrote and that have no seal, one line each.
         changes: values in metadata.yaml that are not the sealed ones, one line each.

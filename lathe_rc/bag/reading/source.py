@@ -25,11 +25,11 @@ from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
+from lathe_rc.bag.reading.seal import Seal
 from lathe_rc.bag.reading.sealed_metadata import compare
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
-from lathe_rc.bag.seal import Seal
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
@@ -113,7 +113,7 @@ class Source:
         first_ns, last_ns: smallest and largest log time [ns]; both 0 if the bag is empty.
         contradictions: differences between the bag's metadata and its files, one line each; the files take precedence.
         damage: unreadable parts, one line each; empty unless ``partial``.
-        seal: seal of the bag; None if it has none that holds.
+        seal: seal of the bag; None if no seal holds.
         altered: differences from what was sealed when the bag was closed, one line each; also that a bag of lathe_rc
             has no seal. Empty unless ``partial`` or ``altered``.
 

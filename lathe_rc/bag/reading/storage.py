@@ -10,8 +10,8 @@ from rosbags.interfaces import Qos
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.limits import MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
+from lathe_rc.bag.reading.seal import FileSeal
 from lathe_rc.bag.reading.unpacking import Budget
-from lathe_rc.bag.seal import FileSeal
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 

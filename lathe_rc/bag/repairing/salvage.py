@@ -25,12 +25,12 @@ from lathe_rc import messages
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
+from lathe_rc.bag.reading.seal import LIBRARY, FileSeal
 from lathe_rc.bag.reading.sealed_metadata import Agreement, compare
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told, parsed
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
 from lathe_rc.bag.reading.unpacking import unpack, unpack_file, unpacked_size
-from lathe_rc.bag.seal import LIBRARY, FileSeal
 from lathe_rc.bag.writing.mcap_file import channel_content, schema_content
 from lathe_rc.bag.writing.writer import Topic, definition
 from lathe_rc.errors import InputError, shown

@@ -26,7 +26,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag import seal
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time

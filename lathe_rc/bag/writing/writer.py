@@ -18,7 +18,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from lathe_rc import messages
-from lathe_rc.bag import seal
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.writing.mcap_file import McapFile, channel_content, schema_content
 from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.errors import InputError, LatheError

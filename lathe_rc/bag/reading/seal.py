@@ -63,7 +63,7 @@ class FileSeal:
     Attributes:
         library: library that wrote the file, as its header states.
         checksum: checksum of the file's data, as the file states it; 0 if it states none.
-        seal: seal of the bag as of the end of the file; None if there is none that holds.
+        seal: seal of the bag as of the end of the file; None if no seal holds.
     """
 
     library: str = ""
