@@ -17,6 +17,7 @@ import pytest
 import yaml
 from bags import lathe
 from cells import scenario
+from sealed_bags import retold
 
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.bag import provenance
@@ -69,16 +70,18 @@ class Received:
             (place / f"{self.module}.py").write_text(text)
 
     def change(self, node="", about=None, **values):
-        """Let the bag's metadata give other values to a node, and hold other texts."""
-        file = self.bag / "metadata.yaml"
-        whole = yaml.safe_load(file.read_text())
-        texts = whole["rosbag2_bagfile_information"]["custom_data"]
-        tree = yaml.safe_load(texts[provenance.SCENARIO])
-        if node:
-            tree.setdefault(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"].update(values)
-        texts[provenance.SCENARIO] = yaml.safe_dump(tree)
-        texts.update(about or {})
-        file.write_text(yaml.safe_dump(whole))
+        """Let the bag give other values to a node, and hold other texts or lack some (None), sealed by its maker."""
+
+        def change(texts):
+            tree = yaml.safe_load(texts[provenance.SCENARIO])
+            if node:
+                tree.setdefault(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"].update(values)
+            texts[provenance.SCENARIO] = yaml.safe_dump(tree)
+            texts.update(about or {})
+            for key in [key for key, text in texts.items() if text is None]:
+                del texts[key]
+
+        retold(self.bag, change)
 
     def scenario(self, place, node, **values):
         """Write the bag's scenario to a file, with other values."""
@@ -160,10 +163,7 @@ def test_other_metadata_of_a_bag_names_no_code(received, key):
 
 
 def test_a_bag_whose_scenario_is_none_is_still_read(received):
-    file = received.bag / "metadata.yaml"
-    whole = yaml.safe_load(file.read_text())
-    whole["rosbag2_bagfile_information"]["custom_data"][provenance.SCENARIO] = "- no nodes"
-    file.write_text(yaml.safe_dump(whole))
+    received.change(about={provenance.SCENARIO: "- no nodes"})
     for word in ("info", "check"):
         found = lathe("bag", word, received.bag)
         assert (found.exit_code, "no nodes; allowed" in found.stdout) == (0, True), found.output
@@ -319,10 +319,10 @@ def test_no_file_that_a_bag_names_gets_into_the_new_bag(received, node, place):
     """The copy is of no file of the user's; a memory, which a run writes, begins anew."""
     named = str(received.secret) if place == "absolute" else "../" * 40 + str(received.secret).lstrip("/")
     key = {"learning_controller": "memory_file", "tool": "profile_file"}[node]
-    received.change(node, **{key: named}, about={f"lathe_rc.file.{node}.{key}_": ""})
+    about = {f"lathe_rc.file.{node}.{key}_": ""}
     if node == "tool":
-        file = received.bag / "metadata.yaml"
-        file.write_text(file.read_text().replace("lathe_rc.file.tool.profile_file:", "lathe_rc.file.tool.other:"))
+        about = {"lathe_rc.file.tool.profile_file": None, "lathe_rc.file.tool.other": ""}
+    received.change(node, **{key: named}, about=about)
     assert f"{node}.{key} names a file that the bag does not hold, " in lathe("bag", "check", received.bag).stdout
     found = lathe("resim", received.bag, "-o", "new")
     if node == "tool":

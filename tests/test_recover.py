@@ -33,7 +33,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from lathe_rc import harness, messages
-from lathe_rc.bag.check import check
+from lathe_rc.bag.check import check, recorded, write_digests
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing.recover import recover
@@ -96,14 +96,12 @@ def test_a_broken_chunk_in_the_middle_costs_that_chunk_alone(turned, tmp_path):
 def test_what_is_clean_is_said_to_be_clean(turned, tmp_path):
     """And another digest than the recorded one is wrong."""
     told = json.loads(lathe("bag", "check", turned, "--json").stdout)
-    recorded = json.loads((turned / "digests.json").read_text())
-    assert told["digest"] == recorded["digest"]
+    assert told["digest"] == recorded(turned)
     assert told["digests_compared"] == len(told["digest"]) == 9
     again = lathe("bag", "recover", turned, "-o", tmp_path / "new")
     assert again.exit_code == 0, again.stdout
     assert check(tmp_path / "new").digests == told["digest"]
-    recorded["digest"]["/tool"] = "0" * 64
-    (tmp_path / "new" / "digests.json").write_text(json.dumps(recorded))
+    write_digests(tmp_path / "new", told["digest"] | {"/tool": "0" * 64})
     found = lathe("bag", "check", tmp_path / "new")
     assert (found.exit_code, "/tool: digest " in found.stdout) == (1, True)
 
@@ -277,6 +275,17 @@ def test_copies_what_it_need_not_understand(tmp_path, profile):
     assert (found.saved, found.lossy) == (2 * len(KINDS), False)
     assert records_of(storage_of(tmp_path / "new")) == records_of(file)
     assert recover(tmp_path / "new", tmp_path / "again").saved == found.saved
+
+
+def test_a_hash_of_zeros_is_not_stated_in_the_metadata(tmp_path):
+    """A middleware that knows no hash of a type says so; rosbags would compare the zeros with the type's own hash."""
+    file, idl = tmp_path / "foreign.mcap", b"module my_msgs { module msg { struct Odd { int32 x; }; }; };"
+    with mcap_writer(file) as writer:
+        schema = writer.register_schema("my_msgs/msg/Odd", "ros2idl", idl)
+        channel = writer.register_channel("/odd", "cdr", schema, {"topic_type_hash": "RIHS01_" + "0" * 64})
+        writer.add_message(channel, 1, b"\0\1\0\0\7\0\0\0", 1)
+    recover(file, tmp_path / "new")
+    assert read_by_others(tmp_path / "new") == [("/odd", 1, b"\0\1\0\0\7\0\0\0")]
 
 
 LOGS = {
@@ -618,6 +627,15 @@ def test_rows_that_are_no_messages_are_told(tmp_path):
         base.execute("UPDATE messages SET data = 'text' WHERE id = 3")
     found = recover(tmp_path / "bag", tmp_path / "new")
     assert (found.saved, found.skipped, found.lossy) == (len(sent) - 3, 3, True)
+
+
+@pytest.mark.parametrize("room", [0, 2**12])
+def test_a_full_disk_at_the_start_leaves_no_folder(tmp_path, room):
+    """So that the same command records once there is room, instead of refusing an existing folder."""
+    with files_up_to(room):
+        refused = lathe("run", "piston", "--revolutions", "2", "--bag", tmp_path / "bag")
+    assert (refused.exit_code in (1, 2), "(File too large)" in refused.stderr) == (True, True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_leaves_no_half_of_a_bag(tmp_path):

@@ -444,7 +444,7 @@ def write_hostile_bag(path):
 def test_a_hostile_bag_gives_a_harmless_page(tmp_path):
     write_hostile_bag(tmp_path / "bag")
     done = CliRunner().invoke(report, [str(tmp_path / "bag"), "-o", str(tmp_path / "page.html")])
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 3, done.output
     assert "incomplete recording" in done.stderr
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     page = ShownPage(text)

@@ -9,6 +9,7 @@ import pytest
 from bags import lathe, storage_of
 from cells import every_scenario, scenario
 from numpy.testing import assert_allclose
+from sealed_bags import retold
 
 from lathe_rc import harness
 from lathe_rc.analysis.form_errors import form_errors
@@ -101,8 +102,8 @@ def test_the_recorded_spindle_counts_not_the_law(nodes, tmp_path):
     other = tmp_path / "other"
     slow = {"revolutions": 15.0, "deviation_amplitude": [0.05], "deviation_frequency": [7.0]}
     harness.run(made(spindle_encoder=slow), bag=other)
-    metadata = other / "metadata.yaml"
-    metadata.write_text(metadata.read_text().replace("deviation_amplitude: [0.05]", "deviation_amplitude: [0.02]"))
+    said = provenance.SCENARIO
+    retold(other, lambda about: about.update({said: about[said].replace("amplitude: [0.05]", "amplitude: [0.02]")}))
     with Source(other) as source:
         assert "deviation_amplitude: [0.02]" in source.about[provenance.SCENARIO]
     assert resimulate(other).different == []
@@ -139,10 +140,12 @@ def test_changes_that_cannot_be_are_refused(nodes, change, said):
     assert said in found.stderr
 
 
-def test_a_bag_without_a_scenario_says_what_is_missing(nodes, tmp_path):
-    shutil.copy(storage_of(nodes[0]), tmp_path / "alone.mcap")
+def test_a_lone_file_has_the_scenario_and_a_bag_without_one_says_what_is_missing(nodes, tmp_path):
+    bag = shutil.copytree(nodes[0], tmp_path / "bag")
+    assert resimulate(storage_of(bag)).different == []
+    retold(bag, dict.clear)
     with pytest.raises(InputError, match="the bag holds no scenario"):
-        resimulate(tmp_path / "alone.mcap")
+        resimulate(bag)
 
 
 @pytest.mark.parametrize("piece", [64, 1000, 65536])

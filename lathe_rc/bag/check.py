@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc import messages
+from lathe_rc import files, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
@@ -19,7 +19,6 @@ from lathe_rc.cell.block import Block
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.files import contents, replacing
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness
 _MOST_FINDINGS = 20  # maximum number listed per topic
@@ -40,6 +39,7 @@ class Findings:
         samples: number of samples of the dense topics, which all have the same length.
         first: first sample of a snapshot; 0 for a whole run.
         unread: topics that were not checked, because they are not ROS 2 topics.
+        origin: bags of which the bag was made, if it was not recorded.
     """
 
     wrong: list[str] = field(default_factory=list)
@@ -51,6 +51,7 @@ class Findings:
     samples: int = 0
     first: int = 0
     unread: list[str] = field(default_factory=list)
+    origin: list[str] = field(default_factory=list)
 
     @property
     def exit_code(self) -> int:
@@ -135,15 +136,16 @@ def check(path: Path) -> Findings:
         InputError: the path is not a bag, or the bag is damaged and needs `lathe_rc.bag.repairing.recover`.
     """
     findings, digester = Findings(), Digester()
-    with Source(path) as source:
+    with Source(path, altered=True) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
         part, findings.first = span_of(source.about), first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}
         sparse = {t: _Sparse(t, k, findings) for t, k in types.items() if k in messages.sparse_types()}
         counts = dict.fromkeys(types, 0)
-        findings.wrong += source.contradictions
+        findings.wrong += source.altered + source.contradictions
         findings.foreign = provenance.foreign(source.about)
         findings.unread = list(map(str, source.unread))
+        findings.origin = provenance.origin(source.about)
         for topic, log_ns, data in source.messages():
             counts[topic] += 1
             if topic in dense:
@@ -187,16 +189,18 @@ def recorded(path: Path) -> dict[str, str]:
     """Return the digests stored in a bag's folder by the harness; empty if there are none.
 
     Raises:
-        InputError: the file has an unexpected format.
+        InputError: the file is not as it was written.
     """
     file = path / DIGESTS
     if not path.is_dir() or not file.exists():
         return {}
     try:
-        told: Any = json.loads(contents(file, _MOST_DIGESTS))
+        content = files.contents(file, _MOST_DIGESTS)
+        files.unsealed(content)
+        told: Any = json.loads(content)
         return {str(topic): str(digest) for topic, digest in told["digest"].items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{file}: not what the harness writes; remove it") from None
+        raise InputError(f"{file}: damaged or changed since the run; remove it") from None
     except OSError as error:
         raise InputError(f"{file}: {error.strerror}; remove it") from None
 
@@ -217,7 +221,8 @@ def write_digests(path: Path, digest: Mapping[str, str]) -> None:
         LatheError: writing to the disk fails.
     """
     try:
-        with replacing(path / DIGESTS) as file:
-            file.write(json.dumps({"digest": dict(digest)}, indent=1).encode() + b"\n")
+        with files.replacing(path / DIGESTS) as file:
+            told = {"digest": dict(digest), "checksum": files.ROOM.decode()}
+            file.write(files.sealed(json.dumps(told, indent=1).encode() + b"\n"))
     except OSError as error:
         raise LatheError(f"{path / DIGESTS}: cannot write ({error.strerror}); the bag is complete without") from None

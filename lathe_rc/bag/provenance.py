@@ -209,6 +209,17 @@ def held(about: Mapping[str, str]) -> dict[str, int]:
         raise InputError(f"{HELD} of the bag is not what a recorder writes; recover the bag") from None
 
 
+def another(about: Mapping[str, str], key: str, said: str) -> dict[str, str]:
+    """Return the entry of a bag that was made of another one, after what that bag says of its own origin."""
+    return {key: "; before that: ".join([said, *([about[key]] if key in about else [])])}
+
+
+def origin(about: Mapping[str, str]) -> list[str]:
+    """Return the statements of a bag that was not recorded, but made of other bags."""
+    words = {RECOVERED: "recovered", COPIED: "copied"}
+    return [f"{word}: {shown(about[key], 2000)}" for key, word in words.items() if key in about]
+
+
 def namespace(about: Mapping[str, str]) -> str:
     """Return the namespace of the cell as a topic prefix; empty if there is none or the bag does not state it."""
     try:

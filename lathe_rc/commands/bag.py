@@ -81,6 +81,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             "topics": topics,
             "unread": [asdict(each) for each in source.unread],
             "about": dict(source.about),
+            "seal": source.seal.digest if source.seal else None,
             "contradictions": source.contradictions,
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
@@ -94,7 +95,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
                 summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
             summary["first_sample"] = stream.first_of(source)
             summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
-        except LatheError as error:
+        except (LatheError, ValueError) as error:
             source.damage.append(str(error))
     if as_json:
         click.echo(json.dumps(summary))
@@ -113,6 +114,8 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
         console.print(what)
     console.print(f"span: {span:.6g} s from {summary['start'] or format(summary['start_s'], '.6g') + ' s'} on")
     console.print(f"written: {summary['written']}")
+    if source.seal:
+        console.print(f"seal: {source.seal}")
     if summary["first_sample"]:
         console.print(f"recorded from sample {summary['first_sample']} of the run on")
     if summary["error_um"]:
@@ -170,6 +173,7 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "lost": found.lost,
         "foreign": found.foreign,
         "unread": found.unread,
+        "origin": found.origin,
         "messages": found.messages,
         "samples": found.samples,
         "digests_compared": found.compared,
@@ -178,7 +182,8 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(summary))
     else:
-        for what in (*found.wrong, *found.lost, *found.foreign, *(f"not read: {each}" for each in found.unread)):
+        unread = (f"not read: {each}" for each in found.unread)
+        for what in (*found.origin, *found.wrong, *found.lost, *found.foreign, *unread):
             click.echo(what)
         state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
         digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"

@@ -124,6 +124,8 @@ def _read(
     found, points = _Read([], [], 0.0), []
     for path in records:
         bag = measured.is_bag(path)
+        if bag:
+            measured.tell_origin(path)
         revolutions = _of_bag(path, last, topic) if bag else part_record.read(path, mapping)
         points += [each.angle.size for each in revolutions]
         waves = [

@@ -14,7 +14,7 @@ from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import part
 from lathe_rc.cell.recording import Recording
-from lathe_rc.commands import options, tables
+from lathe_rc.commands import measured, options, tables
 from lathe_rc.errors import InputError
 
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
@@ -90,6 +90,7 @@ def measure(
     bag: Path, revolutions: str, cutoff: float, nose_radius: float | None, profile: Path | None, *, as_json: bool
 ) -> None:
     """Measure the part turned in a recorded run: form error, roundness and roughness by revolution."""
+    measured.tell_origin(bag)
     recording = reader.read_bag(bag)
     found = part.measured(recording, cutoff=cutoff)
     surface = _surface(bag, recording, found, nose_radius)

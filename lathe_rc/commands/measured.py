@@ -27,6 +27,16 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix in _BAGS
 
 
+def tell_origin(path: Path) -> None:
+    """Print to stderr of which bags a bag was made, if it was not recorded."""
+    from lathe_rc.bag import provenance
+    from lathe_rc.bag.reading.source import Source
+
+    with Source(path) as source:
+        for what in provenance.origin(source.about):
+            click.echo(f"lathe: warning: {path}: {what}", err=True)
+
+
 def opened(path: Path, given: Sequence[str]) -> Measurement:
     """Open a file or a bag with the columns that the options name.
 

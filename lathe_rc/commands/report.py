@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from lathe_rc.commands import options
+from lathe_rc.errors import LossyRunError
 
 
 @click.command()
@@ -13,8 +14,12 @@ from lathe_rc.commands import options
 @click.option("-o", "--output", type=options.PATH, default=Path("report.html"), show_default=True, help="HTML file")
 @options.allow_code
 @click.option("--budget", is_flag=True, help="what the form error is made of, by some ten runs of the bag's scenario")
-def report(bag: Path, output: Path, *, budget: bool) -> None:
-    """Write a recording as one page with result, figures and losses; the page opens without a network."""
+@click.pass_context
+def report(ctx: click.Context, bag: Path, output: Path, *, budget: bool) -> None:
+    """Write a recording as one page with result, figures and losses; the page opens without a network.
+
+    Exit code 3: the recording of a cell is incomplete, and so is what the page says of it.
+    """
     from lathe_rc.view import report as reporting
 
     gathered = reporting.write_report(bag, output, with_budget=budget)
@@ -22,3 +27,4 @@ def report(bag: Path, output: Path, *, budget: bool) -> None:
         why = gathered.stopped or ("" if gathered.samples else gathered.missing)
         click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")
+    ctx.exit(LossyRunError.exit_code if gathered.is_lossy else 0)

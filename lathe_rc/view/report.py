@@ -15,7 +15,7 @@ import numpy as np
 from lathe_rc import __version__, messages
 from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.bag.provenance import FILE, ORIGINS, RECOVERED, SCENARIO, VERSIONS, origins, scenario_of
+from lathe_rc.bag.provenance import FILE, ORIGINS, SCENARIO, VERSIONS, origin, origins, scenario_of
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.budget import budget
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
@@ -142,8 +142,7 @@ def losses(data: Gathered) -> list[str]:
     found += [f"{servo.loop.node}: {servo.refused}" for servo in data.servos if servo.refused]
     if data.unjudged:
         found.append(f"no tolerance is known: {data.unjudged}")
-    if data.about.get(RECOVERED):
-        found.append(f"the bag was cut off and has been recovered: {data.about[RECOVERED]}")
+    found += [f"another bag than the recorded one, {what}" for what in origin(data.about)]
     if host.unreadable:
         found.append(f"{host.unreadable} messages of host topics cannot be decoded")
     if host.left_out:

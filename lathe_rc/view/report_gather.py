@@ -164,6 +164,11 @@ class Gathered:
         ends = 0 < snapshot[1] == self.samples if snapshot else not any(tally.open_end for tally in dense)
         return bool(dense) and not self.stopped and ends
 
+    @property
+    def is_lossy(self) -> bool:
+        """Return True if reading stopped, or if the recording of a cell is incomplete."""
+        return bool(self.stopped) or (self.samples > 0 and not self.complete)
+
     def has(self, kind: str) -> bool:
         """Return True if the bag has messages of a type."""
         return any(tally.count for tally in self.topics.values() if tally.type == kind)

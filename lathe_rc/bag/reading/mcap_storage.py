@@ -7,6 +7,7 @@ and records are counted before memory is allocated for them.
 
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -15,8 +16,9 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Schema, Statistics
+from mcap.records import MetadataIndex, Schema, Statistics
 
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.chunk_messages import HEAD, Places, walk_whole
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, TooMuchError
 from lathe_rc.bag.reading.sound_records import MAGIC, Record, SoundRecords, parsed
@@ -100,6 +102,7 @@ class _Mcap:
         self._counts = np.zeros(_NUMBERS, np.int64)  # messages by channel
         self._announced: set[bytes] = set()
         self._announcements = self._described = 0
+        self._metadata_at: list[int] = []  # offset of the record that may contain the seal, if there is one
 
     def damage(self, what: object) -> None:
         """Record an unreadable part."""
@@ -164,7 +167,14 @@ class _Mcap:
             self._counts[number] = min(count, 2**62)
         self.storage.first_ns, self.storage.last_ns = statistics.message_start_time, statistics.message_end_time
         self._name_channels()
+        self._find_seal(records)
         return True
+
+    def _find_seal(self, records: SoundRecords) -> None:
+        for place in (MAGIC, *self._metadata_at, records.data_end):
+            with suppress(ValueError):  # a file whose record is broken has no seal that holds
+                record = records.at(place)
+                self.storage.sealed.take(record.opcode, record.content)
 
     def _indexed_records(self, records: SoundRecords) -> Statistics | None:
         """Read the records of the summary; return its statistics, or None if it has none."""
@@ -176,6 +186,8 @@ class _Mcap:
                 statistics = parsed(Statistics, record.content)
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunks.append(self._indexed(record.content, records.summary_start))
+            elif record.opcode == Opcode.METADATA_INDEX and (told := parsed(MetadataIndex, record.content)):
+                self._metadata_at = [told.offset] if told.name == seal.RECORD else self._metadata_at
         # Overlapping chunks would be unpacked once per index entry: a small file could cause hours of work.
         free = MAGIC
         for chunk in sorted(chunks, key=lambda chunk: chunk.start):
@@ -226,6 +238,7 @@ class _Mcap:
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._announce(record.opcode, record.content)
         if record.opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+            self.storage.sealed.take(record.opcode, record.content)
             return
         try:
             found = walk_whole(record.content)

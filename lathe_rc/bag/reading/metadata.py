@@ -6,7 +6,7 @@ The memory and time for reading metadata are bounded. Settings missing from a Qo
 
 import errno
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path, PurePath
@@ -19,6 +19,7 @@ from lathe_rc.bag.reading import limits
 from lathe_rc.files import contents
 
 NAME = "metadata.yaml"
+_ROOT = "rosbag2_bagfile_information"
 
 Kind = TypeVar("Kind", bound=Enum)
 
@@ -51,6 +52,10 @@ class Metadata:
         span: first and last log time [ns]; None without messages.
         topics: topics by name.
         about: strings that the recorder added to the metadata.
+        count: number of messages.
+        counts: number of messages of each file, as far as stated.
+        tree: all content, in maps, lists and strings.
+        source: content of the file, in bytes; empty if the metadata are from elsewhere.
     """
 
     files: tuple[str, ...]
@@ -59,6 +64,10 @@ class Metadata:
     span: tuple[int, int] | None
     topics: Mapping[str, Topic]
     about: Mapping[str, str]
+    count: int
+    counts: Mapping[str, int]
+    tree: Mapping[str, Any]
+    source: bytes = b""
 
 
 def read(folder: Path) -> Metadata:
@@ -69,11 +78,23 @@ def read(folder: Path) -> Metadata:
         OSError: the metadata cannot be read.
     """
     try:
-        text = contents(folder / NAME, limits.MOST_METADATA).decode()
+        source = contents(folder / NAME, limits.MOST_METADATA)
     except OSError as error:
         most = f"; allowed: up to {limits.MOST_METADATA} B" if error.errno == errno.EFBIG else ""
         raise ValueError(f"{NAME}: {error.strerror}{most}") from None
-    bag = _of(read_yaml(text, NAME), "rosbag2_bagfile_information", dict)
+    return replace(_made(_of(read_yaml(source.decode(), NAME), _ROOT, dict)), source=source)
+
+
+def sealed(text: str) -> Metadata:
+    """Parse the copy of the metadata that a bag's seal contains.
+
+    Raises:
+        ValueError: see `read`.
+    """
+    return _made(_of({_ROOT: read_yaml(text, NAME)}, _ROOT, dict))
+
+
+def _made(bag: Mapping[str, Any]) -> Metadata:
     names = [PurePath(str(name)).name for name in _of(bag, "relative_file_paths", list)]
     files = tuple(dict.fromkeys(names))
     if len(files) > limits.MOST_FILES or not all(files):
@@ -81,8 +102,8 @@ def read(folder: Path) -> Metadata:
     mode, form = (str(bag.get(key, "")) for key in ("compression_mode", "compression_format"))
     if mode.lower() not in ("", "none") and (mode.lower() not in ("file", "message") or form != "zstd"):
         raise ValueError(f"{NAME}: compression {form[:64]!r} by {mode[:64]!r}; allowed: zstd, by file or message")
-    span = None
-    if _number(_of(bag, "message_count", str)):
+    span, count = None, _number(_of(bag, "message_count", str))
+    if count:
         first = _number(_of(_of(bag, "starting_time", dict), "nanoseconds_since_epoch", str))
         span = first, first + _number(_of(_of(bag, "duration", dict), "nanoseconds", str))
     custom = bag.get("custom_data")
@@ -94,7 +115,17 @@ def read(folder: Path) -> Metadata:
         span,
         _topics(_of(bag, "topics_with_message_count", list)),
         {key[:256]: text[: limits.MOST_TEXT] for key, text in texts if isinstance(text, str)},
+        count,
+        _counts(bag.get("files")),
+        bag,
     )
+
+
+def _counts(listed: object) -> dict[str, int]:
+    """Return the number of messages of each file that the metadata state; recorders before version 5 stated none."""
+    files = (each for each in listed if isinstance(each, dict)) if isinstance(listed, list) else ()
+    told = ((PurePath(str(each.get("path"))).name, str(each.get("message_count"))) for each in files)
+    return {name: int(count) for name, count in told if count.isdecimal() and len(count) <= len(str(2**64))}
 
 
 def _topics(listed: list[object]) -> dict[str, Topic]:

@@ -117,6 +117,7 @@ class SoundRecords:
 
     Attributes:
         summary_start: offset of the summary, once `find_summary` has found it; before that, the size of the file.
+        data_end: offset of the record at the end of the data section, found in the same way.
         ended: whether the latest iteration has passed the end of the data section.
         data_wrong, summary_wrong: whether the checksum of the data section, or of the summary, does not match.
     """
@@ -127,7 +128,7 @@ class SoundRecords:
         self._last = Opcode.FOOTER if effort is None else 0
         self._chunked = False
         self._window = _PAGE
-        self._checked_from = self.summary_start = self._data_end = size
+        self._checked_from = self.summary_start = self.data_end = size
         self.ended = self.data_wrong = self.summary_wrong = False
 
     def inside(self, record: Record) -> Iterator[tuple[bytes, Found]]:
@@ -156,7 +157,7 @@ class SoundRecords:
         with suppress(ValueError):  # the walk reports it
             footer = self._sound(place)
             start, _, crc = struct.unpack("<QQI", footer.content) if footer.opcode == Opcode.FOOTER else (0, 0, 0)
-            self._data_end = (start or place) - _DATA_END
+            self.data_end = (start or place) - _DATA_END
             self.summary_start = start if MAGIC <= start < place else self._size
             self.summary_wrong = bool(start and crc) and self._sum(start, place + _FOOTER - 4) != crc
             self._checked_from = start if start and crc and not self.summary_wrong else self._size
@@ -166,14 +167,14 @@ class SoundRecords:
         """Verify the checksums of the data section and of the summary."""
         self.find_summary()
         try:
-            end = self._sound(self._data_end)
+            end = self.at(self.data_end)
         except ValueError:  # the walk reports it; the summary is elsewhere, and may be valid
             self.summary_start, self.summary_wrong = self._size, False
             return
         if self.summary_wrong:
             self.told("the checksum of the summary is wrong", 0)
         (crc,) = struct.unpack("<I", end.content) if end.opcode == Opcode.DATA_END else (0,)
-        if crc and self._sum(0, self._data_end) != crc:
+        if crc and self._sum(0, self.data_end) != crc:
             self.data_wrong = True
             self.told("the checksum of the data section is wrong", 0)
 
@@ -182,6 +183,14 @@ class SoundRecords:
         for place in range(start, stop, _WINDOW):
             crc = crc32(self._at(place, min(_WINDOW, stop - place)), crc)
         return crc
+
+    def at(self, place: int) -> Record:
+        """Return the record at a file offset.
+
+        Raises:
+            ValueError: there is no valid record.
+        """
+        return self._sound(place)
 
     def summary(self) -> Iterator[Record]:
         """Yield the valid records of the summary, once `find_summary` has found it."""

@@ -25,6 +25,8 @@ from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
+from lathe_rc.bag.reading.seal import Seal
+from lathe_rc.bag.reading.sealed_metadata import compare
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
@@ -36,6 +38,7 @@ _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
 _KINDS = (".mcap", ".db3", ".zstd")
 _RECOVER = "; lathe bag recover saves the rest"
+_SEAL_ANEW = "; lathe bag check tells all, lathe bag recover makes a sealed bag of what was recorded"
 _WRONG = (ValueError, OSError, struct.error, sqlite3.Error, ZstdError)  # exceptions caused by damaged bytes and files
 
 Read = tuple[Span, Mapping[int, str]]  # a span and its requested channels
@@ -100,6 +103,7 @@ class Source:
     Args:
         path: rosbag2 folder, or a single file from one.
         partial: whether to read the readable parts of a damaged bag.
+        altered: whether to read a bag that does not agree with its seal, by what is sealed.
 
     Attributes:
         path: path of the bag.
@@ -109,12 +113,16 @@ class Source:
         first_ns, last_ns: smallest and largest log time [ns]; both 0 if the bag is empty.
         contradictions: differences between the bag's metadata and its files, one line each; the files take precedence.
         damage: unreadable parts, one line each; empty unless ``partial``.
+        seal: seal of the bag; None if no seal holds.
+        altered: differences from what was sealed when the bag was closed, one line each; also that a bag of lathe_rc
+            has no seal. Empty unless ``partial`` or ``altered``.
 
     Raises:
-        InputError: the path is not a bag, or the bag is incomplete or, with ``partial``, has no readable part.
+        InputError: the path is not a bag, or the bag does not agree with its seal, or is incomplete or, with
+            ``partial``, has no readable part.
     """
 
-    def __init__(self, path: Path, *, partial: bool = False) -> None:
+    def __init__(self, path: Path, *, partial: bool = False, altered: bool = False) -> None:
         self.path = path
         self.about: Mapping[str, str] = {}
         self.first_ns = self.last_ns = 0
@@ -122,6 +130,8 @@ class Source:
         self.unread: list[Unread] = []
         self.contradictions: list[str] = []
         self.damage: list[str] = []
+        self.altered: list[str] = []
+        self.seal: Seal | None = None
         self._storages: list[Storage] = []
         self._size, self._packed = 0, False
         self._temporary = ExitStack()
@@ -136,6 +146,10 @@ class Source:
         if self.damage and not (partial and (saved or self.unread)):
             self._temporary.close()
             raise InputError(f"{path}: not a readable bag ({self.damage[0]}){_RECOVER if saved else ''}")
+        if self.altered and not (partial or altered):
+            self._temporary.close()
+            raise InputError(f"{path}: {self.altered[0]}{_SEAL_ANEW}")
+        self.damage += self.altered if partial else []
         if self.unread and not self.topics and not partial:
             self._temporary.close()
             raise InputError(f"{path}: no topic that can be read ({self.unread[0]}); allowed: messages of ROS 2")
@@ -148,7 +162,6 @@ class Source:
             files = files_of(self.path)
             told = self._metadata(files)
         if told:
-            self.about, self._packed = told.about, told.packed
             named = told.files
             others = [f for f in files if f.name not in named and f.name.removesuffix(".zstd") not in named]
             files = [self.path / name for name in named]
@@ -161,12 +174,18 @@ class Source:
                     f"{metadata.NAME} does not name {file.name}: not read; lathe bag recover saves its messages too"
                     for file in others
                 ]
+        by_name: dict[str, Storage] = {}
         for file in files:
             try:
-                self._storages.append(self._storage(file))
+                by_name[file.name] = self._storage(file)
                 self._size += file.stat().st_size
             except _WRONG as error:
                 self.damage.append(f"{file.name}: {_reason(error)}")
+        self._storages = [*by_name.values()]
+        found = compare(told, {name: each.sealed for name, each in by_name.items()}, whole=self.path.is_dir())
+        self.seal, told, self.altered = found.seal, found.metadata, found.strangers + found.changes
+        if told:
+            self.about, self._packed = told.about, told.packed
         for storage in self._storages:
             self.damage += storage.damage
             self.contradictions += storage.remarks
@@ -175,7 +194,7 @@ class Source:
         self.first_ns = min((storage.first_ns for storage in filled), default=0)
         self.last_ns = max((storage.last_ns for storage in filled), default=0)
         if told:
-            self._compare(told)
+            self._compare(told, by_name)
         if len(self.topics) > MOST_TOPICS:
             raise ValueError(f"{len(self.topics)} topics; allowed: up to {MOST_TOPICS}")
 
@@ -234,7 +253,7 @@ class Source:
             self.topics[channel.topic] = Topic(channel.type, qos, before.count + channel.count)
         self.unread = [Unread(*key, count) for key, count in unread.items()]
 
-    def _compare(self, told: Metadata) -> None:
+    def _compare(self, told: Metadata, files: Mapping[str, Storage]) -> None:
         """Add the metadata that the files lack, and note where metadata and files contradict each other."""
         wrong: list[tuple[str, int]] = []
         if told.span and self._storages:
@@ -249,6 +268,10 @@ class Source:
                 self.topics[topic] = Topic(said.type, said.qos, 0)
             count = (known.count if known else 0) + unread.get(topic, 0)
             wrong += [(f"{said.count} messages of {topic}", count)] if said.count != count else []
+        counts = {name: sum(c.count for c in storage.channels.values()) for name, storage in files.items()}
+        totals = [("in all", told.count, sum(counts.values()))]
+        totals += [(f"in {name}", said, counts[name]) for name, said in told.counts.items() if name in counts]
+        wrong += [(f"{said} messages {where}", count) for where, said, count in totals if said != count]
         untold = self.topics.keys() - told.topics.keys()
         wrong += [(f"0 messages of {topic}", self.topics[topic].count) for topic in sorted(untold)]
         self.contradictions += [f"{metadata.NAME} says {said}; the files: {found}" for said, found in wrong]

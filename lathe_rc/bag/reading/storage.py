@@ -10,6 +10,7 @@ from rosbags.interfaces import Qos
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.limits import MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
+from lathe_rc.bag.reading.seal import FileSeal
 from lathe_rc.bag.reading.unpacking import Budget
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
@@ -113,6 +114,7 @@ class Storage:
         first_ns, last_ns: smallest and largest log time of the messages, if there are any [ns].
         damage: unreadable parts, one line each; with a valid summary, damage may be detected later.
         remarks: incorrect statements in the file about itself that do not make any message unreadable.
+        sealed: the file's seal.
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -121,6 +123,7 @@ class Storage:
     last_ns: int = 0
     damage: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    sealed: FileSeal = field(default_factory=FileSeal)
     _offered: int = 0  # total length of the QoS profiles [characters]
 
     def announce(self, number: int, channel: Channel, offered: str) -> None:

@@ -53,7 +53,8 @@ def recover(path: Path, target: Path) -> Salvage:
     def about(salvage: Salvage) -> dict[str, str]:
         missing = f", {salvage.missing} messages missing" if salvage.missing else ""
         said = f"{salvage.saved} messages; {salvage.lost_bytes} B lost{missing}"
-        return {**salvage.about, provenance.RECOVERED: said}
+        said += f"; from {salvage.origin}" if salvage.origin else ""
+        return salvage.about | provenance.another(salvage.about, provenance.RECOVERED, said)
 
     (found,) = _copied([path], target, Choice(), lambda salvages: about(*salvages))
     return found
@@ -80,10 +81,17 @@ def copy(paths: Sequence[Path], target: Path, choice: Choice) -> list[Salvage]:
     """
 
     def about(salvages: Sequence[Salvage]) -> dict[str, str]:
-        of = ", ".join(f"{each.saved} messages of {name_of(each.path)}" for each in salvages)
-        return {**(salvages[0].about if len(salvages) == 1 else {}), provenance.COPIED: of}
+        of = ", ".join(_copied_of(salvage) for salvage in salvages)
+        before = salvages[0].about if len(salvages) == 1 else {}
+        return before | provenance.another(before, provenance.COPIED, of)
 
     return _copied(paths, target, choice, about)
+
+
+def _copied_of(salvage: Salvage) -> str:
+    """Return in words which messages were copied of which bag."""
+    told = filter(None, [salvage.origin, "damaged" if salvage.lossy else ""])
+    return f"{salvage.saved} messages of {name_of(salvage.path)}" + "".join(f", {each}" for each in told)
 
 
 def _copied(
@@ -99,7 +107,7 @@ def _copied(
             writer.close()
         except BaseException:
             writer.abort()
-            shutil.rmtree(target)
+            shutil.rmtree(target, ignore_errors=True)  # a writer removes a bag of which nothing could be written
             raise
     except OSError as error:
         raise LatheError(f"{', '.join(map(str, paths))}: cannot be copied ({error.strerror or shown(error)})") from None

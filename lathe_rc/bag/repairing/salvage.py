@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Metadata, Schema, Statistics
 
@@ -24,6 +25,8 @@ from lathe_rc import messages
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
+from lathe_rc.bag.reading.seal import LIBRARY, FileSeal
+from lathe_rc.bag.reading.sealed_metadata import Agreement, compare
 from lathe_rc.bag.reading.sound_records import SoundRecords, Told, parsed
 from lathe_rc.bag.reading.source import files_of
 from lathe_rc.bag.reading.sqlite_storage import check_tables, connect, left_over, select, with_journal
@@ -70,7 +73,8 @@ class Salvage:
         copied: callback for the opcode and content of each attachment, and of metadata from other software.
         topics: all topics that can be copied.
         profile: profile of the MCAP files.
-        about: strings from the bag's metadata.
+        about: strings from the bag's metadata; those under its seal, once all messages have been read.
+        origin: in words, the seal of the bag or the lack of one; empty for bags of other recorders.
         damage: kind and location of the damage, one line per damaged place.
         lost_bytes: number of bytes in the files that yielded no message.
         saved: number of recovered messages, set by `recover`.
@@ -86,6 +90,7 @@ class Salvage:
     copied: Callable[[int, bytes], None] = lambda _opcode, _content: None
     topics: dict[Topic, None] = field(default_factory=dict)
     about: dict[str, str] = field(default_factory=dict)
+    origin: str = ""
     damage: list[str] = field(default_factory=list)
     lost_bytes: int = 0
     saved: int = 0
@@ -95,13 +100,15 @@ class Salvage:
     _described: int = 0  # total length of strings and definitions [characters]
     _counted: int | None = None  # number of messages stated in the file being read
     _ended: bool = True  # whether that file is complete
+    _seals: dict[str, FileSeal] = field(default_factory=dict)  # by file
 
     def __post_init__(self) -> None:
         self._files = files_of(self.path)
         if not self._files:
             raise InputError(f"{self.path}: no bag; allowed: a folder with .mcap or .db3 files, or such a file")
         self._metadata = self._read_metadata()
-        self.profile = self._profile(self._files[0])
+        header = self._header(self._files[0])
+        self.profile, self._is_ours = header.profile, header.library == LIBRARY
 
     def _read_metadata(self) -> metadata.Metadata | None:
         """Return the metadata of a folder; None if they are missing or unreadable."""
@@ -115,16 +122,17 @@ class Salvage:
             return None
         return told
 
-    def _profile(self, file: Path) -> str:
-        """Return the profile of an MCAP file."""
+    def _header(self, file: Path) -> Header:
+        """Return the header of an MCAP file; that of a file of rosbag2 if there is none."""
+        unknown = Header(ROS2, "")
         if file.suffix != ".mcap":
-            return ROS2
+            return unknown
         with file.open("rb") as stream:
             size = min(file.stat().st_size, MOST_TEXT)
             first = next(iter(SoundRecords(stream, size, lambda _why, _lost: None)), None)
         if first is None or first.opcode != Opcode.HEADER:
-            return ROS2
-        return str(parsed(Header, first.content).profile)
+            return unknown
+        return parsed(Header, first.content)
 
     def __iter__(self) -> Iterator[Message]:
         """Yield the intact messages in the order of the files."""
@@ -146,6 +154,22 @@ class Salvage:
         told = sum(topic.count for topic in self._metadata.topics.values()) if self._metadata else None
         self._miss(metadata.NAME, told, read)
         self.lossy |= bool(self.missing or self.skipped) or not (complete or told == read)
+        self._take_seal()
+
+    def _take_seal(self) -> None:
+        """Replace the strings of the metadata by the sealed ones, if the bag has a seal that holds."""
+        try:
+            found = compare(self._metadata, self._seals, whole=self.path.is_dir())
+        except ValueError:
+            found = Agreement(None, None)
+        if found.seal is None or found.metadata is None:
+            self.origin = "a bag without a seal that holds" if self._is_ours else ""
+            return
+        for what in found.strangers + found.changes:
+            self._tell(what)
+        self.about = dict(found.metadata.about)
+        self.origin = f"the bag with seal {found.seal}" + ", of which files were exchanged" * bool(found.strangers)
+        self.lossy |= bool(found.strangers)
 
     def _miss(self, name: str, counted: int | None, read: int) -> None:
         if counted is not None and counted > read:
@@ -226,9 +250,12 @@ class Salvage:
             sound = SoundRecords(stream, file.stat().st_size, told)
             sound.check_sums()
             known, unchecked = _Definitions(self, sound), 0
+            sealed = self._seals[file.name] = FileSeal()
             for record in () if sound.summary_wrong else sound.summary():
                 known.add(record.opcode, record.content, checked=record.checked)
             for record in sound:
+                with suppress(ValueError, struct.error, EndOfFile):
+                    sealed.take(record.opcode, record.content)
                 if record.opcode == Opcode.STATISTICS and not sound.summary_wrong:
                     self._counted = parsed(Statistics, record.content).message_count
                 for content, found in sound.inside(record):

@@ -210,7 +210,7 @@ def resimulate(
             chosen = provenance.scenario_of(source.about, Path(folder), overrides) if asked else original
         if controller is not None:
             chosen = with_controller(chosen, controller)
-        warnings = provenance.changes(source.about, original) if original is not None else []
+        warnings = [*provenance.origin(source.about), *(provenance.changes(source.about, original) if original else [])]
         _refuse_events(chosen, original)
         drives = identify.drives(recorded, chosen) if identified else []
         chosen = identify.with_identified(chosen, drives)

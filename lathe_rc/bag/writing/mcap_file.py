@@ -26,6 +26,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -85,6 +86,7 @@ class McapFile:
     Attributes:
         counts: number of messages by channel in the chunks written so far.
         first_ns, last_ns: smallest and largest log time so far [ns]; None before the first message.
+        checksum: checksum of the bytes written so far; of a finished file, of its data.
 
     Raises:
         OSError: the file cannot be created; in any later method, writing to the disk fails.
@@ -106,11 +108,11 @@ class McapFile:
         self.last_ns: int | None = None
         self._chunk = io.BytesIO()  # the messages of the chunk, followed by leftover bytes of earlier chunks
         self._begin_chunk()
-        self._offset = self._crc = 0
+        self._offset = self.checksum = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
         self._kept = self._described = 0
         self._refused: OSError | None = None
-        self._put(MCAP0_MAGIC + _encoded(records.Header(profile, "lathe_rc")))
+        self._put(MCAP0_MAGIC + _encoded(records.Header(profile, seal.LIBRARY)))
 
     def successor(self, path: Path) -> "McapFile":
         """Return a new file for further messages, with the same settings, schemas and channel numbers.
@@ -145,7 +147,7 @@ class McapFile:
             raise
         for part in parts:
             self._offset += len(part)
-            self._crc = crc32(part, self._crc)
+            self.checksum = crc32(part, self.checksum)
 
     def _keep_room(self) -> None:
         """Reserve disk space for completing the file, so that a full disk cannot make the file unreadable."""
@@ -295,8 +297,10 @@ class McapFile:
         """Write the summary and close the file."""
         try:
             self.flush()
-            self._put(_encoded(records.DataEnd(self._crc)))
+            of_data = self.checksum
+            self._put(_encoded(records.DataEnd(of_data)))
             self._put(self._summary())
+            self.checksum = of_data
         finally:
             self.abort()
 

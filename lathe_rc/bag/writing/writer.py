@@ -18,6 +18,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2.metadata import dump_qos_v9
 
 from lathe_rc import messages
+from lathe_rc.bag.reading import seal
 from lathe_rc.bag.writing.mcap_file import McapFile, channel_content, schema_content
 from lathe_rc.bag.writing.rows import RowPlan
 from lathe_rc.errors import InputError, LatheError
@@ -27,6 +28,7 @@ Durability = Literal["volatile", "transient_local"]
 
 FLUSH_PERIOD = 0.5  #: wall time after which a recorder writes messages out even if they do not fill a chunk [s]
 _FOREVER = QosTime(9223372036, 854775807)
+_UNKNOWN = 64 * "0"  # hash of a type from a middleware that has none; readers would compare it
 _NEVER = 2**63 - 1  # start of a bag without messages, as written by rosbags [ns]
 
 
@@ -127,12 +129,13 @@ def refuse_existing(path: Path) -> None:
 
 
 class _Part(NamedTuple):
-    """Completed file of a bag: name, messages by channel, smallest and largest log time [ns], None without messages."""
+    """File of a bag: name, messages by channel, first and last log time [ns], None without messages; data checksum."""
 
     name: str
     counts: Mapping[int, int]
     first_ns: int | None
     last_ns: int | None
+    checksum: int = 0
 
     def span(self) -> dict[str, Any]:
         """Return start, duration and number of messages as in the metadata of a bag."""
@@ -142,6 +145,15 @@ class _Part(NamedTuple):
             "duration": {"nanoseconds": max((self.last_ns or 0) - first, 0)},
             "message_count": sum(self.counts.values()),
         }
+
+
+def _begun(path: Path, chunk_size: int, compression: Compression, profile: str) -> McapFile:
+    """Return the first file of a bag in a new folder, which is removed if the file cannot be created."""
+    try:
+        return McapFile(path, chunk_size=chunk_size, compress=compression == "zstd", profile=profile)
+    except OSError:
+        shutil.rmtree(path.parent, ignore_errors=True)
+        raise
 
 
 class BagWriter:
@@ -178,31 +190,28 @@ class BagWriter:
         self._began_ns: int | None = None  # log time of the first message in the file
         try:
             path.mkdir(mode=0o755)
-            self._file = McapFile(
-                path / self._name, chunk_size=chunk_size, compress=compression == "zstd", profile=profile
-            )
+            self._file = _begun(path / self._name, chunk_size, compression, profile)
         except OSError as error:
             raise InputError(f"{path}: cannot be made ({error.strerror})") from None
+        self._is_gone = False  # the folder, of a bag whose first bytes could not be written
         self._about: dict[str, str] = {}
         # Channels with equal name, type, encoding and QoS share an entry in the metadata: the first, and all numbers.
         self._topics: dict[tuple[object, ...], tuple[Topic, list[int]]] = {}
         self._channels: dict[str, int] = {}  # channels of the written topics, by topic
         self._schemas: dict[bytes | None, int] = {}  # by content of the record
-        try:
-            self.tell(about)
-        except LatheError:
-            self.abort()
-            shutil.rmtree(path)
-            raise
+        self.tell(about)
 
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """Convert disk I/O errors into a one-line `LatheError`."""
+        """Convert disk I/O errors into a one-line `LatheError`, and remove a bag in which nothing is recorded yet."""
         try:
             yield
         except OSError as error:
-            is_empty = self._file.first_ns is None and not self._parts
-            before = "" if is_empty else "what was recorded before is readable: "
+            self._is_gone = self._file.first_ns is None and not self._parts
+            if self._is_gone:
+                self.abort()
+                shutil.rmtree(self._path, ignore_errors=True)
+            before = "" if self._is_gone else "what was recorded before is readable: "
             raise LatheError(f"{self._path}: cannot write ({error.strerror}); {before}make room") from None
 
     def tell(self, about: Mapping[str, str]) -> None:
@@ -265,13 +274,12 @@ class BagWriter:
             following = f"{self._path.name}_{len(self._parts) + 1}.mcap"
             made = self._file.successor(self._path / following)
             made.add_metadata("lathe_rc", self._about)
-            self._file.free_room()
-            self._file.finish()
+            self._finish_file()
             self._parts.append(self._part())
             self._file, self._name, self._began_ns = made, following, log_ns
 
     def _part(self) -> _Part:
-        return _Part(self._name, self._file.counts, self._file.first_ns, self._file.last_ns)
+        return _Part(self._name, self._file.counts, self._file.first_ns, self._file.last_ns, self._file.checksum)
 
     def write(self, topic: str, log_ns: int, data: bytes | memoryview) -> None:
         """Append a message to an announced topic.
@@ -324,18 +332,29 @@ class BagWriter:
 
     def _complete(self) -> None:
         """Write the index and metadata into the disk space reserved for them."""
-        tree = self._metadata()
+        if self._is_gone:
+            return
         try:
-            self._file.free_room()
-            self._file.add_metadata("rosbag2", {"serialized_metadata": _yaml(tree).strip()}, last=True)
-            self._file.finish()
+            text = self._finish_file()
             beside = self._path / "metadata.yaml.tmp"
-            beside.write_text(_yaml({"rosbag2_bagfile_information": tree}), encoding="utf-8")
+            beside.write_bytes(text)
             beside.replace(self._path / "metadata.yaml")
         except OSError as error:
             raise LatheError(
                 f"{self._path}: cannot be completed ({error.strerror}); make room, then lathe bag recover it"
             ) from None
+
+    def _finish_file(self) -> bytes:
+        """Seal the current file and complete it; return the content of metadata.yaml for a bag that ends with it."""
+        self._file.flush()
+        tree = self._metadata()
+        text = _yaml({"rosbag2_bagfile_information": tree}).encode()
+        checksums = tuple(part.checksum for part in (*self._parts, self._part()))
+        sealed = seal.Seal(_yaml(tree).strip(), checksums, seal.digest(text, checksums))
+        self._file.free_room()
+        self._file.add_metadata(seal.RECORD, sealed.record, last=True)
+        self._file.finish()
+        return text
 
     def _metadata(self) -> dict[str, Any]:
         """Return the bag metadata (version 9) with the message counts of the file."""
@@ -356,7 +375,7 @@ class BagWriter:
                     "type": topic.type,
                     "serialization_format": topic.encoding,
                     "offered_qos_profiles": dump_qos_v9(list(topic.qos)),
-                    "type_description_hash": topic.digest,
+                    "type_description_hash": "" if topic.digest.endswith(_UNKNOWN) else topic.digest,
                 },
                 "message_count": count,
             }
