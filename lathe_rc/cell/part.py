@@ -41,7 +41,8 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     )
     found = measure(angle - 2.0 * np.pi * turns_before(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
     if not found.form.rms.size:
-        raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
+        why = f": {recording.lost}" if recording.lost else "; let it run longer"
+        raise InputError(f"nothing to measure: the recording has no complete revolution{why}")
     return found
 
 
@@ -56,7 +57,7 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
-            return judge(recording.errors.largest, allowed, _turns_before(recording))
+            return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=recording.lost)
     return None
 
 

@@ -54,6 +54,7 @@ class Recording:
         sparse: sparse messages by fully qualified topic.
         step_ns: sampling step [ns]; 0 without a dense topic.
         first: index of the first sample of the arrays; 0 except in a snapshot.
+        lost: reason why the recording ends before the run, at the loss of a member; empty if it does not.
 
     Example:
         >>> import lathe_rc
@@ -72,11 +73,12 @@ class Recording:
     sparse: Mapping[str, SparseTopic]
     step_ns: int
     first: int = 0
+    lost: str = ""
 
     def __repr__(self) -> str:
         """Return a one-line summary of the content."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
-        told = [f"{len(self.types)} topics", size, self.turned(), *self.errors.told()]
+        told = [f"{len(self.types)} topics", size, self.turned(), *self.errors.told(), *filter(None, [self.lost])]
         return f"<Recording: {', '.join(told)}>"
 
     def _repr_html_(self) -> str:
@@ -197,7 +199,7 @@ class Recording:
             why = (
                 f"no {' and no '.join(missing)}; record both"
                 if missing
-                else "no complete revolution; let it run longer"
+                else f"no complete revolution{f': {self.lost}' if self.lost else '; let it run longer'}"
             )
             raise InputError(f"nothing to draw: the recording has {why}")
         angle, tool = self.of_type(messages.ENCODER)["angle_true"], self.of_type(messages.TOOL)

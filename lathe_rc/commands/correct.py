@@ -16,7 +16,7 @@ from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.form import FormParameters
-from lathe_rc.commands import completers, measured, options, tables
+from lathe_rc.commands import completers, lossy, measured, options, tables
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError
 from lathe_rc.files import check_place
@@ -335,3 +335,4 @@ def correct(
         click.echo(json.dumps(summary))
     else:
         _show(summary, output)
+    lossy.end(*filter(measured.is_bag, records))

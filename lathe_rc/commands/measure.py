@@ -14,7 +14,7 @@ from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import part
 from lathe_rc.cell.recording import Recording
-from lathe_rc.commands import options, tables
+from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError
 
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
@@ -104,13 +104,18 @@ def measure(
             "revolutions": [part.numbers(found, k) for k in chosen],
             "along": part.along(surface) if isinstance(surface, Lay) else surface,
             "profile": str(profile) if profile else None,
+            "lost": recording.lost or None,
         }
         click.echo(json.dumps(summary))
+        lossy.end(bag)
         return
     console = tables.console(soft_wrap=False)
     console.print(table(found, chosen))
+    if recording.lost:
+        console.print(f"revolutions from {found.form.rms.size + 1} on not measured")
     if surface:
         text = part.along_in_words(surface) if isinstance(surface, Lay) else surface
         console.print(text, soft_wrap=True)
     if profile:
         console.print(f"profile: {profile}", soft_wrap=True)
+    lossy.end(bag)

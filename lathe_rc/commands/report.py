@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.commands import options
+from lathe_rc.commands import lossy, options
 
 
 @click.command()
@@ -22,3 +22,4 @@ def report(bag: Path, output: Path, *, budget: bool) -> None:
         why = gathered.stopped or ("" if gathered.samples else gathered.missing)
         click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")
+    lossy.end(bag)

@@ -210,7 +210,7 @@ def gather(path: Path) -> Gathered:
         servos = [Servo(watch) for watch in watches(provenance.servo_loops(nodes), types)]
         gathered = Gathered(source.about, tallies, forms, Curves(types), servos, nodes=nodes, unjudged=unjudged)
         first = first_of(source)
-        feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first)
+        feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first, source.loss)
         try:
             _feed(source, feeder, gathered)
         except LatheError as error:
@@ -236,6 +236,8 @@ def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
     left = feeder.finish()
     if left:
         gathered.stopped = f"some topics have {left} samples more than others"
+    if source.loss:
+        gathered.stopped = str(source.loss)
     for topic, tally in gathered.topics.items():
         if tally.type in messages.block_types():
             tally.open_end = topic not in newest or not Decoder(tally.type).decode(newest[topic]).last

@@ -21,6 +21,7 @@ from types import TracebackType
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
+from lathe_rc.bag.loss import Loss, loss_of
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
@@ -31,6 +32,7 @@ from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_fil
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import START_NS, block_types
 
 _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
@@ -100,6 +102,7 @@ class Source:
     Args:
         path: rosbag2 folder, or a single file from one.
         partial: whether to read the readable parts of a damaged bag.
+        whole: whether blocks are read beyond the loss of a member.
 
     Attributes:
         path: path of the bag.
@@ -114,8 +117,8 @@ class Source:
         InputError: the path is not a bag, or the bag is incomplete or, with ``partial``, has no readable part.
     """
 
-    def __init__(self, path: Path, *, partial: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: Path, *, partial: bool = False, whole: bool = False) -> None:
+        self.path, self._whole = path, whole
         self.about: Mapping[str, str] = {}
         self.first_ns = self.last_ns = 0
         self.topics: dict[str, Topic] = {}
@@ -263,19 +266,45 @@ class Source:
         """Close the bag and remove its temporary files."""
         self._temporary.close()
 
+    @property
+    def loss(self) -> Loss | None:
+        """Loss of a member, at which reading ends; None: the blocks are read to their end.
+
+        Raises:
+            InputError: the bag's entry about it is not in the recorder's format.
+        """
+        return None if self._whole else loss_of(self.about)
+
+    @property
+    def loss_ns(self) -> int:
+        """Simulated time of the `loss` [ns]; that of sample 0 if the bag has no block, and the largest without a loss.
+
+        Raises:
+            InputError: see `loss` and `messages`.
+        """
+        if not (loss := self.loss):
+            return _NEVER
+        dense = (topic for topic, said in self.topics.items() if said.type in block_types() and said.count)
+        return START_NS + loss.first * next((step for topic in dense if (step := self.step_ns(topic))), 0)
+
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
-        """Yield the blocks of a dense topic, starting at a log time [ns].
+        """Yield the blocks of a dense topic, starting at a log time [ns], up to the `loss` of a member.
 
         Raises:
             InputError: see `messages`.
             LatheError: a block cannot be decoded.
         """
-        decoder = Decoder(self.topics[topic].type)
+        decoder, loss = Decoder(self.topics[topic].type), self.loss
         for _, _, data in self.messages({topic}, start_ns=start_ns):
             try:
-                yield decoder.decode(data)
+                block = decoder.decode(data)
             except ValueError as error:
                 raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
+            if loss and block.first_index + block.samples > loss.first:
+                if block.first_index < loss.first:
+                    yield block.part(0, loss.first - block.first_index)
+                return
+            yield block
 
     def step_ns(self, topic: str) -> int:
         """Return the sampling step of a dense topic from its first block [ns]; 0 if it has no block.
