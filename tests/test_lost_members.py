@@ -8,32 +8,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import lathe
-from cells import scenario
+from cells import STEP, scenario
 
 from lathe_rc import harness, messages, read_bag
 from lathe_rc.bag.loss import HELD, SOUND, loss_of
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.snapshot import SNAPSHOT
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell import part
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
 from lathe_rc.view.panel_player import Player
+from lathe_rc.view.report_gather import gather
+from lathe_rc.view.report_verdict import BAD, assess
 
 PLANTED = 73.1313e-6  #: every held sample, and all that may rest on it [SI units]
 SEEN = re.compile(r"73\.13|7\.313|0\.07313")
 TURN = 3840  #: samples of a revolution
 HELD_FROM, SOUND_TO = 5 * TURN + 300, 5 * TURN - 200
 #: of every kind of member but the time master, without which no sample follows
-LOST = ("/coarse/command", "/coarse/state", "/tool", "/gauge/reading", "/safety", "/cross/command", "/cross/state")
+LOST = ("/coarse/command", "/coarse/state", "/tool", "/reference", "/gauge/reading", "/safety", "/fine/state")
+LOST += ("/cut", "/cross/command", "/cross/state")
+FIRSTS = np.random.default_rng(1).integers(0, 8 * TURN - 100, len(LOST)).tolist()
+WINDOW = 4096  #: [sample]
 
 
-def with_loss(source: Path, target: Path, about: dict[str, str], sound: int) -> Path:
-    """Copy a bag; from sample ``sound`` on plant a value in all numbers but those of the encoder."""
+def with_loss(source: Path, target: Path, about: dict[str, str], sound: int, first: int = 0) -> Path:
+    """Copy a bag from a sample on; from sample ``sound`` on plant a value in all numbers but those of the encoder."""
     with Source(source) as bag:
         writer = BagWriter(target, compression="zstd", chunk_size=2**20, about={**bag.about, **about})
         for topic, said in bag.topics.items():
             writer.add_topic(topic, said.type, offered_qos(10, "transient_local"))
-        for topic, log_ns, data in bag.messages():
+        for topic, log_ns, data in bag.messages(start_ns=messages.START_NS + first * STEP):
             writer.write(topic, log_ns, planted(bag.topics[topic].type, data, sound))
         writer.close()
     return target
@@ -109,14 +115,105 @@ def test_the_planted_value_is_found_where_a_bag_does_not_name_the_loss(whole, tm
     assert SEEN.search(lathe("measure", unsaid).output)
 
 
-@pytest.mark.parametrize("topic", LOST)
-def test_the_recording_ends_before_the_first_sample_that_may_rest_on_held_ones(topic, whole, tmp_path):
-    """Ten losses of a member each: earlier samples have all bits of the run, later ones are not read."""
-    complete = read_bag(whole)
-    with Source(whole) as bag:
-        about = dict(bag.about)
-    for first in np.random.default_rng(1).integers(0, complete.samples, 10).tolist():
-        entries = {HELD: json.dumps({topic: first}), SOUND: str(max(first - 4096, 0))}
-        sound = loss_of({**about, **entries}).first
-        assert sound == max(first - 4096, 0)
-        assert loss_of({HELD: entries[HELD]}).first == first, "a bag of an earlier version"
+@pytest.mark.parametrize(("topic", "first"), zip(LOST, FIRSTS, strict=True), ids=LOST)
+def test_the_recording_ends_before_the_first_sample_that_may_rest_on_held_ones(topic, first, whole, tmp_path):
+    """A member of each kind is lost: earlier samples have all bits of the run, later ones are not read."""
+    complete, sound = read_bag(whole), max(first - WINDOW, 0)
+    bag = with_loss(whole, tmp_path / "lost", {HELD: json.dumps({topic: first}), SOUND: str(sound)}, sound)
+    recording = read_bag(bag)
+    for name, signals in recording.dense.items():
+        for field, samples in signals.items():
+            assert np.array_equal(samples, complete.dense[name][field][:sound])
+    assert all(message.index < sound for name in recording.sparse for message in recording.messages(name))
+    assert (
+        recording.lost == f"not read from sample {sound} on: {topic} is held from sample {first} on, its node was lost"
+    )
+    assert recording.errors.rms.tolist() == complete.errors.rms[: recording.revolutions].tolist()
+    verdict = part.verdict(scenario(tool={"tolerance": 1.0}), recording)
+    assert not verdict.in_tolerance
+    assert verdict.told() == f"not judged (±1e+06 µm): {recording.lost}"
+    assert verdict.summary()["in_tolerance"] is None
+    assert read_bag(bag, whole=True).samples == complete.samples, "the samples are there for those that ask"
+
+
+def test_a_bag_of_an_earlier_version_ends_where_a_topic_is_held(whole, tmp_path):
+    assert loss_of({HELD: '{"/tool": 900, "/cut": 700}'}).first == 700
+    assert loss_of({}) is None
+    for wrong in ("[]", '{"/tool": -1}', '{"/tool": "x"}', "{"):
+        with pytest.raises(InputError, match=r"^lathe_rc.held = .* in the bag; allowed: what a recorder writes"):
+            loss_of({HELD: wrong})
+    with pytest.raises(InputError, match=r"^lathe_rc.sound = '-1' in the bag; allowed: what a recorder writes"):
+        loss_of({SOUND: "-1"})
+
+
+def test_a_copy_of_a_bag_names_the_loss_too(whole, lost, tmp_path):
+    """A filtered copy, and one together with another bag, end where the members of the first were lost."""
+    for name, words in (("part", ["--without", "/tool"]), ("both", [whole, "--topics", "/encoder"])):
+        assert lathe("bag", "copy", lost, *words, "-o", tmp_path / name).exit_code == 0
+        with Source(tmp_path / name) as copy:
+            assert str(copy.loss) == WHY
+
+
+def test_a_snapshot_around_the_loss_ends_with_it(lost, tmp_path):
+    """A snapshot that begins in the middle of a run is read up to the loss, with the indices of the run."""
+    first = 3 * TURN
+    about = {SNAPSHOT: json.dumps({"first_sample": first, "samples": 0, "whole": False, "triggers": []})}
+    recording = read_bag(with_loss(lost, tmp_path / "snapshot", about, SOUND_TO, first))
+    assert (recording.first, recording.samples) == (first, SOUND_TO - first)
+    assert recording.lost == WHY
+
+
+def test_the_panel_and_the_view_of_a_bag_end_at_the_loss(lost):
+    player = Player(lost)
+    player.advance(player.samples)
+    assert player.samples == SOUND_TO
+    assert len(player.view.revolutions) == 4
+    assert not SEEN.search(json.dumps(player.view.snapshot, default=str))
+    assert WHY in json.dumps(player.view.snapshot, default=str)
+
+
+# ---- faults of signals
+
+FAULTS = {
+    "coarse/state.position stuck": "electrodynamic_actuator",
+    "coarse/state.position noisy rms=1e-6": "tool",
+    "tool.error off": "tool",
+    "tool.displacement wrong scale=0.5": "tool",
+}
+
+
+@pytest.mark.parametrize(("fault", "node"), FAULTS.items())
+def test_no_form_error_rests_on_a_faulty_signal(fault, node, tmp_path):
+    """From the first fault of a signal of the form error on, no revolution is measured, in the run and from its bag."""
+    begin = {"faults": [f"revolution 3: {fault}"]}
+    cell = scenario({"allow_faults": True}, spindle_encoder={"revolutions": 6.0}, tool={"tolerance": 1.0})
+    cell = scenario(
+        {"allow_faults": True},
+        **{"spindle_encoder": {"revolutions": 6.0}, "tool": {"tolerance": 1.0}, node: begin}
+        | ({"tool": {"tolerance": 1.0, **begin}} if node == "tool" else {}),
+    )
+    result = harness.run(cell, bag=tmp_path / "bag")
+    why = f"from sample {3 * TURN} on: {node}: fault {fault}"
+    assert result.errors.rms.size == 3
+    assert result.verdict.told() == f"not judged (±1e+06 µm): not measured {why}"
+    assert result.summary()["not_measured"] == f"not measured {why}"
+    assert read_bag(tmp_path / "bag").digests() == result.digest, "the signals themselves are recorded as they were"
+    measured = lathe("measure", tmp_path / "bag", "--json")
+    assert (measured.exit_code, json.loads(measured.output)["not_measured"]) == (1, f"not measured {why}")
+    assert json.loads(lathe("bag", "info", tmp_path / "bag", "--json").output)["error_um"]["revolutions"] == 3
+    told = gather(tmp_path / "bag")
+    assert why in told.forms[0].refused
+    assert assess(told, [], None).verdict.mood == BAD
+
+
+def test_a_fault_of_what_only_controllers_read_leaves_the_form_error(tmp_path):
+    """The part is cut as the true signals say, and the fault's effect on it is what a run with faults shows."""
+    fault = {"faults": ["revolution 3: coarse/state.measured_position stuck"]}
+    cell = scenario({"allow_faults": True}, spindle_encoder={"revolutions": 6.0}, electrodynamic_actuator=fault)
+    result = harness.run(cell, bag=tmp_path / "bag")
+    assert result.errors.rms.size == 6
+    fitted = lathe("fit", "drive", tmp_path / "bag", "-o", tmp_path / "d.yaml")
+    assert fitted.exit_code == 2
+    assert (
+        "electrodynamic_actuator: fault coarse/state.measured_position stuck; allowed: signals without" in fitted.output
+    )

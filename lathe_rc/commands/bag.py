@@ -35,13 +35,16 @@ def bag() -> None:
     """Inspect, verify and recover bags, and extract the tachogram."""
 
 
-def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the numbers of the part's first and last revolution; None without a part. Memory use is bounded."""
+def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any]:
+    """Return the numbers of the part's first and last revolution, and why they are not those of the whole run.
+
+    Both are None without a part. Memory use is bounded.
+    """
     if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
-        return None
+        return {}
     ends = part.FirstAndLast(types)
-    stream.feed(path, [ends])
-    return ends.numbers()
+    header = stream.feed(path, [ends])
+    return {"error_um": ends.numbers(), "not_measured": ends.soundness.why or (str(header.loss or "") or None)}
 
 
 @bag.command()
@@ -88,6 +91,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             "events": [],
             "first_sample": 0,
             "error_um": None,
+            "not_measured": None,
         }
         try:
             for _, _, data in source.messages({topic for topic, kind in types.items() if kind == messages.EVENT}):
@@ -95,7 +99,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
                 summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
             summary["lost"] = str(source.loss) if source.loss else None
             summary["first_sample"] = stream.first_of(source)
-            summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
+            summary |= _metrics(path, types) if metrics and not source.damage else {}
         except LatheError as error:
             source.damage.append(str(error))
     code = _LOSSY if source.damage or summary["lost"] else 0
@@ -124,6 +128,8 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
+        if summary["not_measured"] and not summary["lost"]:
+            console.print(f"form error {summary['not_measured']}")
     for event in summary["events"]:
         console.print(f"event: sample {event['sample']}, {event['node']}: {event['action']}")
     _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)

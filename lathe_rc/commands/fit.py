@@ -43,9 +43,13 @@ def hysteresis(
     """
     if measured.is_dir() and not columns:
         from lathe_rc.bag import reader
+        from lathe_rc.cell.soundness import refuse_faults
 
         lossy.tell([measured])
-        loop = hysteresis_fit.from_signals(reader.read_bag(measured).dense, command_topic, state_topic)
+        recording = reader.read_bag(measured)
+        signals = [f"{command_topic}.position", f"{state_topic}.measured_position"]
+        refuse_faults(signals, recording.events, measured)
+        loop = hysteresis_fit.from_signals(recording.dense, command_topic, state_topic)
     else:
         loop = hysteresis_fit.of_measurement(measured_options.opened(measured, columns))
     found = hysteresis_fit.identify(loop, stroke)

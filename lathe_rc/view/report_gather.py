@@ -201,7 +201,11 @@ def gather(path: Path) -> Gathered:
         allowed, nose = provenance.tolerances(nodes), provenance.nose_radius(source.about)
         forms = [
             Form(
-                encoder, tool, next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0), nose
+                encoder,
+                tool,
+                next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0),
+                nose,
+                types,
             )
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
