@@ -184,7 +184,7 @@ class RunView(ABC):
         self._report_losses(first)
         if self._unsound:
             dense = {topic: signals for topic, signals in dense.items() if self._types[topic] not in _RESULTS}
-            sparse = {topic: found for topic, found in sparse.items() if self._types[topic] not in _RESULTS}
+            sparse = {topic: found for topic, found in sparse.items() if found and found[0].type not in _RESULTS}
         self._view.chunk(first, samples, dense, sparse)
 
     def lose(self, index: int, why: str) -> None:

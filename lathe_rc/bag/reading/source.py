@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -266,26 +267,29 @@ class Source:
         """Close the bag and remove its temporary files."""
         self._temporary.close()
 
-    @property
+    @cached_property
     def loss(self) -> Loss | None:
-        """Loss of a member, at which reading ends; None: the blocks are read to their end.
+        """Loss of a member, at which reading ends; None: the bag ends before, and is read to its end.
 
         Raises:
-            InputError: the bag's entry about it is not in the recorder's format.
+            InputError: the bag's entry about it is not in the recorder's format; see also `messages`.
         """
-        return None if self._whole else loss_of(self.about)
+        return loss_of(self.about) if not self._whole and self.last_ns >= self.loss_ns else None
 
-    @property
+    @cached_property
     def loss_ns(self) -> int:
-        """Simulated time of the `loss` [ns]; that of sample 0 if the bag has no block, and the largest without a loss.
+        """Simulated time at which a member was lost [ns]; later than all others without a loss (errors as for `loss`).
 
-        Raises:
-            InputError: see `loss` and `messages`.
+        It is that of sample 0 if the bag has no block.
         """
-        if not (loss := self.loss):
+        if not (loss := loss_of(self.about)):
             return _NEVER
-        dense = (topic for topic, said in self.topics.items() if said.type in block_types() and said.count)
-        return START_NS + loss.first * next((step for topic in dense if (step := self.step_ns(topic))), 0)
+        dense = {topic: said.type for topic, said in self.topics.items() if said.type in block_types()}
+        topic, _, data = next(self.messages(set(dense)), ("", 0, b"")) if dense else ("", 0, b"")
+        try:
+            return START_NS + loss.first * (Decoder(dense[topic]).decode(data).step_ns if topic else 0)
+        except ValueError as error:
+            raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
 
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
         """Yield the blocks of a dense topic, starting at a log time [ns], up to the `loss` of a member.
