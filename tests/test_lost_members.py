@@ -11,11 +11,14 @@ from bags import lathe
 from cells import STEP, scenario
 
 from lathe_rc import harness, messages, read_bag
+from lathe_rc.analysis.tolerance import FORCE
 from lathe_rc.bag.loss import HELD, SOUND, loss_of
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import SNAPSHOT
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.cell import part
+from lathe_rc.cell.loops import Loop, watches
+from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
 from lathe_rc.view.panel_player import Player
@@ -24,7 +27,7 @@ from lathe_rc.view.report_verdict import BAD, assess
 
 PLANTED = 73.13131313e-6  #: every held sample, and all that may rest on it [SI units]
 SEEN = re.compile(r"73\.13|7\.313|0\.07313")  #: as a page or a table tells it
-IN_FULL = re.compile(r"7\.3131313")  #: as a file of columns holds it, among millions of others
+IN_FULL = re.compile(r"7\.?3131313")  #: as a file of columns holds it, among millions of others
 TURN = 3840  #: samples of a revolution
 HELD_FROM, SOUND_TO = 3 * TURN + 300, 3 * TURN - 200
 #: of every kind of member but the time master, without which no sample follows
@@ -193,7 +196,8 @@ def test_no_form_error_rests_on_a_faulty_signal(fault, node, tmp_path):
     nodes[node]["faults"] = [f"revolution 2: {fault}"]
     cell = scenario({"allow_faults": True}, **nodes)
     result = harness.run(cell, bag=tmp_path / "bag")
-    why = f"from sample {2 * TURN} on: {node}: fault {fault}"
+    (begun,) = result.event_log
+    why = f"from sample {begun.sample} on: {node}: fault {fault}"
     assert result.errors.rms.size == 2
     assert result.verdict.told() == f"not judged (±1e+06 µm): not measured {why}"
     assert result.summary()["not_measured"] == f"not measured {why}"
@@ -217,3 +221,20 @@ def test_a_fault_of_what_only_controllers_read_leaves_the_form_error(tmp_path):
     assert (
         "electrodynamic_actuator: fault coarse/state.measured_position stuck; allowed: signals without" in fitted.output
     )
+
+
+@pytest.mark.parametrize(("fault", "turns"), [("cut.measured_force off", 2), ("cut hard_spot factor=2.0", 4)])
+def test_a_loop_is_judged_up_to_a_fault_of_its_sensor(fault, turns):
+    """A dead force sensor shows no error; a hard spot is of the material, and the loop's error with it is real."""
+    samples = 4 * 1000
+    types = {"/encoder": messages.ENCODER, "/cut": messages.CUT, "/longitudinal/command": messages.SERVO}
+    (watch,) = watches([Loop("force", "longitudinal/command", FORCE, 0, 1.0, 5.0, 1e-3)], types)
+    still = np.zeros(samples)
+    servo = {"set_point": still + 100.0, "error": still, "command": still}
+    dense = {"/encoder": {"angle_true": np.linspace(0.0, 8.0 * np.pi, samples)}, "/longitudinal/command": servo}
+    event = Sparse("/cutting_process/events", messages.EVENT, 2500, {"action": f"fault {fault}"})
+    watch.chunk(0, samples, dense, {event.topic: [event]})
+    result = watch.result()
+    assert result.found.errors.rms.size == turns
+    assert result.verdict.in_tolerance == (turns == 4)
+    assert result.why == ("" if turns == 4 else f"not measured from sample 2500 on: cutting_process: fault {fault}")

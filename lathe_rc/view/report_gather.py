@@ -164,6 +164,14 @@ class Gathered:
         ends = 0 < snapshot[1] == self.samples if snapshot else not any(tally.open_end for tally in dense)
         return bool(dense) and not self.stopped and ends
 
+    @property
+    def doubt(self) -> str:
+        """Reason why the run cannot be judged to its end, or held samples are in it; empty without one."""
+        lost = (
+            f"{name} lost {count} blocks, and held the sample before" for name, count in self.host.lost_blocks.items()
+        )
+        return self.stopped or "; ".join(lost)
+
     def has(self, kind: str) -> bool:
         """Return True if the bag has messages of a type."""
         return any(tally.count for tally in self.topics.values() if tally.type == kind)
