@@ -53,7 +53,7 @@ def test_a_campaign_of_kills_leaves_no_figure_on_held_samples(name, node, undist
         bag = tmp_path / f"bag{number}"
         cell = load(name, [f"spindle_encoder.revolutions={ENDLESS}", "spindle_encoder.safe_time=0.05"])
         with pytest.raises(LatheError, match="was killed by SIGKILL"):
-            harness.run(cell, mode="processes", bag=bag, watch=Killer(node, instant))
+            harness.run(cell, mode="processes", groups=[], bag=bag, watch=Killer(node, instant))
         recording = read_bag(bag)
         count = min(recording.samples, whole.samples)
         for topic, signals in recording.dense.items():
