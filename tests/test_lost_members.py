@@ -238,3 +238,14 @@ def test_a_loop_is_judged_up_to_a_fault_of_its_sensor(fault, turns):
     assert result.found.errors.rms.size == turns
     assert result.verdict.in_tolerance == (turns == 4)
     assert result.why == ("" if turns == 4 else f"not measured from sample 2500 on: cutting_process: fault {fault}")
+
+
+def test_a_copy_of_what_follows_the_loss_has_nothing_to_read(lost, tmp_path):
+    assert (
+        lathe("bag", "copy", lost, "--start", (SOUND_TO + TURN) * STEP * 1e-9, "-o", tmp_path / "rest").exit_code == 0
+    )
+    recording = read_bag(tmp_path / "rest")
+    assert (recording.samples, recording.lost) == (0, WHY)
+    done = lathe("measure", tmp_path / "rest")
+    assert done.exit_code == 2
+    assert WHY in done.output

@@ -232,10 +232,10 @@ class View:
         for watch in self._watches:
             if named.keys() >= {*watch.topics}:  # a live view does not listen to controllers
                 watch.chunk(first, samples, named, sparse)
+        before, sound = self._soundness.why, self._soundness.sound(first, samples, sparse)
+        if self._soundness.why != before:
+            self.say(first + sound, "panel", f"form error {self._soundness.why}")
         if encoder and tool:
-            before, sound = self._soundness.why, self._soundness.sound(first, samples, sparse)
-            if self._soundness.why != before:
-                self.say(first + sound, "panel", f"form error {self._soundness.why}")
             self._part(first, encoder["angle_true"], tool, sound)
 
     def _part(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:

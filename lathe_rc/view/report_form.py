@@ -94,6 +94,9 @@ class Form:
         if self.refused:
             return
         sound = self._soundness.sound(first, samples, sparse)
+        if not sound:
+            self._refuse(self._soundness.why)
+            return
         angle = dense[self._encoder]["angle_true"][:sound]
         tool = {name: array[:sound] for name, array in dense[self.tool].items()}
         if first and not self._held.size and not self._done:  # a snapshot begins in the middle of a revolution

@@ -133,8 +133,8 @@ class Scene:
                 self._log_messages(full(topic), found)
         for watch in self._loops:
             watch.chunk(first, samples, named, sparse)
+        sound = self._soundness.sound(first, samples, sparse)
         if angle is not None and self._tool in named:
-            sound = self._soundness.sound(first, samples, sparse)
             self._log_part(first, angle, named[self._tool], sound)
 
     def close(self) -> None:

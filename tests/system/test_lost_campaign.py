@@ -16,7 +16,7 @@ pytestmark = pytest.mark.system
 REVOLUTIONS = {"supervised_full_cell": 8.0, "gauged": 8.0}
 ENDLESS = 1000.0
 KILLED = {
-    "supervised_full_cell": [*load("supervised_full_cell").nodes, "recorder"],
+    "supervised_full_cell": [*load("supervised_full_cell").nodes],
     "gauged": ["controller", "profile", "loaded_drive", "gauge"],
 }
 

@@ -307,6 +307,8 @@ class From:
 def first_of(source: Source) -> int:
     """Return the first sample of all dense topics: not 0 in a snapshot, or if the recorder joined a running cell.
 
+    It is that of the loss in a bag that only has samples from the loss of a member on.
+
     Raises:
         InputError: the bag is damaged at the first block of a topic.
         LatheError: this block cannot be decoded.
@@ -314,7 +316,8 @@ def first_of(source: Source) -> int:
     if span := span_of(source.about):
         return span[0]
     dense = [topic for topic, each in source.topics.items() if each.type in messages.block_types()]
-    return max((block.first_index for topic in dense for block in islice(source.blocks(topic), 1)), default=0)
+    nothing = source.loss.first if source.loss else 0
+    return max((block.first_index for topic in dense for block in islice(source.blocks(topic), 1)), default=nothing)
 
 
 def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536, whole: bool = False) -> BagHeader:
