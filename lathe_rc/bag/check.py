@@ -168,7 +168,7 @@ def check(path: Path) -> Findings:
         for topic, first in held(source.about).items()
     ]
     if loss := source.loss:
-        findings.lost.append(f"samples from {loss.first} on are held, or may rest on held ones: {loss.why}")
+        findings.lost.append(f"samples from {loss.first} on are held or guessed, or may rest on such: {loss.why}")
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result({topic: looked.part for topic, looked in sparse.items()})
         _compare(path, findings)

@@ -241,10 +241,10 @@ class RecorderRole(Role):
                 held[topic] = queue.held_from
         if self._snapshots is not None and not again:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
-        if not again:
-            # Other readers may have received fewer of a lost member's last blocks, but all that precede the window.
-            self._sound = max(first - self.table.window * self.table.block_size, 0)
-        self._sound = min(self._sound, *held.values(), first)
+        # Other readers may have received fewer of a lost member's last blocks, but all that precede the window. Without
+        # a lost member, the time master has lost its encoder.
+        sound = max(first - self.table.window * self.table.block_size, 0) if lost else first
+        self._sound = min([sound, *held.values(), *([self._sound] if again else [])])
         self._open.tell({loss.HELD: json.dumps(held), loss.SOUND: str(self._sound)})
         self._merger.forget(lost)
         for topic, queue in self._queues.items():
