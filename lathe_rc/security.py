@@ -130,8 +130,9 @@ class _Maker:
         )
 
     def rerun_bridge(self) -> Profile:
-        """Return the profile of the Rerun bridge, which reads the signals shown in a scene."""
-        return self._node(RERUN_BRIDGE, subscribe=[t for t, source in self._signals.items() if is_drawn(source.type)])
+        """Return the profile of the Rerun bridge, which reads the signals shown in a scene and the cell's state."""
+        drawn = [topic for topic, source in self._signals.items() if is_drawn(source.type)]
+        return self._node(RERUN_BRIDGE, subscribe=[*drawn, "cell_state"])
 
     def panel(self) -> Profile:
         """Return the profile of an attached panel, which reads the same signals as the Rerun bridge."""

@@ -40,7 +40,7 @@ KEYS = [
     "dropped",
 ]
 KEYS += ["lateness_s", "refused", "events", "not_reached", "unchecked", "warnings", "stability_margin", "drive_margin"]
-KEYS += ["error_um", "tolerance_um", "growth_um", "loops", "along_um", "bag", "snapshots", "digest"]
+KEYS += ["error_um", "not_measured", "tolerance_um", "growth_um", "loops", "along_um", "bag", "snapshots", "digest"]
 PER_REVOLUTION = ["per_revolution_rms", "per_revolution_peak_to_valley", "per_revolution_ront"]
 
 

@@ -109,7 +109,7 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     (safe,) = [event for event in events if event["event"] == "safe"]
     assert safe["lost"] == [f"/{node}"]
     assert safe["end"] == safe["sample"] + 6400
-    recording = reader.read_bag(bag)
+    recording = reader.read_bag(bag, whole=True)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     state = recording.of_type(messages.STATE)
     if node == "electrodynamic_actuator":
@@ -122,6 +122,11 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     if node != "supervisor":
         (status,) = [each for each in recording.sparse["/safety/status"].values["monitor"] if each == "members_lost"]
         assert status
+    sound = reader.read_bag(bag)
+    assert safe["sample"] - 64 * 64 <= sound.samples <= safe["sample"], (
+        "reading ends where samples may rest on held ones"
+    )
+    assert f"not read from sample {sound.samples} on: /" in sound.lost
     found = check(bag)
     assert not found.wrong
     assert any("the node was lost" in line for line in found.lost)
@@ -151,7 +156,7 @@ def test_a_member_that_fails_by_an_error_ends_in_the_safe_state(mode, groups, tm
     (complete,) = [event["monotonic_ns"] for event in events if event["event"] == "complete"]
     left = [event["monotonic_ns"] for event in events if event["event"] == "exit"]
     assert all(complete < moment for moment in left), "DDS sends nothing again for a process that has left"
-    recording = reader.read_bag(bag)
+    recording = reader.read_bag(bag, whole=True)
     assert {signals.size for fields in recording.dense.values() for signals in fields.values()} == {safe["end"]}
     assert recording.of_type(messages.STATE)["position"][-1] == pytest.approx(0.3e-3, abs=1e-6)
     assert "members_lost" in recording.sparse["/safety/status"].values["monitor"]

@@ -62,6 +62,7 @@ class Verdict:
             revolution if it is out of tolerance; (0, 0) without a revolution.
         largest: largest magnitude of the error in these revolutions [m]; NaN without a revolution.
         quantity: quantity that is judged.
+        unjudged: reason why the end of the run cannot be judged; empty if it can.
     """
 
     tolerance: float
@@ -70,11 +71,12 @@ class Verdict:
     over: tuple[int, int]
     largest: float
     quantity: Quantity = FORM
+    unjudged: str = ""
 
     @property
     def in_tolerance(self) -> bool:
-        """Whether the part is in tolerance at the end of the run."""
-        return self.since > 0
+        """Whether the part is in tolerance at the end of the run; False if that cannot be judged."""
+        return self.since > 0 and not self.unjudged
 
     @property
     def spare(self) -> float:
@@ -85,6 +87,8 @@ class Verdict:
         """Describe the result as text."""
         told = self.quantity.told
         allowed = f"±{told(self.tolerance)}"
+        if self.unjudged:
+            return f"not judged ({allowed}): {self.unjudged}"
         if not self.revolutions:
             return f"not in tolerance ({allowed}): no complete revolution"
         if not self.in_tolerance:
@@ -96,6 +100,9 @@ class Verdict:
     def summary(self) -> dict[str, object]:
         """Return the result for JSON, in the quantity's unit."""
         scale = self.quantity.scale
+        if self.unjudged:
+            empty = dict.fromkeys(("in_tolerance", "from_revolution", "largest", "spare", "over_revolutions"))
+            return {"allowed": self.tolerance * scale, **empty, "unjudged": self.unjudged}
         return {
             "allowed": self.tolerance * scale,
             "in_tolerance": self.in_tolerance,
@@ -136,7 +143,9 @@ class Growth:
         return {"diverges": self.diverges, "from_revolution": self.since, **sizes}
 
 
-def judge(largest: Array, tolerance: float, before: int = 0, quantity: Quantity = FORM) -> Verdict:
+def judge(
+    largest: Array, tolerance: float, before: int = 0, quantity: Quantity = FORM, *, unjudged: str = ""
+) -> Verdict:
     """Judge whether a run is in tolerance.
 
     Args:
@@ -144,16 +153,17 @@ def judge(largest: Array, tolerance: float, before: int = 0, quantity: Quantity 
         tolerance: allowed error to each side [m].
         before: number of revolutions before the first of these, for a snapshot.
         quantity: quantity that is judged.
+        unjudged: reason why the end of the run cannot be judged; empty if it can.
     """
     count = largest.size
     if not count:
-        return Verdict(tolerance, 0, 0, (0, 0), np.nan, quantity)
+        return Verdict(tolerance, 0, 0, (0, 0), np.nan, quantity, unjudged)
     outside = np.flatnonzero(~(largest <= tolerance))  # NaN counts as out of tolerance
     inside = int(outside[-1]) + 1 if outside.size else 0  # first of the final sequence in tolerance
     start = max(inside, count - LAST) if inside < count else count - 1
     since = inside + 1 + before if inside < count else 0
     over = (start + 1 + before, count + before)
-    return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity)
+    return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity, unjudged)
 
 
 def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from lathe_rc import files, messages
 from lathe_rc.bag import provenance
+from lathe_rc.bag.loss import held
 from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
 from lathe_rc.bag.reading.source import Source, files_of
@@ -166,8 +167,10 @@ def check(path: Path) -> Findings:
         findings.lost.append(f"the snapshot has {findings.samples} samples, and {why}")
     findings.lost += [
         f"{topic}: from sample {first} on its newest value, held: the node was lost"
-        for topic, first in provenance.held(source.about).items()
+        for topic, first in held(source.about).items()
     ]
+    if loss := source.loss:
+        findings.lost.append(f"samples from {loss.first} on are held or guessed, or may rest on such: {loss.why}")
     if dense and not findings.lost and not findings.wrong:
         findings.digests = digester.result({topic: looked.part for topic, looked in sparse.items()})
         _compare(path, findings)

@@ -33,7 +33,6 @@ SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versi
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
 FILE = "lathe_rc.file."  #: key prefix before NODE.PARAM; the value is the content of the file that the parameter names
 ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are any
-HELD = "lathe_rc.held"  #: for each topic of a lost node, the sample from which its last value was held
 RECOVERED = "lathe_rc.recovered"  #: recovery report, including the losses
 COPIED = "lathe_rc.copied"  #: number of messages copied from each source bag
 _MOST_FILE = 2**19  # longest file that is stored [B]
@@ -198,15 +197,6 @@ def foreign(about: Mapping[str, str]) -> list[str]:
     ]
     lacking = [f"{key} names a file that the bag does not hold, {shown(path)}" for key, path in files.items()]
     return [*dict.fromkeys(code), *lacking]
-
-
-def held(about: Mapping[str, str]) -> dict[str, int]:
-    """Return, for each topic of a lost node, the sample from which its last value was held."""
-    try:
-        told = json.loads(about.get(HELD, "{}"))
-        return {str(topic)[:256]: int(first) for topic, first in list(told.items())[:256]}
-    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
-        raise InputError(f"{HELD} of the bag is not what a recorder writes; recover the bag") from None
 
 
 def another(about: Mapping[str, str], key: str, said: str) -> dict[str, str]:

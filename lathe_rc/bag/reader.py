@@ -31,8 +31,15 @@ class _Collector:
             self.sparse.setdefault(topic, []).extend(found)
 
 
-def read_bag(path: str | os.PathLike[str]) -> Recording:
+def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
     """Read all signal topics of a bag into memory; `lathe_rc.bag.reading.stream` reads longer bags in chunks.
+
+    If members of the cell were lost, the recording ends there, and its ``lost`` gives the reason: later samples are
+    held, or may rest on held ones.
+
+    Args:
+        path: path of the bag.
+        whole: whether reading continues after the loss of a member, up to the end of the safe state.
 
     Example:
         >>> import lathe_rc
@@ -49,7 +56,7 @@ def read_bag(path: str | os.PathLike[str]) -> Recording:
         LatheError: a block is missing or repeated.
     """
     collected = _Collector()
-    header = feed(Path(path), [collected])
+    header = feed(Path(path), [collected], whole=whole)
     dense, sparse = {}, {}
     for topic, msgtype in header.types.items():
         if msgtype in messages.block_types():
@@ -61,4 +68,5 @@ def read_bag(path: str | os.PathLike[str]) -> Recording:
             for message in collected.sparse.get(topic, []):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
     samples = next((array.size for signals in dense.values() for array in signals.values()), 0)
-    return Recording(header.types, dense, sparse, header.step_ns, header.samples - samples)
+    lost = str(header.loss or "")
+    return Recording(header.types, dense, sparse, header.step_ns, header.samples - samples, lost)

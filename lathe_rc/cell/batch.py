@@ -25,6 +25,7 @@ from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
@@ -168,13 +169,17 @@ def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> O
 
 
 class Errors:
-    """Keeper of the form error by revolution."""
+    """Keeper of the form error by revolution, up to a fault of a signal that it is made of (`soundness`)."""
 
     def __init__(self, cell: Cell, samples: int) -> None:
         named = {source.type: topic for topic, source in reversed(cell.dense.items())}
         self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
         read = {self._encoder: "angle_true", self._tool: "error"}
         self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read.items() if topic]
+        types = {topic: source.type for topic, source in cell.dense.items()}
+        self.soundness = Soundness(fields_of(types, FORM))
+        if any(stage.shared.faults for stage in cell.stages.values()):
+            self.heard = [*self.heard, *(t for t, source in cell.sparse.items() if source.type == messages.EVENT)]
         self._errors, self._first, self._before = RunningErrors(), cell.first, 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -183,7 +188,8 @@ class Errors:
             if first == self._first > 0:
                 self._before = turns_before(dense[self._encoder]["angle_true"])
                 self._errors = RunningErrors(self._before)
-            self._errors.add(dense[self._encoder]["angle_true"], dense[self._tool]["error"])
+            sound = self.soundness.sound(first, samples, sparse)
+            self._errors.add(dense[self._encoder]["angle_true"][:sound], dense[self._tool]["error"][:sound])
 
     def kept(self) -> FormErrors:
         """Return the form error of each complete revolution; empty if the scenario has no tool."""

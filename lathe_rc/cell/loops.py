@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of the force and position loops of a run: figures and verdict from the messages of their controllers."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,6 +12,7 @@ from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, Step
 from lathe_rc.analysis.tolerance import FORCE, LAST, POSITION, Growth, Quantity, Verdict, judge, swing_growth
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.soundness import Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.servo import ServoParameters
 from lathe_rc.messages import Signals, full
@@ -83,11 +84,13 @@ class LoopResult:
         loop: the loop.
         found: its behaviour by revolution.
         before: number of revolutions before the first one.
+        why: reason why the loop was not evaluated to the end of the run; empty if it was.
     """
 
     loop: Loop
     found: LoopErrors
     before: int = 0
+    why: str = ""
 
     @property
     def verdict(self) -> Verdict | None:
@@ -95,7 +98,7 @@ class LoopResult:
         loop = self.loop
         if not loop.tolerance:
             return None
-        return judge(self.found.errors.largest, loop.tolerance, self.before, loop.quantity)
+        return judge(self.found.errors.largest, loop.tolerance, self.before, loop.quantity, unjudged=self.why)
 
     @cached_property
     def growth(self) -> Growth | None:
@@ -127,6 +130,8 @@ class LoopResult:
             yield f"{_FAILURES[limits.state].format(loop.name)} ({shares})", False
         if verdict := self.verdict:
             yield verdict.told(), verdict.in_tolerance
+        elif self.why:
+            yield self.why, False
         elif errors.rms.size:
             last = loop.quantity.told(float(errors.largest[-LAST:].max()))
             yield f"no tolerance is set; error at most {last} in the last {min(errors.rms.size, LAST)}", None
@@ -197,6 +202,7 @@ class LoopResult:
             "reversals": {"count": found.reversals, "max": found.glitch * scale} if found.reversals else None,
             "saturated": float(found.saturated.mean()) if errors.rms.size else None,
             "anti_windup": float(found.held.mean()) if errors.rms.size else None,
+            "not_measured": self.why or None,
             "tolerance": verdict.summary() if verdict else None,
             "growth": grown.summary() if grown else None,
             "limits": found.limits and {**asdict(found.limits), "state": found.limits.state},
@@ -230,36 +236,54 @@ class LoopWatch:
     Args:
         loop: the loop.
         encoder, topic: names of the topics with the angle and with the controller's messages.
+        measured: signals that the controller measures, as ``/TOPIC.FIELD``.
 
     Attributes:
         loop: see the arguments.
         topics: topics that the sink reads.
     """
 
-    def __init__(self, loop: Loop, encoder: str, topic: str) -> None:
+    def __init__(self, loop: Loop, encoder: str, topic: str, measured: Collection[str] = ()) -> None:
         self.loop, self.topics = loop, (encoder, topic)
+        self._soundness = Soundness({*measured, *(f"{full(topic)}.{field}" for field in ("set_point", "error"))})
         self._before = 0
         self._running: RunningLoop | None = None
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add consecutive samples."""
         encoder, topic = self.topics
-        angle, servo = dense[encoder]["angle_true"], dense[topic]
+        sound = self._soundness.sound(first, dense[encoder]["angle_true"].size, sparse)
+        angle, servo = dense[encoder]["angle_true"][:sound], dense[topic]
         if self._running is None:
             self._before = turns_before(angle)
             self._running = self.loop.running(self._before)
-        self._running.add(angle, servo["set_point"], servo["error"], servo["command"])
+        if sound:
+            self._running.add(angle, *(servo[name][:sound] for name in ("set_point", "error", "command")))
 
     def result(self) -> LoopResult:
         """Return the result of the loop, as if the run ended after the samples so far."""
-        return LoopResult(self.loop, (self._running or self.loop.running(0)).found(), self._before)
+        running = self._running or self.loop.running(0)
+        return LoopResult(self.loop, running.found(), self._before, self._soundness.why)
 
 
 def watches(found: Sequence[Loop], types: Mapping[str, str]) -> list[LoopWatch]:
     """Return a sink for each loop whose messages are among topics with these message types, together with an angle."""
     encoder = next((topic for topic, kind in types.items() if kind == messages.ENCODER), None)
     named = ((loop, next((topic for topic in types if full(topic).endswith(f"/{loop.topic}")), None)) for loop in found)
-    return [LoopWatch(loop, encoder, topic) for loop, topic in named if encoder and topic]
+    forces = fields_of(types, {(messages.CUT, "measured_force")})
+    deflections = fields_of(types, {(messages.CUT, "deflection")})
+    return [
+        LoopWatch(
+            loop,
+            encoder,
+            topic,
+            forces
+            if loop.quantity is FORCE
+            else {*deflections, f"{full(topic).rpartition('/')[0]}/state.measured_position"},
+        )
+        for loop, topic in named
+        if encoder and topic
+    ]
 
 
 def evaluated(found: list[Loop], recording: Recording) -> dict[str, LoopResult]:
@@ -272,5 +296,6 @@ def evaluated(found: list[Loop], recording: Recording) -> dict[str, LoopResult]:
                 topic: {name: samples[piece] for name, samples in recording.dense[topic].items()}
                 for topic in watch.topics
             }
-            watch.chunk(recording.first + start, 0, dense, {})
-    return {watch.loop.node: watch.result() for watch in made}
+            watch.chunk(recording.first + start, 0, dense, {} if start else recording.events)
+    found_by = {watch.loop.node: watch.result() for watch in made}
+    return {node: replace(result, why=result.why or recording.lost) for node, result in found_by.items()}

@@ -15,6 +15,7 @@ from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
@@ -36,12 +37,15 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     """
     if not {messages.TOOL, messages.ENCODER} <= set(recording.types.values()):
         raise InputError("nothing to measure: the recording has no encoder and tool; record both")
+    sound, reason = recording.sound_form
     angle, error = (
-        recording.of_type(kind)[field] for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
+        recording.of_type(kind)[field][:sound]
+        for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
     )
     found = measure(angle - 2.0 * np.pi * turns_before(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
     if not found.form.rms.size:
-        raise InputError("nothing to measure: the recording has no complete revolution; let it run longer")
+        why = f": {reason}" if reason else "; let it run longer"
+        raise InputError(f"nothing to measure: the recording has no complete revolution{why}")
     return found
 
 
@@ -56,7 +60,7 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
-            return judge(recording.errors.largest, allowed, _turns_before(recording))
+            return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=recording.sound_form[1])
     return None
 
 
@@ -78,8 +82,9 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
         found: measurement of the same recording by `measured`.
         nose_radius: nose radius of the tool in the plane of the feed [m].
     """
-    angle = recording.of_type(messages.ENCODER)["angle_true"]
-    height = evenly(angle - 2.0 * np.pi * turns_before(angle), recording.of_type(messages.TOOL)["height"])
+    sound, _ = recording.sound_form
+    angle, height = recording.of_type(messages.ENCODER)["angle_true"], recording.of_type(messages.TOOL)["height"]
+    height = evenly(angle[:sound] - 2.0 * np.pi * turns_before(angle), height[:sound])
     return lay(found.profile, height, nose_radius)
 
 
@@ -140,10 +145,11 @@ class ErrorsByRevolution:
 
     Attributes:
         turns_before: number of revolutions before the first one.
+        soundness: end of the samples on which the form error may rest.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
-        self._topics = _encoder_and_tool(types)
+        self._topics, self.soundness = _encoder_and_tool(types), Soundness(fields_of(types, FORM))
         self._errors: RunningErrors | None = None
         self.turns_before = 0
 
@@ -157,7 +163,8 @@ class ErrorsByRevolution:
         if self._errors is None:
             self.turns_before = turns_before(angle)
             self._errors = RunningErrors(self.turns_before)
-        self._errors.add(angle, error)
+        sound = self.soundness.sound(first, samples, sparse)
+        self._errors.add(angle[:sound], error[:sound])
 
     def rms(self) -> np.ndarray:
         """Return the RMS form error of each complete revolution so far [m], shape (revolutions,)."""
@@ -169,13 +176,16 @@ class FirstAndLast:
 
     Args:
         types: message type by fully qualified topic; includes an encoder and a tool.
+
+    Attributes:
+        soundness: end of the samples on which the form error may rest.
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
         encoder, tool = _encoder_and_tool(types)
         assert encoder is not None, "its caller has looked"
         assert tool is not None, "its caller has looked"
-        self._encoder, self._tool = encoder, tool
+        self._encoder, self._tool, self.soundness = encoder, tool, Soundness(fields_of(types, FORM))
         self._head = self._tail = np.empty((2, 0))  # angle and error
         self._start = 0.0  # angle at the start of the first revolution [rad]
         self._before = 0  # revolutions before the tail
@@ -183,7 +193,10 @@ class FirstAndLast:
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
         named = {full(topic): signals for topic, signals in dense.items()}
-        angle, error = named[self._encoder]["angle_true"], named[self._tool]["error"]
+        sound = self.soundness.sound(first, samples, sparse)
+        if not sound:
+            return
+        angle, error = named[self._encoder]["angle_true"][:sound], named[self._tool]["error"][:sound]
         piece = np.stack([angle, error])[:, that_count(angle, error)]
         if not self._tail.size:
             self._before = turns_before(piece[0])

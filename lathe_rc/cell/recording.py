@@ -13,6 +13,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end, turns_before
 from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
@@ -54,6 +55,7 @@ class Recording:
         sparse: sparse messages by fully qualified topic.
         step_ns: sampling step [ns]; 0 without a dense topic.
         first: index of the first sample of the arrays; 0 except in a snapshot.
+        lost: reason why the recording ends before the run, at the loss of a member; empty if it does not.
 
     Example:
         >>> import lathe_rc
@@ -72,11 +74,18 @@ class Recording:
     sparse: Mapping[str, SparseTopic]
     step_ns: int
     first: int = 0
+    lost: str = ""
 
     def __repr__(self) -> str:
         """Return a one-line summary of the content."""
         size = f"{self.samples} samples ({self.samples * self.step_ns * 1e-9:.3g} s)"
-        told = [f"{len(self.types)} topics", size, self.turned(), *self.errors.told()]
+        told = [
+            f"{len(self.types)} topics",
+            size,
+            self.turned(),
+            *self.errors.told(),
+            *filter(None, [self.sound_form[1]]),
+        ]
         return f"<Recording: {', '.join(told)}>"
 
     def _repr_html_(self) -> str:
@@ -121,8 +130,25 @@ class Recording:
         """Form error of each complete revolution; empty if there is no tool."""
         if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
             return form_errors(np.empty(0), np.empty(0))
-        angle = self.of_type(messages.ENCODER)["angle_true"]
-        return form_errors(angle, self.of_type(messages.TOOL)["error"], turns_before(angle))
+        sound, _ = self.sound_form
+        angle = self.of_type(messages.ENCODER)["angle_true"][:sound]
+        return form_errors(angle, self.of_type(messages.TOOL)["error"][:sound], turns_before(angle))
+
+    @cached_property
+    def sound_form(self) -> tuple[int, str]:
+        """Number of samples on which the form error may rest, and the reason if these are not those of the whole run.
+
+        The reason is a fault of a signal that the form error is made of, or the loss of a member (`lost`).
+        """
+        soundness = Soundness(fields_of(self.types, FORM))
+        sound = soundness.sound(self.first, self.samples, self.events)
+        return sound, soundness.why or self.lost
+
+    @property
+    def events(self) -> dict[str, list[Sparse]]:
+        """Events of the nodes at samples, by topic."""
+        topics = [topic for topic in self.sparse if self.types[topic] == messages.EVENT] if self.step_ns else []
+        return {topic: self.messages(topic) for topic in topics}
 
     def frame(self, topic: str) -> Any:
         """Return a topic as a table with one row per sample or message, or per element of a message with lists.
@@ -197,7 +223,7 @@ class Recording:
             why = (
                 f"no {' and no '.join(missing)}; record both"
                 if missing
-                else "no complete revolution; let it run longer"
+                else f"no complete revolution{f': {why}' if (why := self.sound_form[1]) else '; let it run longer'}"
             )
             raise InputError(f"nothing to draw: the recording has {why}")
         angle, tool = self.of_type(messages.ENCODER)["angle_true"], self.of_type(messages.TOOL)

@@ -22,7 +22,7 @@ from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 from lathe_rc.cell import part
-from lathe_rc.commands import options, tables
+from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
 from lathe_rc.names import instead
 
@@ -35,13 +35,16 @@ def bag() -> None:
     """Inspect, verify and recover bags, and extract the tachogram."""
 
 
-def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the numbers of the part's first and last revolution; None without a part. Memory use is bounded."""
+def _metrics(path: Path, types: Mapping[str, str]) -> dict[str, Any]:
+    """Return the numbers of the part's first and last revolution, and why they are not those of the whole run.
+
+    Both are None without a part. Memory use is bounded.
+    """
     if not {messages.TOOL, messages.ENCODER} <= set(types.values()):
-        return None
+        return {}
     ends = part.FirstAndLast(types)
-    stream.feed(path, [ends])
-    return ends.numbers()
+    header = stream.feed(path, [ends])
+    return {"error_um": ends.numbers(), "not_measured": ends.soundness.why or (str(header.loss or "") or None)}
 
 
 @bag.command()
@@ -85,21 +88,25 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             "contradictions": source.contradictions,
             "foreign": provenance.foreign(source.about),
             "damage": source.damage,
+            "lost": None,
             "events": [],
             "first_sample": 0,
             "error_um": None,
+            "not_measured": None,
         }
         try:
             for _, _, data in source.messages({topic for topic, kind in types.items() if kind == messages.EVENT}):
                 event = messages.decode(messages.EVENT, data)
                 summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
+            summary["lost"] = str(source.loss) if source.loss else None
             summary["first_sample"] = stream.first_of(source)
-            summary["error_um"] = _metrics(path, types) if metrics and not source.damage else None
+            summary |= _metrics(path, types) if metrics and not source.damage else {}
         except (LatheError, ValueError) as error:
             source.damage.append(str(error))
+    code = _LOSSY if source.damage or summary["lost"] else 0
     if as_json:
         click.echo(json.dumps(summary))
-        ctx.exit(_LOSSY if source.damage else 0)
+        ctx.exit(code)
     console = tables.console()
     table = tables.table("topic", "type", "messages", "rate [Hz]", left=2, no_wrap=True)
     for topic, entry in topics.items():
@@ -108,7 +115,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
     console.print(table)
     for each in source.unread:
         console.print(f"not read: {each}")
-    for what in (*summary["contradictions"], *summary["damage"]):
+    for what in (*summary["contradictions"], *summary["damage"], *filter(None, [summary["lost"]])):
         click.echo(what, err=True)
     for what in summary["foreign"]:
         console.print(what)
@@ -124,10 +131,12 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
+        if summary["not_measured"] and not summary["lost"]:
+            console.print(f"form error {summary['not_measured']}")
     for event in summary["events"]:
         console.print(f"event: sample {event['sample']}, {event['node']}: {event['action']}")
     _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)
-    ctx.exit(_LOSSY if source.damage else 0)
+    ctx.exit(code)
 
 
 def _print_about(console: Console, about: Mapping[str, str], *, whole: bool) -> None:
@@ -290,6 +299,7 @@ def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, 
     made = make_tachogram(path, target, tolerance, topic)
     if as_json:
         click.echo(json.dumps({"bag": str(path), "output": str(target), **asdict(made)}))
+        lossy.end(path)
         return
     held = f"{made.points} rows for {made.samples} samples of {made.field}"
     click.echo(f"{held}, within {made.largest:.4g} rpm: {target}")
@@ -298,3 +308,4 @@ def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, 
             f"the spindle stands still for {made.standstill:.4g} s, first at {made.stands_from:.4g} s: a "
             "spindle_encoder refuses the rows with 0 rpm"
         )
+    lossy.end(path)

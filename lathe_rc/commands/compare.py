@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lathe_rc import allowed_code
-from lathe_rc.commands import measured, options
+from lathe_rc.commands import lossy, measured, options
 
 
 @click.command()
@@ -34,3 +34,4 @@ def compare(runs: Sequence[Path], output: Path) -> None:
                 harness.run(scenarios.load(str(path), []), bag=bags[name])
         comparing.write_comparison(bags, output, [str(path) for path in runs])
     click.echo(f"comparison: {output}")
+    lossy.end(*filter(measured.is_bag, runs))

@@ -15,8 +15,9 @@ from lathe_rc.analysis.form_correction import Alignment, Correction, Revolution
 from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import FORM, fields_of, refuse_faults
 from lathe_rc.cell.stages.form import FormParameters
-from lathe_rc.commands import completers, measured, options, tables
+from lathe_rc.commands import completers, lossy, measured, options, tables
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError
 from lathe_rc.files import check_place
@@ -73,6 +74,9 @@ def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
         raise InputError(f"{path}: no readings of a gauge; allowed: a bag of a cell with a gauge, or CSV, or X3P")
     if len(topics) > 1:
         raise InputError(f"{path}: readings of {len(topics)} gauges; allowed: --topic with one of {', '.join(topics)}")
+    encoder = next(name for name in recording.dense if recording.types[name] == messages.ENCODER)
+    read = {f"{topics[0]}.measured_position", f"{topics[0]}.effort", f"{encoder}.angle"}
+    refuse_faults(read | fields_of(recording.types, FORM), recording.events, path)
     reading, angle = recording.dense[topics[0]], recording.of_type(messages.ENCODER)["angle"]
     there, turn = reading["effort"] > 0.0, np.floor(angle / _TURN).astype(int)
     begun, end = angle[there].min(initial=np.inf) / _TURN - _LATE, angle[-1] / _TURN - 1.0
@@ -337,3 +341,4 @@ def correct(
         click.echo(json.dumps(summary))
     else:
         _show(summary, output)
+    lossy.end(*filter(measured.is_bag, records))

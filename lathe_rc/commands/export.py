@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from lathe_rc.commands import completers, options
+from lathe_rc.commands import completers, lossy, options
 from lathe_rc.errors import InputError
 
 _TARGETS = ("x86-64", "aarch64")  # those of lathe_rc.c_library.object_code, whose import takes a second
@@ -41,6 +41,7 @@ def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[st
     place = output or Path(f"{name}.npz" if kind == "npz" else f"{name}-{kind}")
     done = exporting.export_bag(bag, place, kind, topics)
     click.echo(f"{len(done.rows)} topics, {sum(done.rows.values())} rows: {done.place}")
+    lossy.end(bag)
 
 
 @export.command("c")

@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from lathe_rc.analysis import frequency_response, hysteresis_fit, reduced_order
+from lathe_rc.commands import lossy, options, picture
 from lathe_rc.commands import measured as measured_options
-from lathe_rc.commands import options, picture
 from lathe_rc.commands.fit_drive import drive
 from lathe_rc.commands.tables import console
 from lathe_rc.control.decoupler import LAG
@@ -43,8 +43,13 @@ def hysteresis(
     """
     if measured.is_dir() and not columns:
         from lathe_rc.bag import reader
+        from lathe_rc.cell.soundness import refuse_faults
 
-        loop = hysteresis_fit.from_signals(reader.read_bag(measured).dense, command_topic, state_topic)
+        lossy.tell([measured])
+        recording = reader.read_bag(measured)
+        signals = [f"{command_topic}.position", f"{state_topic}.measured_position"]
+        refuse_faults(signals, recording.events, measured)
+        loop = hysteresis_fit.from_signals(recording.dense, command_topic, state_topic)
     else:
         loop = hysteresis_fit.of_measurement(measured_options.opened(measured, columns))
     found = hysteresis_fit.identify(loop, stroke)

@@ -14,8 +14,8 @@ from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import part
 from lathe_rc.cell.recording import Recording
-from lathe_rc.commands import measured, options, tables
-from lathe_rc.errors import InputError
+from lathe_rc.commands import lossy, measured, options, tables
+from lathe_rc.errors import InputError, LatheError
 
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
 
@@ -105,13 +105,25 @@ def measure(
             "revolutions": [part.numbers(found, k) for k in chosen],
             "along": part.along(surface) if isinstance(surface, Lay) else surface,
             "profile": str(profile) if profile else None,
+            "not_measured": recording.sound_form[1] or None,
         }
         click.echo(json.dumps(summary))
+        _end(bag, recording)
         return
     console = tables.console(soft_wrap=False)
     console.print(table(found, chosen))
+    if why := recording.sound_form[1]:
+        console.print(f"revolutions from {recording.turns_before + found.form.rms.size + 1} on: {why}", soft_wrap=True)
     if surface:
         text = part.along_in_words(surface) if isinstance(surface, Lay) else surface
         console.print(text, soft_wrap=True)
     if profile:
         console.print(f"profile: {profile}", soft_wrap=True)
+    _end(bag, recording)
+
+
+def _end(bag: Path, recording: Recording) -> None:
+    """End with exit code 3 if members were lost, and 1 if the form error rests on a fault."""
+    lossy.end(bag)
+    if recording.sound_form[1]:
+        raise click.exceptions.Exit(LatheError.exit_code)

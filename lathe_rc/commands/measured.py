@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.commands import options
+from lathe_rc.commands import lossy, options
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
 
@@ -46,6 +46,7 @@ def opened(path: Path, given: Sequence[str]) -> Measurement:
     """
     mapping = measurement_file.parse_mapping(given)
     if is_bag(path):
+        lossy.tell([path])
         from lathe_rc.bag.reading import bag_columns
 
         return bag_columns.measurement(path, mapping)

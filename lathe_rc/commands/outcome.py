@@ -61,6 +61,7 @@ def facts(result: harness.Result) -> list[str]:
     surface, first, step = result.surface, result.recording.first, result.scenario.shared.step
     return [
         *(each.told() for each in (result.growth, result.verdict) if each),
+        *filter(None, [result.recording.sound_form[1] if not result.verdict else ""]),
         *(
             f"{node}: {text}"
             for node, loop in result.loops.items()

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from lathe_rc import allowed_code
-from lathe_rc.commands import measured, options
+from lathe_rc.commands import lossy, measured, options
 from lathe_rc.errors import InputError
 
 
@@ -50,6 +50,7 @@ def panel(
         if wrong := [name for name, value in given.items() if value]:
             raise InputError(f"{wrong[0]} with the bag {scenario}; allowed: with a scenario")
         player = Player(Path(scenario))
+        lossy.tell([Path(scenario)])
         with Driver(player, pace) as driver:
             page_server.serve(panels.player_site(driver, player), port, click.echo, browser=not no_browser)
         return

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.commands import options
+from lathe_rc.commands import lossy, options
 from lathe_rc.errors import LossyRunError
 
 
@@ -27,4 +27,5 @@ def report(ctx: click.Context, bag: Path, output: Path, *, budget: bool) -> None
         why = gathered.stopped or ("" if gathered.samples else gathered.missing)
         click.echo(f"incomplete recording{': ' + why if why else ''}", err=True)
     click.echo(f"report: {output}")
-    ctx.exit(LossyRunError.exit_code if gathered.is_lossy else 0)
+    lost = lossy.tell([bag])
+    ctx.exit(LossyRunError.exit_code if lost or gathered.is_lossy else 0)

@@ -18,7 +18,7 @@ from lathe_rc.bag.resimulation import identify
 from lathe_rc.bag.resimulation.bag_spindle import asked_for
 from lathe_rc.bag.resimulation.identify import Identified
 from lathe_rc.bag.resimulation.resim import Resimulation, resimulate
-from lathe_rc.commands import options, tables
+from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError
 
 _DIFFERENT = 1  # exit code if the results of an unchanged run differ from the recording
@@ -156,9 +156,11 @@ def resim(
             click.echo(
                 json.dumps({"bag": str(bag), "drives": [_drive_summary(drive) for drive in drives], "asked_for": rest})
             )
+            lossy.end(bag)
             return
         _show_drives(console, drives, write_parameters)
         console.print(rest)
+        lossy.end(bag)
         return
     found = resimulate(
         bag,

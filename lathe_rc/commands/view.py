@@ -10,7 +10,7 @@ import click
 
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.beside import RERUN_PORT, RERUN_RATE, RerunOutput
-from lathe_rc.commands import options
+from lathe_rc.commands import lossy, options
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.view.rerun_bag import write
 from lathe_rc.view.rerun_output import Viewer, end_viewer, require, viewer
@@ -86,5 +86,7 @@ def view(
         write(bag, output, rate=rate)
         size = output.stat().st_size
         click.echo(f"view: {output} ({size / 1e6:.1f} MB)")
+        lossy.end(bag)
     else:
+        lossy.tell([bag])
         _show(bag, rate, viewer("serve" if web else "spawn", port))

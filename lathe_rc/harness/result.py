@@ -218,6 +218,7 @@ class Result:
                 "per_revolution_peak_to_valley": (errors.peak_to_valley * 1e6).tolist(),
                 "per_revolution_ront": (self.part.roundness.peak_to_valley * 1e6).tolist() if errors.rms.size else [],
             },
+            "not_measured": self.recording.sound_form[1] or None,
             "tolerance_um": verdict.summary() if verdict else None,
             "growth_um": growth.summary() if growth else None,
             "loops": {node: loop.summary() for node, loop in self.loops.items()},

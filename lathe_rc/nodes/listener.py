@@ -15,6 +15,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from lathe_rc import messages
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import overhear, taken
 from lathe_rc.view.live_runs import Backlog, LiveRuns, ShownRun
@@ -43,7 +44,10 @@ class Listener:
     def __init__(self, node: Node, live: LiveRuns, over: Callable[[], bool] = lambda: False) -> None:
         self._node, self._live, self._over = node, live, over
         self._backlog = Backlog(_BACKLOG)
-        self._subscriptions: dict[str, tuple[Subscription, str]] = {}
+        # Heard first: the blocks that rest on samples of lost members come after the message about the loss.
+        cell_state = f"{node.get_namespace().rstrip('/')}/cell_state"
+        inlet = overhear(node, cell_state, messages.CELL_STATE, _DEPTH)
+        self._subscriptions: dict[str, tuple[Subscription, str]] = {cell_state: (inlet, messages.CELL_STATE)}
         self._heard = self._heard_before = 0
         self._failure: LatheError | None = None
         self.stopped = threading.Event()

@@ -29,10 +29,12 @@ class Outputs:
     Attributes:
         topics: fully qualified topic of each output.
         framer: counts the messages at chosen samples.
+        unsound: members of the cell were lost, so that results of cycles may rest on held samples.
     """
 
     def __init__(self, node: CellNode, stage: Stage) -> None:
         self._node, self._size = node, node.table.block_size
+        self.unsound = False
         self.framer = Framer(node.table.run_id, node.full_name, node.table.step_ns)
         self.topics = [node.topic(port.topic) for port in stage.outputs]
         self._encoders = [
@@ -95,7 +97,7 @@ class Outputs:
             if self._goes_out(topic):
                 node.outlets[topic].publish(data)
             node.exchange.hand_over(topic, data)
-            if sparse.type == messages.LEARNING:
+            if sparse.type == messages.LEARNING and not self.unsound:
                 values = {key: float(value) for key, value in sparse.values.items()}
                 node.reporter("cycle", node.get_name(), sample=sparse.index, **values)
         companions = [before + len(indices)]

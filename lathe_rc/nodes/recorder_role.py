@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from lathe_rc import messages
-from lathe_rc.bag import provenance
+from lathe_rc.bag import loss, provenance
 from lathe_rc.bag.snapshot import GONE_ON, SNAPSHOTS_GONE_ON, Snapshot
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, split
@@ -69,7 +69,7 @@ class RecorderRole(Role):
         self._encoder = cache(Encoder)  # by message type, run, source and step [ns]
         self._merger: Merger | None = None
         self._ended: set[str] = set()  # topics whose last block has arrived
-        self._first = self._blocks = self._samples = 0
+        self._first = self._blocks = self._samples = self._sound = 0
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
 
@@ -241,7 +241,11 @@ class RecorderRole(Role):
                 held[topic] = queue.held_from
         if self._snapshots is not None and not again:
             self._snapshots.trigger(f"cell: lost {', '.join(sorted(lost))}", first)
-        self._open.tell({provenance.HELD: json.dumps(held)})
+        # Other readers may have received fewer of a lost member's last blocks, but all that precede the window. Without
+        # a lost member, the time master has lost its encoder.
+        sound = max(first - self.table.window * self.table.block_size, 0) if lost else first
+        self._sound = min([sound, *held.values(), *([self._sound] if again else [])])
+        self._open.tell({loss.HELD: json.dumps(held), loss.SOUND: str(self._sound)})
         self._merger.forget(lost)
         for topic, queue in self._queues.items():
             while queue.blocks:

@@ -157,7 +157,7 @@ class Replayer:
                 f"{_seconds(span_ns)} s, where the bag's last message is, and an end after it, or 0"
             )
         self._start_ns = source.first_ns + _ns(start)
-        self._stop_ns = source.first_ns + _ns(end) if end else source.last_ns + 1
+        self._stop_ns = min(source.first_ns + _ns(end) if end else source.last_ns + 1, self._loss_ns())
         for topic, log_ns, _ in source.messages(
             self._topics, start_ns=max(self._start_ns, _CLOCK_END), stop_ns=self._stop_ns
         ):
@@ -378,6 +378,19 @@ class Replayer:
         if start_ns > self._source.first_ns:
             yield from self._latched(start_ns)
         yield from self._source.messages(self._topics, start_ns=start_ns, stop_ns=self._stop_ns)
+
+    def _loss_ns(self) -> int:
+        """Return the time at which members of the recorded cell were lost [ns], and say so.
+
+        Raises:
+            InputError: the bag is to be replayed as a cell, which would be recorded as a whole run.
+        """
+        if loss := self._source.loss:
+            said = f"{self._parameters.bag}: {loss}"
+            if self._parameters.as_cell:
+                raise InputError(f"{said}; allowed as a cell: a bag of a run that nothing interrupted")
+            self._node.get_logger().warning(said)
+        return self._source.loss_ns
 
     def _latched(self, start_ns: int) -> Iterator[Message]:
         """Yield the latched messages from before the start, up to the publishers' depth, as for a late reader."""

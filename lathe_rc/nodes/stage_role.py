@@ -160,6 +160,7 @@ class StageRole(Role):
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
         """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
+        self.outputs.unsound = True
         if self.chain is not None:
             self.chain.leave()
         for queue in self.inputs.queues.values():

@@ -210,13 +210,13 @@ class _Keeper(Errors):
         for each in self._measures:
             if not each.node:
                 found[each.name] = STATISTICS[each.statistic](self._signals[each.topic, each.field][last])
-            elif (result := results[each.node]).found.errors.rms.size:
+            elif (result := results[each.node]).found.errors.rms.size and not result.why:
                 found[each.name] = FIGURES[each.statistic][0](result)
-        if errors.rms.size:
+        if errors.rms.size and not self.soundness.why:
             for name, values in (("max", errors.largest), ("rms", errors.rms)):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
                 found[f"tool.{name}_errors"] = values
-        if self._tolerance:
+        if self._tolerance and not self.soundness.why:
             found["tool.in_tolerance_from"] = judge(errors.largest, self._tolerance, self._before).since or None
         return found
 

@@ -6,7 +6,7 @@ figure finds its own fields by their positions.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,7 @@ class Compared:
         shown: revolution shown first, the last one that all runs have.
         sizes: largest magnitude of the form error [µm] by name and revolution.
         tolerance: tolerance shown first [µm].
+        unjudged: runs whose end is not known.
     """
 
     maps: Mapping[str, Samples]
@@ -46,6 +47,7 @@ class Compared:
     shown: int
     sizes: Mapping[str, tuple[Samples, Samples]]
     tolerance: float
+    unjudged: Collection[str] = ()
 
     @property
     def rows(self) -> int:
@@ -65,8 +67,14 @@ class Compared:
         return {**plain, SIZES: sizes}
 
 
-def compared(forms: Mapping[str, Form], tolerance: float) -> Compared:
-    """Return the maps of several runs with common rows; ``tolerance`` in m, 0 for none."""
+def compared(forms: Mapping[str, Form], tolerance: float, unjudged: Collection[str] = ()) -> Compared:
+    """Return the maps of several runs with common rows.
+
+    Args:
+        forms: form by run.
+        tolerance: tolerance shown first [m]; 0: none.
+        unjudged: runs whose end is not known.
+    """
     group = max(form.map.group for form in forms.values())
     longest = max(form.map.size for form in forms.values())
     most = max(2, _FIELDS // _ACROSS // (2 * len(forms) - 1))
@@ -80,7 +88,8 @@ def compared(forms: Mapping[str, Form], tolerance: float) -> Compared:
     differences = {f"{name} − {first}": maps[name] - maps[first] for name in others}
     least = min(float(size[-1]) for _, size in sizes.values())
     shown = min(form.map.size for form in forms.values())
-    return Compared(maps, differences, step, longest, shown, sizes, tolerance * 1e6 or float(f"{2.0 * least:.1g}"))
+    first_shown = tolerance * 1e6 or float(f"{2.0 * least:.1g}")
+    return Compared(maps, differences, step, longest, shown, sizes, first_shown, unjudged)
 
 
 def _rows(form: Form, step: int, count: int) -> Samples:
@@ -154,7 +163,8 @@ def verdicts(runs: Compared) -> Spec:
     worst = {"op": "max", "field": "beyond", "as": "last"}, {"op": "max", "field": "r", "as": "end"}
     beyond = {"calculate": "datum.v <= tolerance ? 0 : datum.r", "as": "beyond"}
     text = (
-        "datum.l + (datum.last >= datum.end ? ': not within the tolerance at the end' : "
+        f"datum.l + (indexof({json.dumps([*runs.unjudged])}, datum.l) >= 0 ? ': not judged, its end is not known' : "
+        "datum.last >= datum.end ? ': not within the tolerance at the end' : "
         "': within the tolerance from revolution ' + floor(datum.last + 1) + ' on')"
     )
     where = {"field": "l", "type": "nominal", "sort": None, "axis": None, "scale": {"paddingInner": 0.0}}

@@ -23,6 +23,9 @@ from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_signals import drawn_fields
 
 Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
+_SAFE = 4  # CellState.SAFE
+#: types of the topics whose figures rest on the samples of other nodes
+_RESULTS = {messages.TOOL, messages.SERVO, messages.LEARNING, messages.PERIODIC, messages.MARGIN}
 
 
 class Backlog:
@@ -157,6 +160,7 @@ class RunView(ABC):
         self.pieces = Pieces(types, size, self)
         self.shown = ShownRun(block.run_id, file, end=block.first_index)
         self._ended = {topic: False for topic, kind in types.items() if drawn_fields(kind)}
+        self._unsound = False  # members of the cell were lost
 
     @abstractmethod
     def note(self, index: int, text: str) -> None:
@@ -178,7 +182,16 @@ class RunView(ABC):
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Show consecutive samples, after a note about dropped chunks before them."""
         self._report_losses(first)
+        if self._unsound:
+            dense = {topic: signals for topic, signals in dense.items() if self._types[topic] not in _RESULTS}
+            sparse = {topic: found for topic, found in sparse.items() if found and found[0].type not in _RESULTS}
         self._view.chunk(first, samples, dense, sparse)
+
+    def lose(self, index: int, why: str) -> None:
+        """Show no more results from here on, since they may rest on held samples of lost members."""
+        if not self._unsound:
+            self.note(index, f"no results from here on: {why}")
+        self._unsound = True
 
     def _report_losses(self, index: int) -> None:
         """Report the chunks dropped before a sample since the last report."""
@@ -231,6 +244,10 @@ class LiveRuns:
                 block = self._decoders[topic].decode(data)
                 if self._belongs(topic, block.run_id, block.first_index, block.first_index + block.samples):
                     self._block(topic, msgtype, block)
+            elif msgtype == messages.CELL_STATE:
+                state = messages.decode(msgtype, data)
+                if self._run and state.state == _SAFE and state.run_id == self._run.shown.run_id:
+                    self._run.lose(int(state.first_index), str(state.message))
             else:
                 message = messages.decode(msgtype, data)
                 index = int(message.sample_index)

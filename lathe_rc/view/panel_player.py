@@ -56,6 +56,8 @@ class Player:
             (signals["angle_true"] for topic, signals in recording.dense.items() if topic == self.view.topics.encoder),
             np.empty(0),
         )
+        if recording.lost:
+            self.view.say(self.samples, "panel", recording.lost)
         with Source(bag) as source, tempfile.TemporaryDirectory() as folder:
             about, name = source.about, name_of(bag)
             try:

@@ -20,6 +20,7 @@ from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.arrays import Array
 from lathe_rc.cell.loops import Loop, loops, watches
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals, full
@@ -148,6 +149,7 @@ class View:
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
         """Begin with another run of another cell (arguments as for the class)."""
         self._types: dict[str, str] = {}
+        self._form: set[str] = set()  # signals that the form error is made of
         self._step_ns, self._margin = step_ns, margin
         self.learn(types)
         self.clear(margin)
@@ -162,12 +164,13 @@ class View:
     def learn(self, types: Mapping[str, str]) -> None:
         """Add topics."""
         self._types |= {full(topic): kind for topic, kind in types.items()}
+        self._form |= fields_of(types, FORM)
         self.topics = Topics.of(self._types)
 
     def clear(self, margin: float | None = None) -> None:
         """Begin with another run of the same cell."""
         self.run += 1
-        self._revolutions = Revolutions()
+        self._revolutions, self._soundness = Revolutions(), Soundness(self._form)
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
         if messages.SAFETY_STATUS in self._types.values():
             self._now["safety"] = {"state": State.NOMINAL.name.lower(), "since": 0, "cause": "", "alarm": ""}
@@ -228,18 +231,23 @@ class View:
         }
         for watch in self._watches:
             if named.keys() >= {*watch.topics}:  # a live view does not listen to controllers
-                watch.chunk(first, samples, named, {})
+                watch.chunk(first, samples, named, sparse)
+        before, sound = self._soundness.why, self._soundness.sound(first, samples, sparse)
+        if self._soundness.why != before:
+            self.say(first + sound, "panel", f"form error {self._soundness.why}")
         if encoder and tool:
-            self._part(first, encoder["angle_true"], tool)
+            self._part(first, encoder["angle_true"], tool, sound)
 
-    def _part(self, first: int, angle: Samples, tool: Signals) -> None:
+    def _part(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:
         if self._scale is None:
             self._scale = Scale.of(Outlook(), tool["reference"])
         self._now |= {
             name: float(tool[name][-1]) * _UM for name in ("reference", "displacement", "error", "measured_error")
         }
         self._now["height"] = float(tool["height"][-1]) * 1e3
-        self._add(self._revolutions.add(first, angle, tool["error"], tool["reference"], tool["height"]))
+        if sound:
+            fields = (tool[name][:sound] for name in ("error", "reference", "height"))
+            self._add(self._revolutions.add(first, angle[:sound], *fields))
 
     def finish(self) -> None:
         """Show the last revolution as well, at the end of a run."""

@@ -5,6 +5,7 @@ from array import array
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
 from lathe_rc.cell import part
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
@@ -50,6 +52,7 @@ class Form:
         tool: topic with the form error.
         tolerance: allowed form error in either direction [m]; 0: no tolerance.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
+        types: message types of the bag by topic, for the signals that the form error is made of.
 
     Attributes:
         tool, tolerance: see the arguments.
@@ -61,7 +64,15 @@ class Form:
         refused: reason why the form, or the rest of it, is not measured; empty if it is.
     """
 
-    def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
+    def __init__(
+        self,
+        encoder: str,
+        tool: str,
+        tolerance: float = 0.0,
+        nose_radius: float = 0.0,
+        types: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self._soundness = Soundness(fields_of(types, FORM))
         self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
@@ -82,13 +93,20 @@ class Form:
         """Add consecutive samples; revolutions are measured as soon as they are complete."""
         if self.refused:
             return
-        angle, tool = dense[self._encoder]["angle_true"], dense[self.tool]
+        sound = self._soundness.sound(first, samples, sparse)
+        if not sound:
+            self._refuse(self._soundness.why)
+            return
+        angle = dense[self._encoder]["angle_true"][:sound]
+        tool = {name: array[:sound] for name, array in dense[self.tool].items()}
         if first and not self._held.size and not self._done:  # a snapshot begins in the middle of a revolution
             self._done = self._before = int(np.ceil(angle[0] / _TURN))
-        height = tool["height"] if self._nose_radius else np.zeros(samples)
+        height = tool["height"] if self._nose_radius else np.zeros(sound)
         new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
         self._held = np.concatenate([self._held, new], axis=1)
-        self._measure(_MARGIN)
+        self._measure(0 if sound < samples else _MARGIN)
+        if sound < samples and not self.refused:
+            self._refuse(self._soundness.why)
 
     @property
     def verdict(self) -> Verdict | None:

@@ -169,6 +169,14 @@ class Gathered:
         """Return True if reading stopped, or if the recording of a cell is incomplete."""
         return bool(self.stopped) or (self.samples > 0 and not self.complete)
 
+    @property
+    def doubt(self) -> str:
+        """Reason why the run cannot be judged to its end, or held samples are in it; empty without one."""
+        lost = (
+            f"{name} lost {count} blocks, and held the sample before" for name, count in self.host.lost_blocks.items()
+        )
+        return self.stopped or "; ".join(lost)
+
     def has(self, kind: str) -> bool:
         """Return True if the bag has messages of a type."""
         return any(tally.count for tally in self.topics.values() if tally.type == kind)
@@ -206,7 +214,11 @@ def gather(path: Path) -> Gathered:
         allowed, nose = provenance.tolerances(nodes), provenance.nose_radius(source.about)
         forms = [
             Form(
-                encoder, tool, next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0), nose
+                encoder,
+                tool,
+                next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0),
+                nose,
+                types,
             )
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
@@ -215,7 +227,7 @@ def gather(path: Path) -> Gathered:
         servos = [Servo(watch) for watch in watches(provenance.servo_loops(nodes), types)]
         gathered = Gathered(source.about, tallies, forms, Curves(types), servos, nodes=nodes, unjudged=unjudged)
         first = first_of(source)
-        feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first)
+        feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first, source.loss)
         try:
             _feed(source, feeder, gathered)
         except LatheError as error:
@@ -241,6 +253,8 @@ def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
     left = feeder.finish()
     if left:
         gathered.stopped = f"some topics have {left} samples more than others"
+    if source.loss:
+        gathered.stopped = str(source.loss)
     for topic, tally in gathered.topics.items():
         if tally.type in messages.block_types():
             tally.open_end = topic not in newest or not Decoder(tally.type).decode(newest[topic]).last

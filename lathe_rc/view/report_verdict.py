@@ -67,6 +67,8 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
     if growth:
         mood = BAD if growth.diverges or verdict.mood == BAD else WARN
         verdict = Finding(f"{_sentence(growth.told())} {verdict.text}", mood)
+    if data.doubt:
+        verdict = Finding(f"Not judged to its end: {data.doubt}. Without that: {verdict.text}", BAD)
     return Assessment(verdict, wrong, limits)
 
 

@@ -87,6 +87,8 @@ def log(recording: "rr.RecordingStream", bag: Path, *, rate: float) -> int:
     # Chunks of complete windows, so that the points of the curves do not depend on the chunks.
     header = stream.feed(bag, [scene], piece=max(scene.window, _PIECE // scene.window * scene.window))
     scene.close()
+    if header.loss:
+        scene.note(header.samples, str(header.loss))
     return header.samples
 
 

@@ -20,6 +20,7 @@ from PIL import Image
 from lathe_rc import event_log, messages
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.loops import Loop, watches
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import Samples, Signals, full
@@ -86,6 +87,8 @@ class Scene:
         self._pose = max(1, int(np.ceil(1e9 / (_POSES * step_ns))))
         self._scale: parts.Scale | None = None
         self._revolutions = Revolutions()
+        self._form: set[str] = set()  # signals that the form error is made of
+        self._soundness = Soundness(self._form)
         self._ring: parts.Ring | None = None
         self._rows: list[npt.NDArray[np.uint8]] = []
         self._every = 1  # one row and one ring per this many revolutions
@@ -101,6 +104,7 @@ class Scene:
             LatheError: the recording cannot be written.
         """
         self._types |= {full(topic): kind for topic, kind in types.items()}
+        self._form |= fields_of(types, FORM)
         self._curves = curves(self._types, [watch.loop for watch in self._loops])
         by_type = {kind: topic for topic, kind in reversed(self._types.items())}  # the first topic of each type
         self._encoder, self._tool = by_type.get(messages.ENCODER), by_type.get(messages.TOOL)
@@ -129,8 +133,9 @@ class Scene:
                 self._log_messages(full(topic), found)
         for watch in self._loops:
             watch.chunk(first, samples, named, sparse)
+        sound = self._soundness.sound(first, samples, sparse)
         if angle is not None and self._tool in named:
-            self._log_part(first, angle, named[self._tool])
+            self._log_part(first, angle, named[self._tool], sound)
 
     def close(self) -> None:
         """Log the remaining samples and flush the recording, which stays open.
@@ -227,8 +232,8 @@ class Scene:
             texts = [f"{topic.strip('/')}: {event_log.text(message)}" for message in found]
             self._send("events", rr.TextLog.columns(text=texts), index)
 
-    def _log_part(self, first: int, angle: Samples, tool: Signals) -> None:
-        """Log the part, the tool and the form error."""
+    def _log_part(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:
+        """Log the part, the tool and the form error, which rests on the first ``sound`` samples alone."""
         error, reference, height = tool["error"], tool["reference"], tool["height"]
         if self._scale is None:
             self._scale = parts.Scale.of(self._outlook, reference)
@@ -243,7 +248,9 @@ class Scene:
             place[:, 0] = self._scale.x((reference - error)[at])
             place[:, 2] = self._scale.z(turns, height[at])
             self._send("machine/tool", rr.Transform3D.columns(translation=place), *when)
-        self._log_revolutions(list(self._revolutions.add(first, angle, error, reference, height)))
+        if sound:
+            pieces = (samples[:sound] for samples in (angle, error, reference, height))
+            self._log_revolutions(list(self._revolutions.add(first, *pieces)))
 
     # --- revolutions
 

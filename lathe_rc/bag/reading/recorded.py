@@ -11,7 +11,9 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import check_next
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.cell.soundness import refuse_faults
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples, Signals
 
 
@@ -126,8 +128,10 @@ class Recorded:
         The arrays end together: a run that was stopped may lack the last blocks of one topic.
 
         Raises:
+            InputError: a signal has a fault.
             LatheError: see `pieces`.
         """
+        self.refuse_faults(fields)
         arrays = []
         for topic, field in fields:
             pieces = self.pieces(topic, [field])
@@ -135,6 +139,22 @@ class Recorded:
             arrays.append(np.concatenate(found)[:most])
         common = min(array.size for array in arrays)
         return [array[:common] for array in arrays]
+
+    def refuse_faults(self, fields: Sequence[tuple[str, str]]) -> None:
+        """Refuse signals, by topic and field, that have a fault according to the events in the bag.
+
+        Raises:
+            InputError: a signal has a fault.
+        """
+        events: dict[str, list[Sparse]] = {}
+        topics = {topic for topic, said in self.source.topics.items() if said.type == messages.EVENT}
+        for topic, _, data in self.source.messages(topics) if topics else ():
+            try:
+                values = messages.values_of(messages.EVENT, data)
+            except ValueError as error:
+                raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
+            events.setdefault(topic, []).append(Sparse(topic, messages.EVENT, values["sample_index"], values))
+        refuse_faults([f"{topic}.{field}" for topic, field in fields], events, self.path)
 
     def length(self, topic: str, field: str) -> int:
         """Return the number of samples of a topic, after validating all of them.

@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -21,6 +22,7 @@ from types import TracebackType
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
+from lathe_rc.bag.loss import Loss, loss_of
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_OPEN, MOST_TOPICS
 from lathe_rc.bag.reading.mcap_storage import open_mcap
@@ -33,6 +35,7 @@ from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_fil
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import START_NS, block_types
 
 _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
@@ -104,6 +107,7 @@ class Source:
         path: rosbag2 folder, or a single file from one.
         partial: whether to read the readable parts of a damaged bag.
         altered: whether to read a bag that does not agree with its seal, by what is sealed.
+        whole: whether blocks are read beyond the loss of a member.
 
     Attributes:
         path: path of the bag.
@@ -122,8 +126,8 @@ class Source:
             ``partial``, has no readable part.
     """
 
-    def __init__(self, path: Path, *, partial: bool = False, altered: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: Path, *, partial: bool = False, altered: bool = False, whole: bool = False) -> None:
+        self.path, self._whole = path, whole
         self.about: Mapping[str, str] = {}
         self.first_ns = self.last_ns = 0
         self.topics: dict[str, Topic] = {}
@@ -286,19 +290,48 @@ class Source:
         """Close the bag and remove its temporary files."""
         self._temporary.close()
 
+    @cached_property
+    def loss(self) -> Loss | None:
+        """Loss of a member, at which reading ends; None: the bag ends before, and is read to its end.
+
+        Raises:
+            InputError: the bag's entry about it is not in the recorder's format; see also `messages`.
+        """
+        return loss_of(self.about) if not self._whole and self.last_ns >= self.loss_ns else None
+
+    @cached_property
+    def loss_ns(self) -> int:
+        """Simulated time at which a member was lost [ns]; later than all others without a loss (errors as for `loss`).
+
+        It is that of sample 0 if the bag has no block.
+        """
+        if not (loss := loss_of(self.about)):
+            return _NEVER
+        dense = {topic: said.type for topic, said in self.topics.items() if said.type in block_types()}
+        topic, _, data = next(self.messages(set(dense)), ("", 0, b"")) if dense else ("", 0, b"")
+        try:
+            return START_NS + loss.first * (Decoder(dense[topic]).decode(data).step_ns if topic else 0)
+        except ValueError as error:
+            raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
+
     def blocks(self, topic: str, *, start_ns: int | None = None) -> Iterator[Block]:
-        """Yield the blocks of a dense topic, starting at a log time [ns].
+        """Yield the blocks of a dense topic, starting at a log time [ns], up to the `loss` of a member.
 
         Raises:
             InputError: see `messages`.
             LatheError: a block cannot be decoded.
         """
-        decoder = Decoder(self.topics[topic].type)
+        decoder, loss = Decoder(self.topics[topic].type), self.loss
         for _, _, data in self.messages({topic}, start_ns=start_ns):
             try:
-                yield decoder.decode(data)
+                block = decoder.decode(data)
             except ValueError as error:
                 raise LatheError(f"{self.path}: {topic}: {shown(error)}") from None
+            if loss and block.first_index + block.samples > loss.first:
+                if block.first_index < loss.first:
+                    yield block.part(0, loss.first - block.first_index)
+                return
+            yield block
 
     def step_ns(self, topic: str) -> int:
         """Return the sampling step of a dense topic from its first block [ns]; 0 if it has no block.

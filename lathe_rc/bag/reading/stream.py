@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.bag.loss import Loss
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import span_of
@@ -24,6 +25,7 @@ from lathe_rc.messages import START_NS, Signals
 _TOGETHER, _TOGETHER_BYTES = 64, 2**18  # number and total size [B] of a topic's messages decoded together
 _AHEAD = 64  # chunks that one topic may be ahead of another
 _MOST_WAITING = 2**18  # messages of a sparse topic that may be waiting for blocks
+_ENDLESS = 2**64  # end of the samples where no member was lost
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class BagHeader:
         step_ns: sampling step [ns]; 0 if the bag has no dense topic.
         run_id: ID of the run.
         about: strings from the bag's metadata.
+        loss: loss of a member, at which reading has ended; None: the bag was read to its end.
     """
 
     types: Mapping[str, str]
@@ -45,6 +48,7 @@ class BagHeader:
     step_ns: int
     run_id: str
     about: Mapping[str, str]
+    loss: Loss | None = None
 
 
 def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
@@ -152,20 +156,23 @@ class Feeder:
         sinks: sinks that receive the chunks.
         piece: samples per chunk.
         first: index of the first sample of all topics.
+        loss: loss of a member, at which the chunks end.
 
     Attributes:
         types: message type by fully qualified signal topic.
         first: index of the first sample that has not been passed on.
     """
 
-    def __init__(self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0) -> None:
+    def __init__(
+        self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0, loss: Loss | None = None
+    ) -> None:
         self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in messages.signal_types()}
         self._dense = {t: _Dense(t, kind, first) for t, kind in self.types.items() if kind in messages.block_types()}
         self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
             topic: [] for topic in self.types if topic not in self._dense
         }
         self._sinks, self._piece = list(sinks), piece
-        self.first = first
+        self.first, self._end = first, loss.first if loss else _ENDLESS
 
     @property
     def step_ns(self) -> int:
@@ -194,11 +201,15 @@ class Feeder:
             except ValueError as error:
                 raise LatheError(f"{topic}: at {log_ns} ns: {shown(error)}") from None
             return
-        if dense.add(data) and dense.end - self.first >= self._piece:
+        if dense.end < self._end and dense.add(data) and dense.end - self.first >= self._piece:
             self._hand_on(self._piece)
 
+    def _ends(self) -> dict[str, int]:
+        """Return the sample after the last one to pass on, by topic."""
+        return {topic: min(dense.end, self._end) for topic, dense in self._dense.items()}
+
     def _hand_on(self, samples: int) -> None:
-        ends = {topic: dense.end for topic, dense in self._dense.items()}
+        ends = self._ends()
         while (ready := min(ends.values())) - self.first >= samples:
             self._give(samples)
         slow = min(ends, key=lambda topic: ends[topic])
@@ -231,7 +242,7 @@ class Feeder:
             return 0
         for dense in self._dense.values():
             dense.read()
-        ends = [dense.end for dense in self._dense.values()]
+        ends = self._ends().values()
         while min(ends) - self.first > self._piece:
             self._give(self._piece)
         if min(ends) > self.first:
@@ -296,6 +307,8 @@ class From:
 def first_of(source: Source) -> int:
     """Return the first sample of all dense topics: not 0 in a snapshot, or if the recorder joined a running cell.
 
+    It is that of the loss in a bag that only has samples from the loss of a member on.
+
     Raises:
         InputError: the bag is damaged at the first block of a topic.
         LatheError: this block cannot be decoded.
@@ -303,28 +316,33 @@ def first_of(source: Source) -> int:
     if span := span_of(source.about):
         return span[0]
     dense = [topic for topic, each in source.topics.items() if each.type in messages.block_types()]
-    return max((block.first_index for topic in dense for block in islice(source.blocks(topic), 1)), default=0)
+    nothing = source.loss.first if source.loss else 0
+    return max((block.first_index for topic in dense for block in islice(source.blocks(topic), 1)), default=nothing)
 
 
-def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536) -> BagHeader:
+def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536, whole: bool = False) -> BagHeader:
     """Read a cell's bag and pass its signals to sinks, in chunks.
+
+    If members of the cell were lost, reading ends there: later samples are held, or may rest on held ones.
 
     Args:
         path: path of the bag.
         sinks: sinks that receive every sample once, in order; topics are fully qualified.
         piece: samples per chunk; the last chunk may be shorter.
+        whole: whether reading continues after the loss of a member.
 
     Raises:
         InputError: the path is not a bag.
         LatheError: samples are missing or repeated.
     """
-    with Source(path) as source:
+    with Source(path, whole=whole) as source:
         types = {topic: kind.type for topic, kind in source.topics.items()}
-        feeder = Feeder(types, sinks, piece, first_of(source))
+        loss = source.loss
+        feeder = Feeder(types, sinks, piece, first_of(source), loss)
         for topic, log_ns, data in source.messages(set(feeder.types)):
             try:
                 feeder.add(topic, log_ns, data)
             except LatheError as error:
                 raise type(error)(f"{path}: {error}") from None
         left = feeder.finish()
-        return BagHeader(feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, dict(source.about))
+        return BagHeader(feeder.types, feeder.first, left, feeder.step_ns, feeder.run_id, dict(source.about), loss)

@@ -55,6 +55,7 @@ def make(bag: Path, output: Path, tolerance: float, topic: str = "") -> Made:
         recorded = Recorded(source, {"encoder": _chosen(source, topic)})
         spindle = recorded.spindle("encoder")
         field = "speed_true" if spindle.has_truth else "speed"
+        recorded.refuse_faults([(spindle.topic, field)])
         step = source.step_ns(spindle.topic) * 1e-9
 
         def pieces() -> Iterator[tuple[Samples, Samples]]:

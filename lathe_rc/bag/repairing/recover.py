@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from lathe_rc.bag import provenance
+from lathe_rc.bag import loss, provenance
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.bag.repairing.salvage import Message, Salvage
 from lathe_rc.bag.writing.writer import BagWriter, Topic, refuse_existing
@@ -65,7 +65,8 @@ def copy(paths: Sequence[Path], target: Path, choice: Choice) -> list[Salvage]:
 
     Several bags are merged in the order of their log times; the messages of a single bag keep their order.
 
-    Strings in the metadata, such as the scenario, are copied from a single bag only: two bags have two of them.
+    Strings in the metadata, such as the scenario, are copied from a single bag only: two bags have two of them. The
+    loss of members is copied from all of them.
 
     Args:
         paths: folders or files of the bags.
@@ -82,8 +83,9 @@ def copy(paths: Sequence[Path], target: Path, choice: Choice) -> list[Salvage]:
 
     def about(salvages: Sequence[Salvage]) -> dict[str, str]:
         of = ", ".join(_copied_of(salvage) for salvage in salvages)
-        before = salvages[0].about if len(salvages) == 1 else {}
-        return before | provenance.another(before, provenance.COPIED, of)
+        abouts = [each.about for each in salvages]
+        before = abouts[0] if len(abouts) == 1 else loss.together(abouts)
+        return {**before, **provenance.another(before, provenance.COPIED, of)}
 
     return _copied(paths, target, choice, about)
 

@@ -147,12 +147,9 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
 
 
 def _refuse_part(source: Source, *, begun: bool) -> None:
-    held = provenance.held(source.about)
-    if held:
-        topic, sample = next(iter(held.items()))
+    if loss := source.loss:
         raise InputError(
-            f"{source.path}: nodes were lost on the way, {topic} is held from sample {sample} on; allowed: a bag of a "
-            "run that nothing interrupted"
+            f"{source.path}: nodes were lost on the way, {loss.why}; allowed: a bag of a run that nothing interrupted"
         )
     first = first_of(source)
     if first and not begun and GONE_ON not in source.about:
