@@ -15,6 +15,7 @@ import fmu_builder
 from test_extending import lathe
 
 from lathe_rc import harness, hosts
+from lathe_rc.c_library.sources import export_nodes
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.wiring import Cell, new_stage
@@ -256,3 +257,10 @@ def test_unpacked_fmus_that_are_not_used_any_more_leave_the_cache(fmus, tmp_path
     os.utime(first, (0, 0))
     third = imported.Fmu(fmus("drive")).unpacked()
     assert {*first.parent.iterdir()} == {second, third}
+
+
+def test_an_fmu_is_not_exported(fmus, tmp_path):
+    """The memory of its step holds addresses in this process."""
+    made = cell(tmp_path, SPINDLE, LAW, node("drive", fmus("drive"), DRIVE), TOOL)
+    with pytest.raises(InputError, match="drive: an FMU is loaded by Python; allowed: export the other nodes"):
+        export_nodes(made, ["drive"], tmp_path / "drive-c")

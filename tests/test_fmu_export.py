@@ -43,8 +43,11 @@ class Run:
         self.get = {8: getattr(self.fmu, f"get{kinds[0]}"), 1: getattr(self.fmu, f"get{kinds[1]}")}
         self.put = {8: getattr(self.fmu, f"set{kinds[0]}"), 1: getattr(self.fmu, f"set{kinds[1]}")}
 
-    def go(self, reference, library, first, last):
-        """Compute some samples with the inputs of the engine, and return the outputs that differ from its own."""
+    def go(self, reference, library, first, last, held=0):
+        """Compute some samples with the inputs of the engine, and return the outputs that differ from its own.
+
+        ``held`` steps before them did not count.
+        """
         inputs = [(each.bytes, self.references[each.name], reference.signal(each)) for each in library.inputs]
         outputs = {size: [each for each in library.outputs if each.bytes == size] for size in (8, 1)}
         places = {size: [self.references[each.name] for each in of] for size, of in outputs.items() if of}
@@ -52,7 +55,7 @@ class Run:
         for sample in range(first, last):
             for size, place, given in inputs:
                 self.put[size]([place], [given[sample]])
-            self.fmu.doStep(sample * STEP, STEP)
+            self.fmu.doStep((sample + held) * STEP, STEP)
             for size, wanted in places.items():
                 found[size].append(self.get[size](wanted))
         differ = []
@@ -93,10 +96,50 @@ def test_a_law_stopped_in_mid_run_goes_on_in_a_new_instance_with_the_same_bits(l
     assert whole.go(reference, library, 4321, 6000) == []
     other.fmu.setFMUState(other.fmu.deserializeFMUState(saved))
     assert other.go(reference, library, 4321, 6000) == []
-    wrong = bytearray(saved)
-    wrong[-library.size + 8 : -library.size + 16] = bytes(8)  # the identity of the library
-    with pytest.raises(fmpy.fmi1.FMICallException):
-        other.fmu.setFMUState(other.fmu.deserializeFMUState(bytes(wrong)))
+    for place in (0, 8, len(saved) - library.size - 4, len(saved) - library.size + 30, len(saved) - 1, None):
+        wrong = bytearray(saved if place is not None else len(saved))
+        if place is not None:
+            wrong[place] ^= 1
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            other.fmu.setFMUState(other.fmu.deserializeFMUState(bytes(wrong)))
+        assert b"no state of this FMU, or a damaged one" in other.said[-1]
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_bad_input_is_discarded_and_the_law_goes_on(law, fmi):
+    """NaN, infinity and 1e300: the outputs are held, time goes on, and with a good input the law does."""
+    paths, library, reference = law
+    run = Run(paths[fmi])
+    assert run.go(reference, library, 0, 4000) == []
+    (command,) = (run.references[each.name] for each in library.outputs)
+    before = run.get[8]([command])
+    held = 0
+    for each in library.inputs:
+        for value in (np.nan, np.inf, -np.inf, 1e300, each.low * 1.001):
+            with pytest.raises(fmpy.fmi1.FMICallException, match=r"[Dd]iscard"):
+                run.put[8]([run.references[each.name]], [value])
+            assert each.name.encode() in run.said[-1]
+            assert b"the outputs are held" in run.said[-1]
+            run.fmu.doStep((4000 + held) * STEP, STEP)  # a warning
+            assert b"the outputs are held from" in run.said[-1]
+            assert run.get[8]([command]) == before
+            held += 1
+        run.put[8]([run.references[each.name]], [reference.signal(each)[3999]])
+    assert run.go(reference, library, 4000, 4600, held) == []
+
+
+def test_an_fmu_that_has_stopped_holds_its_outputs(law):
+    paths, library, reference = law
+    run = Run(paths[3])
+    assert run.go(reference, library, 0, 4000) == []
+    (command,) = (run.references[each.name] for each in library.outputs)
+    before = run.get[8]([command])
+    run.put[8]([run.references["encoder.angle"]], [1e6])
+    for _ in range(2):
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            run.fmu.doStep(4000 * STEP, STEP)
+        assert b"learning_controller has stopped at sample 4000: " in run.said[-1]
+        assert run.get[8]([command]) == before
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

@@ -75,7 +75,7 @@ def variables(library: Library) -> list[Variable]:
         for signal in signals:
             late = f"value of {signal.delay} sample before" if signal.delay else ""
             kind, start = "Float64" if signal.bytes == 8 else "UInt8", 0.0 if causality == "input" else None
-            found.append(Variable(signal.name, kind, causality, signal.unit, late, start))
+            found.append(Variable(signal.name, kind, causality, signal.unit, late, start, signal.low, signal.high))
     for each in library.parameters:
         kind = "Int32" if each.whole else "Float64"
         limits = each.low, each.high

@@ -24,6 +24,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import SOURCES
 
 _IMAGE = "_image"  # object with the block at the start; no name of a node begins like this
 _GAP = 4  # zero words that are stored, so that there are fewer runs
@@ -58,7 +59,7 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
             "w": _listed(map(float.hex, wi_double.tolist())),
             "f": _listed(map(float.hex, fi_double.tolist())),
         },
-        "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.goes_on.items()],
+        "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.stops.items()],
         "formulas": list(_formulas(part.stage for part in library.parts)),
         "identity": "",
     }
@@ -67,13 +68,17 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
         found[name] = _TEMPLATES.get_template(f"{name}.j2").render(made)
     found[f"{library.name}.h"] = _TEMPLATES.get_template("NAME.h.j2").render(made)
     tables = _TEMPLATES.get_template("NAME.c.j2")
-    told = hashlib.sha256(tables.render(made).encode() + library.image.tobytes())
+    steps = "".join(part.stage.native().name for part in library.parts)
+    told = hashlib.sha256(f"{tables.render(made)}{steps}{SOURCES}".encode() + library.image.tobytes())
     made["identity"] = f"0x{told.hexdigest()[:16]}"
     found[f"{library.name}.c"] = tables.render(made)
     return found
 
 
-_KEPT = ("name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "room", "size", "left_out")
+_KEPT = (
+    "name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "held", "room", "size",
+    "left_out",
+)  # fmt: skip
 
 
 def words(library: Library) -> np.ndarray:
@@ -119,7 +124,7 @@ def library_of(
     if not _IDENTIFIER.fullmatch(name):
         raise InputError(f"--name {name}; allowed: a C identifier of small letters, digits and underscores")
     cell.check(cures=False)
-    return Library(cell, nodes, name, block or cell.master.shared.block_size, tune)
+    return Library(cell, nodes, name, cell.master.shared.block_size if block is None else block, tune)
 
 
 def export_nodes(
@@ -212,7 +217,8 @@ def _described(signal: Signal) -> str:
     kind = "double" if signal.bytes == 8 else "uint8_t"
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
-    return f"{kind} [{signal.unit}]{late}" if signal.unit else f"{kind}{late}"
+    unit = f" [{signal.unit}]" if signal.unit else ""
+    return f"{kind}{unit} from {signal.low:g} to {signal.high:g}{late}"
 
 
 def _ranged(parameter: Parameter) -> str:

@@ -16,7 +16,6 @@ and the fastest without overshoot with b = D^D/(D+1)^(D+1) (both from λ^(D+1) -
 """
 
 import math
-from collections.abc import Mapping
 from statistics import NormalDist
 from typing import Annotated, NamedTuple
 
@@ -374,11 +373,6 @@ class Gauge(Stage):
             memory.whole[LEARNS] = action == "learn"
         # Points since then are no whole revolution of readings.
         memory.whole[_BEGUN] = 0
-
-    @property
-    def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
-        """Return whether the gauge learns."""
-        return {"learning": (self._memory.whole, LEARNS)}
 
     @property
     def memory(self) -> Memory:
