@@ -18,6 +18,8 @@ from lathe_rc.cell.scenario import load
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.tool import Tool
 
+WORDS = ("int", "lathe", "lathe_cell", "class", "main", "memcpy", "tapes", "math", "all", "write")
+
 
 def same_bits(exported, samples=0):
     """Build the example of a library and let it compare the library with the engine."""
@@ -191,6 +193,7 @@ def test_equal_memories_have_equal_images():
         (["lerning_controller"], {}, "node lerning_controller; did you mean learning_controller"),
         (["learning_controller"], {"block": 4096}, "samples late; allowed: 1 up to"),
         (["learning_controller"], {"name": "A-b"}, "a C identifier"),
+        *((["tool"], {"name": name}, f"--name {name}: a word of C") for name in WORDS),
         (["tool"], {"block": 0}, "--block 0; allowed: 1 up to 8192"),
         (["learning_controller"], {"tune": ["learning_controller.q_time"]}, "does not store it as it is"),
         (["learning_controller"], {"tune": ["learning_controller.gain"]}, "allowed: NODE.PARAM of learning_controller"),

@@ -117,3 +117,17 @@ def test_no_input_and_no_state_brings_a_library_out_of_its_range(name, nodes, va
     exported = export_nodes(cell, nodes, tmp_path / "law", name="law", samples=20_000)
     assert "refused" in hostile(exported.place, sized(10_000), sized(1000))
     hostile(exported.place, sized(2000), 100, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover")
+
+
+def test_each_name_compiles_or_is_refused(tmp_path):
+    """Words of C, and of the code around the library; the compiler has the last word about all others."""
+    compiled = []
+    names = ["int", "lathe", "cell", "block", "given", "read_0", "time", "j1", "index", "stop", "stage_0", "law", "y"]
+    for name in names:
+        try:
+            exported = export_nodes(load("piston"), ["tool"], tmp_path / name, name=name, samples=1000)
+        except InputError:
+            continue
+        told(exported, built(exported.place))
+        compiled.append(name)
+    assert compiled == ["stage_0", "law", "y"]
