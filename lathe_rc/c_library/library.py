@@ -261,6 +261,17 @@ class Library:
                 if stage not in stages and (source in self.nodes or source in after):
                     after[name] = after.get(source, source)
 
+    def dependencies(self) -> dict[str, list[str]]:
+        """Return by output the inputs whose value at a sample acts on the output at the same sample, by name.
+
+        Inputs that only arrive late act on later samples.
+        """
+        needed = {signal.tape: {signal.name} for signal in self.inputs if not signal.delay}
+        for part in self.parts:  # none reads a later one in the same sample
+            found = set[str]().union(*(needed.get(tape, set()) for tape, delay in part.reads if delay == 0))
+            needed |= {self.outputs[number].tape: found for number in part.writes}
+        return {signal.name: sorted(needed[signal.tape]) for signal in self.outputs}
+
     # ---- layout -------------------------------------------------------------------------------------
 
     def _append(self, content: npt.NDArray[np.uint8]) -> int:
