@@ -7,18 +7,30 @@ from pathlib import Path
 
 import numpy as np
 
-DONE, ASKS, STOPPED, REFUSED = range(4)
+DONE, INPUT, STOPPED, REFUSED = range(4)
 
 
-def built(place: Path, *flags: str, compiler: str = "cc") -> Path:
+def built(place: Path, *flags: str, compiler: str = "cc", main: Path | None = None) -> Path:
     """The example of an exported library, built as its CMake file does; ``flags`` go to the compiler."""
     name = next(path.stem for path in place.glob("*.c") if path.stem not in ("lathe", "main"))
     example = place / f"{name}_main"
+    if main is not None:
+        example, flags = place / f"{name}_{main.stem}", (*flags, f"-DCELL={name}", "-include", f"{place}/{name}.h")
     strict = ["-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror"]
     subprocess.run(
-        [compiler, *strict, *flags, "-o", example, *_parts(place, name), place / "main.c", "-lm"], check=True
+        [compiler, *strict, *flags, "-o", example, *_parts(place, name), main or place / "main.c", "-lm"], check=True
     )
     return example
+
+
+def hostile(place: Path, tries: int, flips: int, *flags: str) -> str:
+    """Output of hostile.c after bad inputs and flipped bits; the first one that is accepted fails."""
+    program = built(place, *flags, f"-I{place}", main=Path(__file__).parent / "hostile.c")
+    done = subprocess.run(
+        [program, place / "reference.bin", str(tries), str(flips)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{done.returncode}: {done.stdout}{done.stderr}"
+    return done.stdout
 
 
 def _parts(place: Path, name: str) -> list[Path]:
@@ -76,6 +88,8 @@ class Loaded:
         self.c = ctypes.CDLL(str(library))
         self.c.lathe_get.restype = ctypes.c_double
         self.c.lathe_sample.restype = ctypes.c_int64
+        self.c.lathe_reason_text.restype = self.c.lathe_reason_name.restype = ctypes.c_char_p
+        self.c.lathe_restore.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t]
         self._room = np.zeros(size + 64, np.uint8)
         self.block = ctypes.c_void_p(-(-self._room.ctypes.data // 64) * 64)
         self.cell = ctypes.byref(ctypes.c_char.in_dll(self.c, name))
@@ -88,12 +102,9 @@ class Loaded:
         return int(self.c.lathe_set(self.block, self.parameter(name), ctypes.c_double(value)))
 
     def step(self, inputs: list[np.ndarray], outputs: list[np.ndarray], first: int, samples: int) -> int:
-        """Compute some samples; a stage that asks goes on without an answer."""
+        """Compute some samples."""
         tables = [
             (ctypes.c_void_p * max(len(arrays), 1))(*(array[first:].ctypes.data for array in arrays))
             for arrays in (inputs, outputs)
         ]
-        status = ASKS
-        while status == ASKS:
-            status = self.c.lathe_step(self.block, samples, *tables)
-        return int(status)
+        return int(self.c.lathe_step(self.block, samples, *tables))

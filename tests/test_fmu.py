@@ -2,7 +2,9 @@
 """FMUs of other tools as stages: response, units, hosts, state, and what is refused."""
 
 import json
+import os
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,10 +15,12 @@ import fmu_builder
 from test_extending import lathe
 
 from lathe_rc import harness, hosts
+from lathe_rc.c_library.sources import export_nodes
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.fmi import imported
 from lathe_rc.nodes import graph
 
 SPINDLE = "/spindle_encoder: {ros__parameters: {revolutions: 3.0}}\n"
@@ -225,3 +229,38 @@ def test_a_bag_and_an_announcement_run_no_fmu(fmus, tmp_path):
         scenario.load(tmp_path / "bag" / "cell.yaml")
     told = graph._refused(scenario.TABLES["fmu"], made.nodes["drive"].model_dump())
     assert told.endswith("a file that no parameter file of this process names")
+
+
+def test_an_fmu_that_unpacks_to_hundreds_of_megabytes_is_refused(fmus, tmp_path, monkeypatch):
+    """400 MB of zeros in an FMU of 400 kB stay out of the cache; sources and binaries of other platforms as well."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    path = shutil.copy(fmus("filter"), tmp_path / "large.fmu")
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("sources/all.c", "binaries/x86_64-windows/filter.dll"):
+            archive.writestr(name, bytes(1000))
+    place = imported.Fmu(path).unpacked()
+    assert {each.name for each in place.iterdir()} == {"modelDescription.xml", "binaries"}
+    assert {each.name for each in (place / "binaries").iterdir()} == {"x86_64-linux"}
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("resources/zeros", "w") as file:
+        for _ in range(400):
+            file.write(bytes(1_000_000))
+    with pytest.raises(InputError, match=r"large.fmu: its binary and resources unpack to 38\d MiB; allowed: 64 MiB"):
+        imported.Fmu(path).unpacked()
+    assert [*(tmp_path / "cache" / "fmu").iterdir()] == [place]
+
+
+def test_unpacked_fmus_that_are_not_used_any_more_leave_the_cache(fmus, tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(imported, "_CACHE", 1)
+    first, second = (imported.Fmu(fmus("filter", fmi)).unpacked() for fmi in (2, 3))
+    assert {*first.parent.iterdir()} == {first, second}  # both may be in use
+    os.utime(first, (0, 0))
+    third = imported.Fmu(fmus("drive")).unpacked()
+    assert {*first.parent.iterdir()} == {second, third}
+
+
+def test_an_fmu_is_not_exported(fmus, tmp_path):
+    """The memory of its step holds addresses in this process."""
+    made = cell(tmp_path, SPINDLE, LAW, node("drive", fmus("drive"), DRIVE), TOOL)
+    with pytest.raises(InputError, match="drive: an FMU is loaded by Python; allowed: export the other nodes"):
+        export_nodes(made, ["drive"], tmp_path / "drive-c")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``lathe export fmu``: stages as FMUs that FMPy runs with the bits of the engine."""
 
+import graphlib
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from cells import scenario
 from fmpy import build, simulation, validation
 
 from lathe_rc import LatheError, harness
+from lathe_rc.c_library import sources
 from lathe_rc.c_library.fmu import export_fmu
 from lathe_rc.c_library.reference import Reference
 from lathe_rc.cell.parameters import SharedParameters
@@ -43,8 +46,11 @@ class Run:
         self.get = {8: getattr(self.fmu, f"get{kinds[0]}"), 1: getattr(self.fmu, f"get{kinds[1]}")}
         self.put = {8: getattr(self.fmu, f"set{kinds[0]}"), 1: getattr(self.fmu, f"set{kinds[1]}")}
 
-    def go(self, reference, library, first, last):
-        """Compute some samples with the inputs of the engine, and return the outputs that differ from its own."""
+    def go(self, reference, library, first, last, held=0):
+        """Compute some samples with the inputs of the engine, and return the outputs that differ from its own.
+
+        ``held`` steps before them did not count.
+        """
         inputs = [(each.bytes, self.references[each.name], reference.signal(each)) for each in library.inputs]
         outputs = {size: [each for each in library.outputs if each.bytes == size] for size in (8, 1)}
         places = {size: [self.references[each.name] for each in of] for size, of in outputs.items() if of}
@@ -52,7 +58,7 @@ class Run:
         for sample in range(first, last):
             for size, place, given in inputs:
                 self.put[size]([place], [given[sample]])
-            self.fmu.doStep(sample * STEP, STEP)
+            self.fmu.doStep((sample + held) * STEP, STEP)
             for size, wanted in places.items():
                 found[size].append(self.get[size](wanted))
         differ = []
@@ -93,10 +99,79 @@ def test_a_law_stopped_in_mid_run_goes_on_in_a_new_instance_with_the_same_bits(l
     assert whole.go(reference, library, 4321, 6000) == []
     other.fmu.setFMUState(other.fmu.deserializeFMUState(saved))
     assert other.go(reference, library, 4321, 6000) == []
-    wrong = bytearray(saved)
-    wrong[-library.size + 8 : -library.size + 16] = bytes(8)  # the identity of the library
-    with pytest.raises(fmpy.fmi1.FMICallException):
-        other.fmu.setFMUState(other.fmu.deserializeFMUState(bytes(wrong)))
+    for place in (0, 8, len(saved) - library.size - 4, len(saved) - library.size + 30, len(saved) - 1, None):
+        wrong = bytearray(saved if place is not None else len(saved))
+        if place is not None:
+            wrong[place] ^= 1
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            other.fmu.setFMUState(other.fmu.deserializeFMUState(bytes(wrong)))
+        assert b"no state of this FMU, or a damaged one" in other.said[-1]
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_bad_input_is_discarded_and_the_law_goes_on(law, fmi):
+    """NaN, infinity and 1e300: the outputs are held, time goes on, and with a good input the law does."""
+    paths, library, reference = law
+    run = Run(paths[fmi])
+    assert run.go(reference, library, 0, 4000) == []
+    (command,) = (run.references[each.name] for each in library.outputs)
+    before = run.get[8]([command])
+    held = 0
+    for each in library.inputs:
+        for value in (np.nan, np.inf, -np.inf, 1e300, each.low * 1.001):
+            with pytest.raises(fmpy.fmi1.FMICallException, match=r"[Dd]iscard"):
+                run.put[8]([run.references[each.name]], [value])
+            assert each.name.encode() in run.said[-1]
+            assert b"the outputs are held" in run.said[-1]
+            run.fmu.doStep((4000 + held) * STEP, STEP)  # a warning
+            assert b"the outputs are held from" in run.said[-1]
+            assert run.get[8]([command]) == before
+            held += 1
+        run.put[8]([run.references[each.name]], [reference.signal(each)[3999]])
+    assert run.go(reference, library, 4000, 4600, held) == []
+
+
+def test_an_fmu_that_has_stopped_holds_its_outputs(law):
+    paths, library, reference = law
+    run = Run(paths[3])
+    assert run.go(reference, library, 0, 4000) == []
+    (command,) = (run.references[each.name] for each in library.outputs)
+    before = run.get[8]([command])
+    run.put[8]([run.references["encoder.angle"]], [1e6])
+    for _ in range(2):
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            run.fmu.doStep(4000 * STEP, STEP)
+        assert b"learning_controller has stopped at sample 4000: " in run.said[-1]
+        assert run.get[8]([command]) == before
+
+
+@pytest.mark.parametrize("fmi", [pytest.param(2, marks=pytest.mark.system), 3])
+def test_a_cell_split_in_four_has_an_order_that_gives_the_engines_bits(tmp_path, fmi):
+    """A master that steps the FMUs in the order of their declared dependencies; others are cycles."""
+    cell = load("piston")
+    names = ["tool", "electrodynamic_actuator", "learning_controller", "spindle_encoder"]
+    made = {name: export_fmu(cell, [name], tmp_path / f"{name}.fmu", fmi=fmi) for name in names}
+    runs = {name: Run(path) for name, (path, _) in made.items()}
+    source = {each.name: name for name, (_, library) in made.items() for each in library.outputs}
+    needs = {name: {source[needed.name] for each in run.model.outputs for needed in each.dependencies}
+             for name, run in runs.items()}  # fmt: skip
+    order = list(graphlib.TopologicalSorter(needs).static_order())
+    assert order == names[::-1]
+    values = dict.fromkeys(source, 0.0)
+    whole = sources.library_of(cell, [], None, 1, ())
+    reference = Reference(whole, Cell(cell.nodes), 1500)
+    wanted = {each.name: reference.signal(each) for each in whole.outputs}
+    for sample in range(1500):
+        for name in order:
+            run, (_, library) = runs[name], made[name]
+            for size in (8, 1):
+                if given := [each.name for each in library.inputs if each.bytes == size]:
+                    run.put[size]([run.references[each] for each in given], [values[each] for each in given])
+            run.fmu.doStep(sample * STEP, STEP)
+            for size in (8, 1):
+                if got := [each.name for each in library.outputs if each.bytes == size]:
+                    values |= zip(got, run.get[size]([run.references[each] for each in got]), strict=True)
+        assert all(values[name] == wanted[name][sample] for name in values), sample
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

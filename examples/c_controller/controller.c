@@ -65,11 +65,9 @@ int main(int count, char **arguments)
         latest = late > latest ? late : latest;
         const void *inputs[] = {question.signal, question.signal + n, question.signal + 2 * n};
         void *outputs[] = {answer.signal};
-        int status;
-        while ((status = lathe_step(block, n, inputs, outputs)) == LATHE_ASKS)
-            ; /* a cycle has ended */
-        if (status != LATHE_DONE) {
-            fprintf(stderr, "the law has stopped (%d)\n", (int)lathe_reason(block, NULL, NULL));
+        int status = lathe_step(block, n, inputs, outputs);
+        if (status != LATHE_DONE) { /* the last command is in the answer: a machine would hold it, or bring it to rest */
+            fprintf(stderr, "%s: %s\n", lathe_reason_name(block), lathe_reason_text(block));
             return 1;
         }
         answer.first = question.first;

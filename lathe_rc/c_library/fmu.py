@@ -75,7 +75,7 @@ def variables(library: Library) -> list[Variable]:
         for signal in signals:
             late = f"value of {signal.delay} sample before" if signal.delay else ""
             kind, start = "Float64" if signal.bytes == 8 else "UInt8", 0.0 if causality == "input" else None
-            found.append(Variable(signal.name, kind, causality, signal.unit, late, start))
+            found.append(Variable(signal.name, kind, causality, signal.unit, late, start, signal.low, signal.high))
     for each in library.parameters:
         kind = "Int32" if each.whole else "Float64"
         limits = each.low, each.high
@@ -249,17 +249,17 @@ def _model(library: Library, scenario: str, fmi: int, token: str, compiled: Sequ
     listed = ET.SubElement(root, "ModelVariables")
     first = 0 if fmi == 3 else 1
     listed.extend(_variable(each, reference, fmi) for reference, each in enumerate(known, first))
-    outputs = [number for number, each in enumerate(known, first) if each.causality == "output"]
+    places = {each.name: place for place, each in enumerate(known, first)}
     structure = ET.SubElement(root, "ModelStructure")
-    if fmi == 3:
-        for tag in ("Output", "InitialUnknown"):
-            for reference in outputs:
-                ET.SubElement(structure, tag, valueReference=str(reference))
-    else:
-        for tag in ("Outputs", "InitialUnknowns") if outputs else ():
-            group = ET.SubElement(structure, tag)
-            for index in outputs:
-                ET.SubElement(group, "Unknown", index=str(index))
+    needed = library.dependencies()
+    for tag in ("Output", "InitialUnknown"):
+        group = structure if fmi == 3 else ET.SubElement(structure, f"{tag}s")
+        for output, inputs in needed.items():
+            unknown = ET.SubElement(group, tag if fmi == 3 else "Unknown")
+            unknown.set("valueReference" if fmi == 3 else "index", str(places[output]))
+            # Before the first step outputs are 0.
+            needs = sorted(places[name] for name in inputs) if tag == "Output" else ()
+            unknown.set("dependencies", " ".join(map(str, needs)))
     return root
 
 

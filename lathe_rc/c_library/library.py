@@ -7,6 +7,7 @@ steps on it; `lathe_rc.c_library.sources` writes its tables.
 """
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from math import inf, nextafter
 from typing import Any
@@ -18,17 +19,25 @@ from lathe_rc import messages
 from lathe_rc.c_library.memory_image import MemoryImage
 from lathe_rc.c_library.object_code import temporary_arrays
 from lathe_rc.cell.columns import units
-from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.events import SET
+from lathe_rc.cell.parameters import Row, explain_overflow, remapped
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
+from lathe_rc.safety.state_machine import Reaction, State
 from lathe_rc.signals.noise import NormalStream
 
 _HEAD = 256  # [B] of the block for the position in the run, see lathe.c
 _LEAST = 512  # elements of a temporary array that any step may take
 _ARRAY_HEAD = 128  # [B] of a temporary array beside its elements
+_HUGE = 1e300  # of a parameter without a limit
+_CLOSE, _HALVINGS = 1e-3, 60  # relative accuracy of the limits that follow from checks, and steps of their search
+_STROKE = 1.0  # [m] bound on displacements of the tool and their commands
+_BOUNDS = {"m": 1e2, "m/s": 1e3, "rad": 1e9, "rad/s": 1e5, "N": 1e7, "A": 1e6, "V": 1e6, "1": 1e6}  # by unit
+_FLAGS = {"index_pulse": 1.0, "reaction": float(max(Reaction)), "state": float(max(State))}
+LEARN = {"learn": 1.0, "freeze": 0.0}  #: events that set the parameter ``learning``
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,7 @@ class Signal:
         unit: unit; empty if there is none.
         bytes: size of a sample: 8 for a double, 1 for a uint8_t.
         tape: index of the tape.
+        low, high: smallest and largest value that is accepted or given.
         delay: for an input, the caller gives at sample k the value of sample k - delay.
     """
 
@@ -48,6 +58,8 @@ class Signal:
     unit: str
     bytes: int
     tape: int
+    low: float
+    high: float
     delay: int = 0
 
     @property
@@ -107,7 +119,7 @@ class Part:
         memory, table: offsets of its memory and its address table in the block [B].
         floats: number of float64 inputs.
         reads: tape and delay of each entry of the address table after the first; tape -1: none.
-        writes: tapes of its outputs.
+        writes: indices of its outputs among those of the library.
     """
 
     stage: Stage
@@ -152,6 +164,7 @@ class Library:
         parts, tapes, streams: see the classes.
         image: the block before the first sample, without the room for temporary arrays, shape (n,), uint8.
         relocations: offsets of the words of the image that hold addresses, as offsets from its beginning [B].
+        held: offset of the newest value of each output, 8 B each [B].
         room: offset of the room for temporary arrays [B].
         size: size of the block [B].
         left_out: events and faults of the scenario, which the caller has to cause; one line each.
@@ -194,6 +207,7 @@ class Library:
         numbers = self._lay_tapes(stages)
         for stage in stages:
             self._add(stage, numbers)
+            self._check_events(stage)
         for name in self.tune:
             if name not in {parameter.name for parameter in self.parameters}:
                 node, _, parameter = name.partition(".")
@@ -201,6 +215,7 @@ class Library:
                     raise InputError(f"--tune {name}; allowed: NODE.PARAM of {', '.join(sorted(self.nodes))}")
                 raise InputError(f"--tune {name}: the step does not store it as it is; allowed: export once more")
         arrays = max(temporary_arrays(part.stage.native()) for part in self.parts)
+        self.held = self._append(np.zeros(8 * len(self.outputs), np.uint8))
         self.image = np.concatenate(self._images)
         self.room = self._end
         self.size = self.room + (arrays + 1) * (_ARRAY_HEAD + 8 * max(self.block, _LEAST))
@@ -216,8 +231,19 @@ class Library:
                     f"--block {self.block}: {stage.name} reads {port.topic} {port.delay} samples late; allowed: 1 up "
                     f"to {port.delay}"
                 )
-        if stage.waiting:
-            self.left_out.append(f"{stage.name}: {', '.join(stage.waiting)}")
+
+    def _check_events(self, stage: Stage) -> None:
+        """Check that the caller can cause the events of a stage by its parameters, and list them."""
+        known = {parameter.name for parameter in self.parameters}
+        for event in stage.waiting:
+            verb, _, rest = event.partition(": ")[2].partition(" ")
+            name = rest.partition(" ")[0] if verb == SET else "learning" if verb in LEARN else ""
+            if f"{stage.name}.{name}" not in known:
+                raise InputError(
+                    f"{stage.name}: the event {event!r} changes no parameter of the exported step; allowed: a scenario "
+                    f"without it (--set {stage.name}.events=[] --set {stage.name}.faults=[])"
+                )
+            self.left_out.append(f"{stage.name}: {event}")
 
     def _check_between(self, stages: Sequence[Stage]) -> None:
         """Check that no stage outside of the library reads it and is read by it in the same sample."""
@@ -234,6 +260,17 @@ class Library:
                     )
                 if stage not in stages and (source in self.nodes or source in after):
                     after[name] = after.get(source, source)
+
+    def dependencies(self) -> dict[str, list[str]]:
+        """Return by output the inputs whose value at a sample acts on the output at the same sample, by name.
+
+        Inputs that only arrive late act on later samples.
+        """
+        needed = {signal.tape: {signal.name} for signal in self.inputs if not signal.delay}
+        for part in self.parts:  # none reads a later one in the same sample
+            found = set[str]().union(*(needed.get(tape, set()) for tape, delay in part.reads if delay == 0))
+            needed |= {self.outputs[number].tape: found for number in part.writes}
+        return {signal.name: sorted(needed[signal.tape]) for signal in self.outputs}
 
     # ---- layout -------------------------------------------------------------------------------------
 
@@ -270,7 +307,7 @@ class Library:
             length = longest + self.block if longest else 0
             content = np.zeros((2 * length or self.block) * size, np.uint8)
             self.tapes.append(Tape(self._append(content), size, length))
-            signal = Signal(topic, name, units(kind).get(name, ""), size, number, given)
+            signal = Signal(topic, name, units(kind).get(name, ""), size, number, *_range(kind, name), given)
             (self.outputs if topic in made else self.inputs).append(signal)
         return {key: number for number, key in enumerate(delays)}
 
@@ -303,30 +340,78 @@ class Library:
         self._append(image.content)
         table = self._append(np.zeros(8 * step.table.size, np.uint8))
         symbol = f"{self.name}_{len(self.parts)}_{stage.kind}"
-        self.parts.append(Part(stage, symbol, memory, table, step.table.floats, reads, writes))
+        outputs = [signal.tape for signal in self.outputs]
+        written = [outputs.index(tape) for tape in writes]
+        self.parts.append(Part(stage, symbol, memory, table, step.table.floats, reads, written))
 
     # ---- parameters ---------------------------------------------------------------------------------
 
     def _parameters(self, stage: Stage, image: MemoryImage, memory: int) -> list[Parameter]:
         found: list[Parameter] = []
         for name, (array, index) in stage.handles.items():
-            place, value, flag = (memory + image.offset(array, index),), float(array.flat[index]), name == "learning"
-            doc = "1: it learns; 0: it does not" if flag else "result of a cycle, given by the caller"
-            low, high, limits = (0.0, 1.0, "0 or 1") if flag else (-inf, inf, "")
-            found.append(Parameter(f"{stage.name}.{name}", "", doc, low, high, limits, flag, value, place))
+            place, value = (memory + image.offset(array, index),), float(array.flat[index])
+            doc = "1: it learns; 0: it does not"
+            found.append(
+                Parameter(f"{stage.name}.{name}", "", doc, 0.0, 1.0, "0 or 1", whole=True, value=value, places=place)
+            )
         asked = [name.partition(".")[2] for name in self.tune if name.partition(".")[0] == stage.name]
         rows = type(stage.shared).rows()
         for name in dict.fromkeys((*stage.tunable, *asked)):
             row = rows.get(name)
             if row and row.type is float and not row.is_list and (places := _places(stage, name, image)):
-                low = nextafter(row.low, inf) if "above" in row.limits else row.low
-                high = nextafter(row.high, -inf) if "below" in row.limits else row.high
                 at, value = tuple(memory + place for place in places), getattr(stage.shared, name)
+                low, high = (self._bound(stage, name, value, end) for end in _ends(row))
+                limits = f"from {low:.6g} up to {high:.6g}"
                 told = f"{stage.name}.{name}", row.unit, row.doc
-                found.append(Parameter(*told, low, high, row.limits, whole=False, value=value, places=at))
+                found.append(Parameter(*told, low, high, limits, whole=False, value=value, places=at))
             else:
                 self.fixed.append(f"{stage.name}.{name}")
         return found
+
+    def _bound(self, stage: Stage, name: str, value: float, end: float) -> float:
+        """Return the value of a parameter farthest towards ``end`` that the checks of the cell accept.
+
+        All other parameters are as they are; up to the value returned, none is refused.
+        """
+        if self._is_accepted(stage, name, end):
+            return end
+        good, bad = value, end
+        for _ in range(_HALVINGS):
+            if abs(bad - good) <= _CLOSE * abs(good):
+                break
+            middle = np.copysign(np.sqrt(abs(good)) * np.sqrt(abs(bad)), good) if good * bad > 0.0 else (good + bad) / 2
+            good, bad = (middle, bad) if self._is_accepted(stage, name, float(middle)) else (good, middle)
+        return float(good)
+
+    def _is_accepted(self, stage: Stage, name: str, value: float) -> bool:
+        """Return whether the engine would accept the event ``set`` with this value."""
+        cell = copy(self.cell)  # the checks write their results into it
+        cell.warnings, cell.unchecked, cell.factors, cell.loops = [], [], {}, {}
+        table = stage.shared.model_copy(update={"events": [], "faults": []})
+        try:
+            with explain_overflow({stage.name: table}), np.errstate(all="ignore"):
+                type(stage)(stage.name, table.changed(stage.name, {name: value})).check_cell(cell, cures=False)
+        except (LatheError, ArithmeticError):
+            return False
+        return True
+
+
+def _ends(row: Row) -> tuple[float, float]:
+    """Return the smallest and largest value in the range of a parameter."""
+    low = nextafter(row.low, inf) if "above" in row.limits else max(row.low, -_HUGE)
+    return low, nextafter(row.high, -inf) if "below" in row.limits else min(row.high, _HUGE)
+
+
+def _range(msgtype: str, name: str) -> tuple[float, float]:
+    """Return the smallest and largest value of a signal, far beyond those of any machine.
+
+    The bounds keep a wrong number, such as one in another unit, from poisoning a memory or reaching a drive.
+    """
+    if messages.sample_fields(msgtype)[name].itemsize == 1:
+        return 0.0, _FLAGS[name]
+    tip = msgtype in (messages.COMMAND, messages.TOOL) and name != "height"
+    bound = _STROKE if tip else max(_BOUNDS[unit] for unit in (units(msgtype).get(name) or "1").split(" or "))
+    return -bound, bound
 
 
 def _places(stage: Stage, name: str, image: MemoryImage) -> list[int]:
@@ -346,8 +431,6 @@ def _places(stage: Stage, name: str, image: MemoryImage) -> list[int]:
             new.content[used : used + 8] = 0
         words = new.content.view(np.int64)
         differs = np.flatnonzero(words != image.content.view(np.int64))
-        # The caller gives what depends on the parameter beside the step, such as a stability margin.
-        differs = np.setdiff1d(differs, [image.offset(*handle) // 8 for handle in stage.handles.values()])
         if not np.all(words[differs].view(np.float64) == other):
             return []
         found.append((8 * differs).tolist())

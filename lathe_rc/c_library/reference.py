@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.c_library.library import Library, Signal
+from lathe_rc.c_library.library import LEARN, Library, Signal
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.stage import Sparse, Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 
-_LEARN = {"learn": 1.0, "freeze": 0.0}  # events that set the parameter `learning`
-
 
 class Reference:
-    """Signals of a run, and the parameters that events and answers of the engine have changed in it.
+    """Signals of a run, and the parameters that events have changed in it.
 
     Args:
         library: the library.
@@ -28,26 +26,23 @@ class Reference:
 
     Attributes:
         samples: length [sample].
-        events, answers: changes of parameters, by the scenario and by the engine where a stage has stopped: sample,
-            index of the parameter, index of the stage in the library, and value.
+        events: changes of parameters by the scenario: sample, index of the parameter, and value.
     """
 
     def __init__(self, library: Library, cell: Cell, samples: int) -> None:
         self._library, self.samples = library, min(samples, cell.samples)
-        self.events: list[tuple[int, int, int, float]] = []
-        self.answers: list[tuple[int, int, int, float]] = []
+        self.events: list[tuple[int, int, float]] = []
         self._numbers = {parameter.name: number for number, parameter in enumerate(library.parameters)}
         self._signals = {(each.topic, each.field): list[Any]() for each in (*library.inputs, *library.outputs)}
-        for number, part in enumerate(library.parts):
+        for part in library.parts:
             stage = cell.stages[part.stage.name]
-            stage.__dict__["serve"] = self._watched(number, stage, stage.serve)
-            stage.__dict__["act"] = self._acting(number, stage, stage.act)
+            stage.__dict__["serve"] = self._watched(stage, stage.serve)
+            stage.__dict__["act"] = self._acting(stage, stage.act)
         engine, self._reached = Engine(cell, heard={topic for topic, _ in self._signals}), 0
         for _ in engine.steps([self]):
             if self._reached >= self.samples:
                 break
         self.events = sorted(event for event in self.events if event[0] < self.samples)
-        self.answers = sorted(answer for answer in self.answers if answer[0] < self.samples)
 
     def chunk(
         self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, Sequence[Sparse]]
@@ -57,24 +52,19 @@ class Reference:
             kept.append(dense[topic][name].copy())
         self._reached = first + samples
 
-    def _watched(self, place: int, stage: Stage, serve: Callable[..., list[Sparse]]) -> Callable[..., list[Sparse]]:
-        def watched(reason: int, first: int, reached: int, *signals: Any) -> list[Sparse]:
+    def _watched(self, stage: Stage, serve: Callable[..., list[Sparse]]) -> Callable[..., list[Sparse]]:
+        def watched(reason: int, first: int, *rest: Any) -> list[Sparse]:
             if reason not in stage.goes_on:
                 self.samples = min(self.samples, first)
-            found = serve(reason, first, reached, *signals)
-            for name, (array, index) in stage.handles.items():
-                if name != "learning":
-                    number = self._numbers[f"{stage.name}.{name}"]
-                    self.answers.append((first + reached, number, place, float(array.flat[index])))
-            return found
+            return serve(reason, first, *rest)
 
         return watched
 
-    def _acting(self, place: int, stage: Stage, act: Callable[[str, int], None]) -> Callable[[str, int], None]:
+    def _acting(self, stage: Stage, act: Callable[[str, int], None]) -> Callable[[str, int], None]:
         def acting(action: str, index: int) -> None:
             number = self._numbers.get(f"{stage.name}.learning")
-            if action in _LEARN and number is not None:
-                self.events.append((index, number, place, _LEARN[action]))
+            if action in LEARN and number is not None:
+                self.events.append((index, number, LEARN[action]))
             else:
                 self.samples = min(self.samples, index)
             act(action, index)
@@ -92,8 +82,8 @@ class Reference:
         """Write the file that the program of the library reads: counts, settings, then one array after the other."""
         library = self._library
         with path.open("wb") as file:
-            file.write(np.array([self.samples, len(self.events), len(self.answers)], np.int64).tobytes())
-            for *whole, value in (*self.events, *self.answers):
+            file.write(np.array([self.samples, len(self.events)], np.int64).tobytes())
+            for *whole, value in self.events:
                 file.write(np.array(whole, np.int64).tobytes() + np.float64(value).tobytes())
             for signal in (*library.inputs, *library.outputs):
                 file.write(self.signal(signal).tobytes())

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of a C library: header, tables, objects, an example that checks it, CMake file and README."""
 
+import ctypes
 import hashlib
 import inspect
 import json
@@ -24,11 +25,28 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.jit import SOURCES
 
 _IMAGE = "_image"  # object with the block at the start; no name of a node begins like this
 _GAP = 4  # zero words that are stored, so that there are fewer runs
 _OF_US = re.compile(r"`(lathe_rc\.[a-z_.]+)`")
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
+_WORD = re.compile(r"[a-z][a-z0-9_]*")
+_TEMPLATE_FOLDER = Path(__file__).parents[1] / "templates"
+_SEES_NAME = ("c_library/lathe.h.j2", "c_library/NAME.c.j2", "c_library/main.c.j2", "fmu/fmu.c.j2")
+_NO_CODE = re.compile(r"/\*.*?\*/|\"(?:[^\"\\\n]|\\.)*\"|\{\{.*?\}\}|\{%.*?%\}", re.DOTALL)
+# Words of C and C++, headers of the C library, targets of CMake, and files of an FMU.
+_RESERVED = """
+alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl concept const consteval
+constexpr constinit const_cast continue decltype default delete do double dynamic_cast else enum explicit export
+extern false float for friend goto if inline int long mutable namespace new noexcept not not_eq nullptr operator or
+or_eq private protected public register reinterpret_cast requires restrict return short signed sizeof static
+static_assert static_cast struct switch template this thread_local throw true try typedef typeid typename typeof
+typeof_unqual union unsigned using virtual void volatile wchar_t while xor xor_eq linux unix assert complex ctype
+errno features fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic stdbool stddef stdint
+stdio stdlib stdnoreturn string tgmath threads time uchar unistd wchar wctype all clean edit_cache help install
+rebuild_cache fmu unsupported words
+"""
 _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
 
 
@@ -58,7 +76,7 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
             "w": _listed(map(float.hex, wi_double.tolist())),
             "f": _listed(map(float.hex, fi_double.tolist())),
         },
-        "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.goes_on.items()],
+        "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.stops.items()],
         "formulas": list(_formulas(part.stage for part in library.parts)),
         "identity": "",
     }
@@ -67,13 +85,17 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
         found[name] = _TEMPLATES.get_template(f"{name}.j2").render(made)
     found[f"{library.name}.h"] = _TEMPLATES.get_template("NAME.h.j2").render(made)
     tables = _TEMPLATES.get_template("NAME.c.j2")
-    told = hashlib.sha256(tables.render(made).encode() + library.image.tobytes())
+    steps = "".join(part.stage.native().name for part in library.parts)
+    told = hashlib.sha256(f"{tables.render(made)}{steps}{SOURCES}".encode() + library.image.tobytes())
     made["identity"] = f"0x{told.hexdigest()[:16]}"
     found[f"{library.name}.c"] = tables.render(made)
     return found
 
 
-_KEPT = ("name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "room", "size", "left_out")
+_KEPT = (
+    "name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "held", "room", "size",
+    "left_out",
+)  # fmt: skip
 
 
 def words(library: Library) -> np.ndarray:
@@ -116,10 +138,23 @@ def library_of(
     cell = Cell(scenario.nodes)
     nodes = nodes or list(cell.stages)
     name = name or (nodes[0] if len(nodes) == 1 else scenario.name)
+    _check_name(name)
+    cell.check(cures=False)
+    return Library(cell, nodes, name, cell.master.shared.block_size if block is None else block, tune)
+
+
+def _check_name(name: str) -> None:
+    """Check that the name of a library is an identifier that C, its library and the files of a library leave free."""
     if not _IDENTIFIER.fullmatch(name):
         raise InputError(f"--name {name}; allowed: a C identifier of small letters, digits and underscores")
-    cell.check(cures=False)
-    return Library(cell, nodes, name, block or cell.master.shared.block_size, tune)
+    code = "".join((_TEMPLATE_FOLDER / each).read_text(encoding="utf-8") for each in _SEES_NAME)
+    words = {*_RESERVED.split(), *_WORD.findall(_NO_CODE.sub(" ", code))}
+    taken = {name, name.rstrip("0123456789")} & words or hasattr(ctypes.CDLL(None), name)  # the code has read_0 as well
+    if taken or name.startswith("lathe") or name.endswith("_step"):
+        raise InputError(
+            f"--name {name}: a word of C, CMake, the C library or the files of the export; allowed: another name, such "
+            f"as my_{name}"
+        )
 
 
 def export_nodes(
@@ -212,7 +247,8 @@ def _described(signal: Signal) -> str:
     kind = "double" if signal.bytes == 8 else "uint8_t"
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
-    return f"{kind} [{signal.unit}]{late}" if signal.unit else f"{kind}{late}"
+    unit = f" [{signal.unit}]" if signal.unit else ""
+    return f"{kind}{unit} from {signal.low:g} to {signal.high:g}{late}"
 
 
 def _ranged(parameter: Parameter) -> str:

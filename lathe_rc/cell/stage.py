@@ -92,6 +92,7 @@ Reached = tuple[int, int]  #: sample of the block that a step has reached, and w
 DONE, PYTHON = 0, -1  #: why a step, or a program of steps, has stopped
 NEVER = np.iinfo(np.int64).max  #: no sample at all
 
+_AROUND = ("prepare", "process", "compute", "advance")  # methods with which a stage changes samples beside its step
 _NOTHING = np.empty(0)
 _NO_FLAGS = np.empty(0, np.uint8)  # flags of a step without any, so that the call is the same
 
@@ -178,7 +179,8 @@ class Stage(ABC):
     outputs: tuple[Output, ...] = ()
     step: ClassVar[Step | None] = None
     learns: ClassVar[bool] = False  #: whether a run tells its stability margin
-    goes_on: ClassVar[Mapping[int, str]] = {}  #: stop reasons, in words, after which the step needs no answer
+    goes_on: ClassVar[Collection[int]] = ()  #: stop reasons after which the step needs no answer
+    stops: ClassVar[Mapping[int, str]] = {}  #: all other stop reasons: name, colon, explanation
     rooms: ClassVar[int] = 0  #: arrays of a block that the step needs for itself
     _sensors: Sequence[Sensor] = ()  # sensors whose noise the step needs
 
@@ -645,12 +647,21 @@ class Stage(ABC):
 
     @property
     def needs_python(self) -> str:
-        """Return why the compiled step cannot run without Python, with what is allowed instead; empty if it can."""
-        return "" if self.is_compiled else f"{self.kind} has no compiled step; allowed: a step or sample with @kernel"
+        """Return why the outputs are not those of the compiled step alone, with what is allowed instead; empty if so.
+
+        A stage whose Python code changes outputs between two calls of the step declares it here.
+        """
+        if not self.is_compiled:
+            return f"{self.kind} has no compiled step; allowed: a step or sample with @kernel"
+        own = [name for name in _AROUND if getattr(type(self), name) is not getattr(Stage, name)]
+        return f"{self.kind} computes {', '.join(own)} in Python; allowed: a step alone" if own else ""
 
     @property
     def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
-        """Return the numbers in the memory that a host without Python may change, by name: array and flat index."""
+        """Return the flags in the memory, by name: array and flat index, that alone make the events of that name.
+
+        A host without Python may change them. An event that changes more is none of theirs.
+        """
         return {}
 
     def prepare(self, first: int, samples: int) -> None:

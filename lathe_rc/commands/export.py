@@ -2,12 +2,15 @@
 """Command group ``lathe export``: signals of a bag as tables, and stages as C libraries or FMUs."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lathe_rc.commands import completers, lossy, options
 from lathe_rc.errors import InputError
+
+if TYPE_CHECKING:
+    from lathe_rc.c_library.library import Library
 
 _TARGETS = ("x86-64", "aarch64")  # those of lathe_rc.c_library.object_code, whose import takes a second
 
@@ -69,20 +72,23 @@ def c_library(
     from lathe_rc.commands import scenario as scenarios
 
     done = export_nodes(scenarios.load(scenario, overrides), nodes, output, **how)
-    for line in done.library.left_out:
-        click.echo(f"warning: not in the library, the program has to cause it: {line}", err=True)
-    _tell_fixed(done.library.fixed)
+    _tell(done.library, "not in the library, the program has to cause it")
     exported = ", ".join(part.stage.name for part in done.library.parts)
     click.echo(f"{done.place}: {exported}; state of {done.library.size} bytes")
     click.echo(f"next: cd {done.place} && cmake -B build && cmake --build build && build/{done.library.name}_main")
 
 
-def _tell_fixed(names: list[str]) -> None:
-    """Name the parameters that a running cell could change, and the exported code cannot."""
-    if names:
-        click.echo(
-            f"fixed, since they act by way of tables: {', '.join(names)}; for other values export again", err=True
-        )
+def _tell(library: "Library", left_out: str) -> None:
+    """Print what the checks of the cell leave in doubt, and what a running cell could do that the code cannot."""
+    for line in library.cell.warnings:
+        click.echo(f"warning: {line}", err=True)
+    for line in library.cell.unchecked:
+        click.echo(f"not checked: {line}", err=True)
+    for line in library.left_out:
+        click.echo(f"warning: {left_out}: {line}", err=True)
+    if library.fixed:
+        names = ", ".join(library.fixed)
+        click.echo(f"fixed, since they act by way of tables: {names}; for other values export again", err=True)
 
 
 @export.command()
@@ -102,9 +108,7 @@ def fmu(
     from lathe_rc.commands import scenario as scenarios
 
     place, library = export_fmu(scenarios.load(scenario, overrides), nodes, output, fmi=int(fmi), **how)
-    for line in library.left_out:
-        click.echo(f"warning: not in the FMU, the importer has to cause it: {line}", err=True)
-    _tell_fixed(library.fixed)
+    _tell(library, "not in the FMU, the importer has to cause it")
     exported = ", ".join(part.stage.name for part in library.parts)
     counts = f"{len(library.inputs)} inputs, {len(library.outputs)} outputs, {len(library.parameters)} parameters"
     click.echo(f"{place}: {exported}; {counts}, a step of {library.step:.9g} s")

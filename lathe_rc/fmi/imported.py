@@ -8,8 +8,10 @@ import ctypes
 import gc
 import hashlib
 import os
+import shutil
 import tempfile
 import threading
+import time
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +34,8 @@ with extras.named():
     from fmpy import model_description, simulation
 
 _MOST = 2**29  # longest FMU [B]
+_UNPACKED, _RATIO = 2**26, 20  # size of what is unpacked [B], and relative to the FMU, of which the larger is allowed
+_CACHE, _IN_USE = 2**30, 3600.0  # size of all unpacked FMUs [B] beyond those used so recently [s]
 _ERROR = 2  # a status from which a call has failed: discard, error, fatal
 _loading = threading.Lock()  # FMPy changes the current folder while it loads a library
 
@@ -202,22 +206,54 @@ class Fmu:
         return any(other.fmu.path == self.path for other in _alive)
 
     def unpacked(self) -> Path:
-        """Return the folder with the content of the FMU, which is unpacked once on this computer.
+        """Return the folder with the binary and resources of the FMU, which are unpacked once on this computer.
 
         Raises:
-            LatheError: it cannot be unpacked.
+            InputError: they are too large.
+            LatheError: they cannot be unpacked.
         """
         try:
-            place = cache_folder() / "fmu" / hashlib.sha256(contents(self.path, _MOST)).hexdigest()
+            place = cache_folder().parent / "fmu" / hashlib.sha256(contents(self.path, _MOST)).hexdigest()
             if not place.is_dir():
+                self._check_size()
                 place.parent.mkdir(parents=True, exist_ok=True)
                 with tempfile.TemporaryDirectory(dir=place.parent) as folder:
-                    fmpy.extract(self.path, Path(folder) / "content")
+                    fmpy.extract(self.path, Path(folder) / "content", self._is_needed)
                     with suppress(FileExistsError):
                         (Path(folder) / "content").rename(place)
+                _make_room(place)
+            with suppress(OSError):  # of a cache that is only read
+                os.utime(place)
+        except LatheError:
+            raise
         except Exception as error:  # noqa: BLE001 - FMPy and zipfile raise what they like about a damaged archive
             raise LatheError(f"{self.path}: cannot be unpacked ({shown(error)})") from None
         return place
+
+    def _is_needed(self, name: str) -> bool:
+        """Return whether an instance needs a file of the FMU: neither its sources nor other platforms' binaries."""
+        folder = fmpy.platform_tuple if self.is_3 else fmpy.platform
+        return name == "modelDescription.xml" or name.startswith((f"binaries/{folder}/", "resources/"))
+
+    def _check_size(self) -> None:
+        with zipfile.ZipFile(self.path) as archive:
+            size = sum(each.file_size for each in archive.infolist() if self._is_needed(each.filename))
+        allowed = max(_UNPACKED, _RATIO * self.path.stat().st_size)
+        if size > allowed:
+            raise InputError(
+                f"{self.path}: its binary and resources unpack to {size / 2**20:.0f} MiB; allowed: "
+                f"{allowed / 2**20:.0f} MiB, or {_RATIO} times the FMU (store large resources uncompressed, or outside)"
+            )
+
+
+def _make_room(newest: Path) -> None:
+    """Remove the FMUs used longest ago from the cache while it is too large; those of the last hour may be in use."""
+    known = [(each.stat().st_mtime, each) for each in newest.parent.iterdir() if each.is_dir()]
+    total = 0
+    for used, place in sorted(known, reverse=True):
+        total += sum(each.stat().st_size for each in place.rglob("*") if each.is_file())
+        if total > _CACHE and used < time.time() - _IN_USE:
+            shutil.rmtree(place, ignore_errors=True)
 
 
 @cache

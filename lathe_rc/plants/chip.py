@@ -78,6 +78,11 @@ _TURN = 2.0 * np.pi
 
 WEAR, _EDGE = 0, 1  #: indices in the state
 DONE, _STANDS, _TURNS_BACK, DRAWN_IN = 0, 1, 2, 3  #: reasons for a kernel to stop
+STOPS = {
+    _STANDS: "stands: the spindle, in the cut",
+    _TURNS_BACK: "turns back: the spindle, or its angle jumps",
+    DRAWN_IN: "drawn in: the force draws the edge into the part",
+}  #: the same in words
 
 
 class Process(NamedTuple):

@@ -26,6 +26,10 @@ from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import discretise
 
 _DONE, _OVERLOADED, _OUT_OF_SPEED = 0, 1, 2
+STOPS = {
+    _OVERLOADED: "overloaded: the cut loads the spindle beyond largest_load",
+    _OUT_OF_SPEED: "out of speed: the load changes the speed beyond largest_deviation",
+}  #: reasons to stop, in words
 _INTEGRAL, _LOAD, _SPEED = 0, 1, 2  # indices in the state of the loop
 
 

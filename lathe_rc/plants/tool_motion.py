@@ -23,6 +23,7 @@ from lathe_rc.plants.chip import (
     meet,
     press,
 )
+from lathe_rc.plants.chip import STOPS as CUT_STOPS
 from lathe_rc.plants.chip import failure as failure_of_cut
 from lathe_rc.plants.coil import CoilTable, applied
 from lathe_rc.plants.electrodynamic import between_stops
@@ -32,6 +33,7 @@ from lathe_rc.signals.noise import quantise
 _ROUNDS = 32  # maximum iterations for the carriage's position and the extension of the same sample
 _TURN = 2.0 * np.pi
 _TORN_OFF = DRAWN_IN + 1  # reason why the kernel stopped, in addition to those of the cut
+STOPS = {**CUT_STOPS, _TORN_OFF: "torn off: the acceleration exceeds the preload of the stack"}  #: in words
 
 
 @sized

@@ -4,17 +4,38 @@
 import subprocess
 
 import pytest
-from bags import some
-from c_libraries import built
+from bags import sized, some
+from c_libraries import built, hostile
 from cells import SCENARIOS
 
 from lathe_rc.c_library.sources import export_nodes
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
 
 pytestmark = pytest.mark.system
 
 SAMPLES = 200_000  # beyond the event of each scenario that has one
+#: scenarios that Python changes beside the steps, with what they are refused for
+REFUSED = {
+    "adaptive_inverse": "correction_model = identified",
+    **dict.fromkeys(["supervised", "supervised_full_cell", "supervised_two_channel"], "publish_margin = true"),
+}
+#: the same with what Python does left out, and stages with further kinds of inputs
+HOSTILE = [
+    ("piston", ["learning_controller"], []),
+    ("adaptive_inverse", ["learning_controller"], ["correction_model=given", "events=[]"]),
+    ("supervised_turning", ["longitudinal"], []),
+    ("robust", ["disturbance_controller"], ["events=[]"]),
+    ("exact_invariance", ["learning_controller"], ["events=[]"]),
+    ("periodic", ["position_controller"], []),
+    ("lead_lag", ["fine_controller"], []),
+    ("full_cell", ["electrodynamic_actuator"], []),
+    ("gauged", ["gauge"], []),
+    ("force_turning", ["force_controller"], []),
+    ("robust_cutting", ["loaded_drive"], []),
+    ("force_turning", ["cutting_process"], []),
+]
 
 
 def told(exported, *command, samples=0):
@@ -30,6 +51,11 @@ def told(exported, *command, samples=0):
 
 @pytest.mark.parametrize("path", some(SCENARIOS, 4), ids=lambda path: path.stem)
 def test_each_cell_has_the_bits_of_the_engine(path, tmp_path):
+    """Or is refused by the name of what Python does in it."""
+    if path.stem in REFUSED:
+        with pytest.raises(InputError, match=REFUSED[path.stem]):
+            export_nodes(load(path), place=tmp_path / "cell")
+        return
     exported = export_nodes(load(path), place=tmp_path / "cell", samples=SAMPLES)
     assert exported.reference.samples > 40_000
     told(exported, built(exported.place))
@@ -40,7 +66,7 @@ def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
     """One of each different compiled step that the scenarios have."""
     steps = {}
     for path in SCENARIOS:
-        for name, stage in Cell(load(path).nodes).stages.items():
+        for name, stage in Cell(load(path).nodes).stages.items() if path.stem not in REFUSED else ():
             steps.setdefault(stage.native().name, (path, name))
     assert len(steps) > 25
     for number, (path, name) in enumerate(some([*steps.values()], 4)):
@@ -81,3 +107,27 @@ def test_64_bit_arm_has_the_bits_of_the_engine(name, nodes, tmp_path):
     """Cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
     exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", target="aarch64", samples=20_000)
     told(exported, "qemu-aarch64", built(exported.place, "-static", compiler="aarch64-linux-gnu-gcc"))
+
+
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize(("name", "nodes", "values"), some(HOSTILE, 4), ids=lambda value: "-".join(value)[:40])
+def test_no_input_and_no_state_brings_a_library_out_of_its_range(name, nodes, values, tmp_path):
+    """NaN, infinity, 1e300, wild values at each input, and flipped bits of its state; under two sanitizers as well."""
+    cell = load(name, [f"{nodes[0]}.{value}" for value in values])
+    exported = export_nodes(cell, nodes, tmp_path / "law", name="law", samples=20_000)
+    assert "refused" in hostile(exported.place, sized(10_000), sized(1000))
+    hostile(exported.place, sized(2000), 100, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover")
+
+
+def test_each_name_compiles_or_is_refused(tmp_path):
+    """Words of C, and of the code around the library; the compiler has the last word about all others."""
+    compiled = []
+    names = ["int", "lathe", "cell", "block", "given", "read_0", "time", "j1", "index", "stop", "stage_0", "law", "y"]
+    for name in names:
+        try:
+            exported = export_nodes(load("piston"), ["tool"], tmp_path / name, name=name, samples=1000)
+        except InputError:
+            continue
+        told(exported, built(exported.place))
+        compiled.append(name)
+    assert compiled == ["stage_0", "law", "y"]

@@ -16,7 +16,7 @@ from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.plants.chip import CutTable, failure
+from lathe_rc.plants.chip import STOPS, CutTable, failure
 from lathe_rc.plants.cutting import CuttingProcess, cut_along
 from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, Elasticity, Flank, SpecificForce, Wear
 from lathe_rc.plants.workpiece import HardSpot, Part
@@ -232,6 +232,7 @@ class CutStage(Stage):
     """
 
     devices = ("cut",)
+    stops = STOPS
     failure = staticmethod(failure)  #: function that explains why the cut cannot continue
 
     def __init__(self, name: str, parameters: NodeParameters, table: CuttingProcessParameters, prefix: str) -> None:

@@ -326,6 +326,11 @@ class FmuStage(Stage):
         return Instance(self.fmu, self._values)
 
     @property
+    def needs_python(self) -> str:
+        """Return that the step calls functions of a loaded FMU."""
+        return "an FMU is loaded by Python; allowed: export the other nodes, and wire the FMU to them where they run"
+
+    @property
     def memory(self) -> Memory:
         """Memory of the step, with a running instance of the FMU, which begins when it is first needed."""
         if self._memory is None:

@@ -16,9 +16,9 @@ and the fastest without overshoot with b = D^D/(D+1)^(D+1) (both from λ^(D+1) -
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -27,11 +27,11 @@ from lathe_rc import messages
 from lathe_rc.analysis.metrology import gaussian_share
 from lathe_rc.arrays import Integers, put
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, parameter, remapped
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage, WiredCell
+from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell
 from lathe_rc.control.interpolation import read
-from lathe_rc.errors import InputError, at_least, at_most
+from lathe_rc.errors import InputError, LatheError, at_least, at_most
 from lathe_rc.jit import inlined, kernel
-from lathe_rc.messages import Samples
+from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.noise import Sensor, SensorTable, quantise
 
 _TURN = 2.0 * np.pi
@@ -47,6 +47,7 @@ _NEXT, _FIRST, _RECORDS, _POINT, _SINCE, _BEGUN, LEARNS = range(7)
 # Indices in the real state: newest recorded angle and error; angle up to which there is no reading; sum and count of
 # the readings at the current point.
 _ANGLE, _ERROR, _MISSING, _SUM, _COUNT = range(5)
+_JUMPED = 1  # stop reason of the step
 
 
 class GaugeParameters(NodeParameters):
@@ -197,6 +198,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     noisy, drops = m.sensor.rms > 0.0, m.dropouts.rms > 0.0
     for k in range(angle.size):
         if first + k >= m.delay:
+            if whole[_RECORDS] and abs(cut_angle[k] * (_GRID / _TURN) - real[_ANGLE]) > m.record.size:
+                return k, _JUMPED
             _record(m, cut_angle[k], cut_error[k])
         place = angle_true[k] * (_GRID / _TURN) - m.back
         left = int(np.floor(place))
@@ -213,6 +216,8 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
             value = error[k] + (m.sensor.rms * m.sensor.noise.values[noise + k] if noisy else 0.0)
             reading[k] = quantise(value, m.sensor.resolution)
         if whole[LEARNS]:
+            if whole[_BEGUN] and abs(angle[k] * (m.correction.size / _TURN) - whole[_POINT]) > m.correction.size:
+                return k, _JUMPED
             _learn(m, angle[k], reading[k], there[k] > 0.0)
         point = angle[k] * (m.correction.size / _TURN)
         i = int(np.floor(point))
@@ -255,6 +260,7 @@ class Gauge(Stage):
     Parameters = GaugeParameters
     parameters: GaugeParameters
     actions = ("freeze", "learn", "clear")
+    stops: ClassVar[Mapping[int, str]] = {_JUMPED: "jumped: the spindle angle, by more than the record holds"}
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: GaugeParameters) -> None:
@@ -375,10 +381,18 @@ class Gauge(Stage):
         # Points since then are no whole revolution of readings.
         memory.whole[_BEGUN] = 0
 
-    @property
-    def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
-        """Return whether the gauge learns."""
-        return {"learning": (self._memory.whole, LEARNS)}
+    def serve(
+        self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]
+    ) -> list[Sparse]:
+        """End a run whose angle jumps, since the points in between would take hours.
+
+        Raises:
+            LatheError: the angle jumps.
+        """
+        raise LatheError(
+            f"sample {first + reached}: the spindle angle jumps to {inputs[0]['angle'][reached]:.6g} rad; allowed: a "
+            "revolution or less in a sample"
+        )
 
     @property
     def memory(self) -> Memory:

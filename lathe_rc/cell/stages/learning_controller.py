@@ -51,7 +51,13 @@ class LearningController(Learner):
     factor = "sup|Q - Z|"
     remedy = "another lead, correction or Q"
     step = staticmethod(step)
-    goes_on: ClassVar[Mapping[int, str]] = {angle_memory.CYCLE_ENDED: "a cycle has ended"}
+    goes_on = (angle_memory.CYCLE_ENDED,)
+    stops: ClassVar[Mapping[int, str]] = {
+        **Learner.stops,
+        angle_memory.AHEAD: "ahead: the memory would be read before it is learned (speed, lead and delay)",
+        angle_memory.BEHIND: "behind: the spindle has turned back to where no memory is kept",
+        angle_memory.JUMPED: "jumped: the spindle angle",
+    }
 
     def __init__(self, name: str, parameters: LearningControllerParameters) -> None:
         super().__init__(name, parameters)
@@ -284,17 +290,23 @@ class LearningController(Learner):
 
     @property
     def needs_python(self) -> str:
-        """Return why the step needs Python: filters other than the exponential one are no kernels."""
-        filtered = f"q_filter = {self.parameters.q_filter} is computed in Python; allowed: exponential"
-        return filtered if self._q.ratio < 0.0 else super().needs_python
+        """Return why the step needs Python: other filters than the exponential one, and what a cycle's end changes."""
+        parameters = self.parameters
+        if self._q.ratio < 0.0:
+            return f"q_filter = {parameters.q_filter} is computed in Python; allowed: exponential"
+        if parameters.correction_model == "identified":
+            return "correction_model = identified is computed in Python; allowed: given"
+        if parameters.publish_margin:
+            return "publish_margin = true: the margin is computed in Python; allowed: false, and no monitor of it"
+        if parameters.stop_ratio:
+            return f"stop_ratio = {parameters.stop_ratio:g} is watched in Python; allowed: 0"
+        return super().needs_python
 
     @property
     def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
-        """Return whether it learns, and what the end of a cycle may change: the margin, and a1 and a2 of 1/W0."""
-        table, obedience = self._controller.table, self._obedience
-        learning = obedience.wanted if obedience else (table.whole, angle_memory.LEARNS)
-        inverse = {"inverse_a1": (table.settings, 0), "inverse_a2": (table.settings, 1)}
-        return {"learning": learning, "stability_margin": (self._margin, 0), **inverse}
+        """Return whether it learns."""
+        own = self._controller.table.whole, angle_memory.LEARNS
+        return {"learning": self._obedience.wanted if self._obedience else own}
 
     def serve(
         self, reason: int, first: int, reached: int, inputs: Sequence[Signals], outputs: Sequence[Signals]

@@ -27,7 +27,7 @@ from lathe_rc.messages import Samples
 from lathe_rc.plants.chip import CutTable
 from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.tool_drive import ToolDrive
-from lathe_rc.plants.tool_motion import MotionTable, advance_loaded, failure
+from lathe_rc.plants.tool_motion import STOPS, MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
 from lathe_rc.signals.noise import SensorTable, measure
 
@@ -246,6 +246,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
     Parameters = LoadedDriveParameters
     parameters: LoadedParameters
     failure = staticmethod(failure)
+    stops = STOPS
     rooms = 9
     step = staticmethod(step)
 

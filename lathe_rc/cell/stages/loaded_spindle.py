@@ -15,7 +15,7 @@ from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder, SpindleEncoderP
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
+from lathe_rc.plants.spindle import STOPS, Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
 
 _TORQUE = "torque"  # source of limit events
@@ -96,6 +96,7 @@ class LoadedSpindleStage(SpindleEncoder):
     kind = "loaded_spindle"
     Parameters = LoadedSpindleParameters
     announces = (LIMITED, FREE)
+    stops = STOPS
     rooms = 1
     step = staticmethod(step)
 

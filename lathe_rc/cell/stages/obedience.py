@@ -2,8 +2,8 @@
 """Reactions of a controller or a feed drive to the supervisor."""
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -204,6 +204,7 @@ class Obedience:
 class Obedient(Stage):
     """Stage that may obey the supervisor, whose reactions are its last input; a subclass sets the obedience, if any."""
 
+    stops: ClassVar[Mapping[int, str]] = {OBEY: "reaction: the supervisor asks for another one"}
     _obedience: Obedience | None = None
 
     @property

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Position controller of a slide: PID, sampled link, or the periodic law."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Gt, Le
@@ -237,7 +236,7 @@ class PositionController(Servo):
     kind = "position_controller"
     Parameters = PositionControllerParameters
     parameters: PositionControllerParameters
-    goes_on: ClassVar[Mapping[int, str]] = {_TOLD: "the log of periods is full"}
+    goes_on = (_TOLD,)
 
     def __init__(self, name: str, parameters: PositionControllerParameters) -> None:
         super().__init__(name, parameters)

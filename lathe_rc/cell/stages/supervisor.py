@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Supervisor of the cell: monitors, and requested reactions, which nodes read as feedback with a declared delay."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -175,6 +175,7 @@ class Supervisor(Stage):
     Parameters = SupervisorParameters
     parameters: SupervisorParameters
     actions = (RESET, RETRACT)
+    stops: ClassVar[Mapping[int, str]] = {_ANSWER: "alarm: a monitor raises one, or the tool has cleared the part"}
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: SupervisorParameters) -> None:
