@@ -5,8 +5,8 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 from cells import Seen, scenario, until
@@ -20,6 +20,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
+from lathe_rc.messages import ALIVE
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import has_ended, this_host
@@ -163,7 +164,6 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
     watch = tool.watch
     with subprocess.Popen(["/bin/sleep", "1000"]) as child:
         watch.follow(Announcement("", "/stopped", "tool", pid=child.pid, host=this_host()))
-        watch._changed("/stopped", SimpleNamespace(alive_count=1, not_alive_count=0))
         for number, change, silent in (
             (signal.SIGSTOP, os.WSTOPPED, ["/stopped"]),
             (signal.SIGCONT, os.WCONTINUED, []),
@@ -173,6 +173,24 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
             watch.look()
             assert list(watch.silent) == silent
         child.kill()
+
+
+def test_a_member_of_another_machine_is_silent_when_its_lease_has_run_out(tool):
+    """Its liveliness is polled, as an event of DDS can make a node stand still."""
+    code = (
+        "import rclpy, signal; from lathe_rc.nodes.liveliness import *; rclpy.init(); node = rclpy.create_node('far');"
+        f"node.create_publisher(Empty, '/far/{ALIVE}', liveliness()); signal.pause()"
+    )
+    tool.watch.follow(Announcement("", "/far", "tool", pid=1, host="another machine"))
+    with subprocess.Popen([sys.executable, "-c", code]) as process:
+        try:
+            inlet = next(each for each in tool.subscriptions if each.topic_name == f"/far/{ALIVE}")
+            until(inlet.get_publisher_count)
+            for number, silent in ((signal.SIGSTOP, ["/far"]), (signal.SIGCONT, [])):
+                process.send_signal(number)
+                until(lambda silent=silent: list(tool.watch.silent) == silent, tool.watch.look)
+        finally:
+            process.kill()
 
 
 def test_an_ended_process_is_known_by_its_announcement():
