@@ -84,8 +84,8 @@ def test_a_stored_result_is_shown_beside(tmp_path, monkeypatch):
 def test_a_law_and_a_drive_of_a_user_are_measured_beside_ours(tmp_path, monkeypatch):
     """Within the command, where no code of others is allowed by itself."""
     monkeypatch.setattr(suite, "STORE", tmp_path)
-    monkeypatch.setattr(engine, "measure", lambda *, quick, say: {"own": engine.own(quick=quick)})
-    monkeypatch.setattr(engine, "_asked", lambda turns, _: dict.fromkeys(turns, [1.0]))
+    monkeypatch.setattr(engine, "measure", lambda *, quick, **_: {"own": engine.own(quick=quick)})
+    monkeypatch.setattr(engine, "_asked", lambda turns, _: dict.fromkeys(turns, (1.0,)))
     shown = run("engine", "--quick", "--json")
     assert shown.exit_code == 0, shown.output
     assert json.loads(shown.output.splitlines()[-1])["engine"]["own"]["law"]["ratio_to_ours"]["median"] == 1.0
