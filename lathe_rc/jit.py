@@ -191,7 +191,7 @@ def check_compiler() -> None:
     Raises:
         InputError: the environment switches the compiler off.
     """
-    if numba.config.DISABLE_JIT:
+    if vars(numba.config)["DISABLE_JIT"]:
         raise InputError(
             "NUMBA_DISABLE_JIT = 1; allowed: 0 or unset, as offline runs need compiled code (nodes run without it)"
         )

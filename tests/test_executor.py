@@ -87,7 +87,7 @@ def test_requests_have_their_turn_while_messages_keep_coming(ghost, node):
 def test_no_event_of_dds_is_taken(ghost, node):
     """In rmw_fastrtps 8.4 the thread that takes one may stand still for ever, whatever the event."""
     told = []
-    every = {name: told.append for name in ("matched", "incompatible_qos", "liveliness", "message_lost")}
+    every = dict.fromkeys(("matched", "incompatible_qos", "liveliness", "message_lost"), told.append)
     node.create_subscription(Empty, "/watched", told.append, 1, event_callbacks=SubscriptionEventCallbacks(**every))
     publisher, events = ghost.create_publisher(Empty, "/watched", 1), Events([node])
     until(publisher.get_subscription_count)

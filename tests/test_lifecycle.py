@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from cells import Seen, scenario, until
@@ -21,6 +22,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.messages import ALIVE
+from lathe_rc.nodes import cell_node
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import has_ended, this_host
@@ -191,6 +193,22 @@ def test_a_member_of_another_machine_is_silent_when_its_lease_has_run_out(tool):
                 until(lambda silent=silent: list(tool.watch.silent) == silent, tool.watch.look)
         finally:
             process.kill()
+
+
+def test_a_reader_that_is_stuck_costs_the_nodes_of_a_process_their_patience_once(tool, monkeypatch):
+    """A stopped panel acknowledges no status and no event, which each node publishes on topics of its own."""
+    clock, waits = [0.0], []
+
+    def wait(duration):
+        waits.append(duration.nanoseconds * 1e-9)
+        clock[0] += waits[-1]
+        return False
+
+    monkeypatch.setattr(cell_node.time, "monotonic", lambda: clock[0])
+    stuck = [SimpleNamespace(topic="/events", wait_for_all_acked=wait)] * 5
+    for _ in range(3):  # nodes
+        tool._wait_for_acknowledgement(stuck, 2.0)
+    assert (waits[0], sum(waits)) == (2.0, pytest.approx(2.0 + 14 * 0.05))
 
 
 def test_an_ended_process_is_known_by_its_announcement():

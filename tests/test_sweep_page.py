@@ -202,7 +202,11 @@ class TestPage:
         ("best", "words", "sound"),
         [
             (1.4e-3, ["Its stability margin is 0.4999, beside 0.4949."], True),
-            (1e-3, [f"at the end of {LEAD} (0.001, the smallest): a better", "margin is 0.4999, beside 0.4949."], False),
+            (
+                1e-3,
+                [f"at the end of {LEAD} (0.001, the smallest): a better", "margin is 0.4999, beside 0.4949."],
+                False,
+            ),
             (2.4e-3, ["margin is 0.4999, beside 0.4949.", "Beside it without a result: cell 8 (refused)."], False),
         ],
     )

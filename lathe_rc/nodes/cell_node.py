@@ -43,6 +43,7 @@ from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
 
 _TICK = 0.02  # [s] between polls of the graph while members join
+_BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
 _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
@@ -547,8 +548,12 @@ class CellNode(LifecycleNode):
             self._host["progress"].publish(messages.encode(_PROGRESS, progress))
 
     def _wait_for_acknowledgement(self, publishers: Sequence[Publisher], patience: float) -> None:
+        """Wait until all readers have acknowledged; a stuck one uses up the patience of a process only once."""
         for publisher in publishers:
-            if not publisher.wait_for_all_acked(Duration(seconds=patience)):
+            began = time.monotonic()
+            left = max(patience - self.exchange.waited, min(patience, _BRIEF))
+            if not publisher.wait_for_all_acked(Duration(seconds=left)):
+                self.exchange.waited += time.monotonic() - began
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
 
     # ---- topics -------------------------------------------------------------------------------------

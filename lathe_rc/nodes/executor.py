@@ -62,11 +62,12 @@ class Events:
 
     def _list_endpoints(self) -> None:
         self._changed = False
+        # Topics of liveliness carry no messages, but each change of liveliness would end a wait.
         self._inlets = [
             (inlet, partial(cast("Any", inlet.handle).take_message, inlet.msg_type, inlet.raw))
             for node in self._nodes
             for inlet in node.subscriptions
-            if not inlet.topic_name.endswith(f"/{ALIVE}")  # without messages; a change of liveliness would end each wait
+            if not inlet.topic_name.endswith(f"/{ALIVE}")
         ]
         self._services = [service for node in self._nodes for service in node.services]
         sizes = (len(self._inlets), 0, 0, 0, len(self._services), 0)
