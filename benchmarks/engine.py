@@ -8,7 +8,8 @@ and neither side makes messages at chosen samples (joint states, learning status
 
 ``real_time_factor`` is that of the engine in the same run. For the unmodified scenario, ``unchanged_real_time_factor``
 is that of the engine, and ``recorded_real_time_factor`` that of ``lathe_rc.run`` with a bag, on one core, from the
-first sample until the bag is closed.
+first sample until the bag is closed. ``engine_share``, ``zstd_share`` and ``digests_share`` are the times of these over
+that of the recorded run; the digests (SHA-256) are computed after the bag is closed, so they come on top.
 """
 
 import sys
@@ -21,10 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 
 from benchmarks.plain_c import PlainC, compiled
 from benchmarks.sides import alternate, one_core, ratio, seconds, spread
-from lathe_rc import harness, resources
+from lathe_rc import allowed_code, harness, resources
+from lathe_rc.bag.writing import mcap_file
 from lathe_rc.cell import scenario
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine
@@ -134,6 +137,37 @@ def _recorded(name: str, revolutions: float) -> float:
     return run.wall_s / run.samples
 
 
+def _digested(name: str, revolutions: float) -> float:
+    run = harness.run(loaded(name, revolutions))
+    with one_core():
+        return seconds(run.recording.digests) / run.samples
+
+
+def _compressed(name: str, revolutions: float) -> float:
+    """The same of the compression of the bag's chunks, as in `lathe_rc.bag.writing.mcap_file`."""
+    with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
+        made = loaded(name, revolutions, "recorder.compression=none")
+        run = harness.run(made, bag=Path(folder) / "bag")
+        whole = next(Path(folder).glob("bag/*.mcap")).read_bytes()
+    size = made.recorder[1].chunk_size
+    compressor = zstandard.ZstdCompressor(level=mcap_file.LEVEL)
+    pieces = [whole[start : start + size] for start in range(0, len(whole), size)]
+    with one_core():
+        return seconds(lambda: [compressor.compress(piece) for piece in pieces]) / run.samples
+
+
+def _of_recording(name: str, revolutions: float, rounds: int) -> dict[str, Any]:
+    """What a recorded run on one core consists of, each over its time until the bag is closed."""
+    turns = {
+        "recorded": partial(_recorded, name, revolutions),
+        "engine": partial(_unchanged, name, revolutions),
+        "zstd": partial(_compressed, name, revolutions),
+        "digests": partial(_digested, name, revolutions),
+    }
+    times = _asked(turns, rounds)
+    return {f"{side}_share": ratio(times[side], times["recorded"]) for side in ("engine", "zstd", "digests")}
+
+
 def sides(name: str, revolutions: float) -> dict[str, Callable[[], float]]:
     """What takes turns on a cell."""
     return {
@@ -205,6 +239,7 @@ def own(*, quick: bool) -> dict[str, dict[str, Any]]:
     with tempfile.TemporaryDirectory(prefix="lathe-bench-") as folder:
         for kind in ("law", "plant"):
             begin(kind, f"own_{kind}", Path(folder), compiled=True)
+            allowed_code.allow(f"own_{kind}")
             sys.path.append(f"{folder}/own_{kind}")
         length = f"spindle_encoder.revolutions={revolutions}"
         files = {kind: Path(folder) / f"own_{kind}" / f"own_{kind}.yaml" for kind in ("law", "plant")}
@@ -229,6 +264,7 @@ def measure(*, quick: bool, say: Say) -> dict[str, Any]:
     whole["unchanged_real_time_factor"] = unchanged["real_time_factor"]
     whole["recorded_real_time_factor"] = unchanged["recorded_real_time_factor"]
     whole["target_recorded_real_time_factor"] = _PACE
+    whole |= _of_recording("full_cell", *((50.0, 3) if quick else (200.0, 9)))
     for factors in pace.values():
         factors |= {f"target_{key}": _PACE for key in tuple(factors)}
     say("engine with stages of one's own")

@@ -14,7 +14,11 @@ import importlib
 import os
 from typing import Any
 
+from lathe_rc import numba_settings
+
 __version__ = "0.1.0"
+
+numba_settings.ignore_current_folder()
 
 # The matrices are small, and waiting BLAS threads would occupy cores that other nodes need.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -70,7 +70,12 @@ def cause(message: Sparse) -> str:
 
 def supervisor_state(message: Sparse) -> str:
     """Return the state in a message of the supervisor, in lower case."""
-    return _STATES.get(message.values["state"], "?")
+    return state_name(message.values["state"])
+
+
+def state_name(state: int) -> str:
+    """Return the name of a supervisor's state, in lower case."""
+    return _STATES.get(state, "?")
 
 
 @dataclass

@@ -25,6 +25,7 @@ from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 from numba.core.ccallback import CFunc
 
+from lathe_rc.errors import InputError
 from lathe_rc.extensions import is_ours
 from lathe_rc.files import DamagedError, contents, sealed, unsealed
 
@@ -182,6 +183,18 @@ class _Cache(FunctionCache):
 
 
 # ---- kernels -------------------------------------------------------------------------------------------------------
+
+
+def check_compiler() -> None:
+    """Check that kernels are compiled.
+
+    Raises:
+        InputError: the environment switches the compiler off.
+    """
+    if vars(numba.config)["DISABLE_JIT"]:
+        raise InputError(
+            "NUMBA_DISABLE_JIT = 1; allowed: 0 or unset, as offline runs need compiled code (nodes run without it)"
+        )
 
 
 def _kept(compiled: Any, function: Callable[..., Any]) -> Any:

@@ -17,7 +17,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.messages import ALIVE
+from lathe_rc.messages import ALIVE, SAFETY
 from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.machine_state import source as machine_source
 from lathe_rc.view.rerun_signals import is_drawn
@@ -135,8 +135,11 @@ class _Maker:
         return self._node(RERUN_BRIDGE, subscribe=[*drawn, "cell_state"])
 
     def panel(self) -> Profile:
-        """Return the profile of an attached panel, which reads the same signals as the Rerun bridge."""
-        return replace(self.rerun_bridge(), node=PANEL, reply=frozenset(f"{PANEL}/{each}" for each in _PARAMETERS))
+        """Return the profile of an attached panel, which reads the signals of the Rerun bridge and the cell's state."""
+        bridge = self.rerun_bridge()
+        states = {topic for topic, source in self._signals.items() if source.type == SAFETY} | {"cell_state"}
+        reply = frozenset(f"{PANEL}/{each}" for each in _PARAMETERS)
+        return replace(bridge, node=PANEL, subscribe=bridge.subscribe | states, reply=reply)
 
     def panel_commands(self) -> Profile:
         """Return the profile of its second node, which asks for events, pace and pause."""

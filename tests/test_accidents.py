@@ -38,7 +38,7 @@ signal.pause()
 """
 STRANGERS = [
     "/members: message of run 'test' from /second_spindle; the time master is /spindle_encoder",
-    "/tool: message of run '' from ?; a publisher offers a quality of service that does not fit",
+    "/tool: message of run '' from /haunted/ghost; a publisher offers a quality of service that does not fit",
 ]
 REFUSED = {
     "tool": "/tool: process {tool} has this name already; give this node another one",

@@ -13,7 +13,7 @@ from lathe_rc import harness
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import page, ros, sides, suite, transport
+from benchmarks import engine, page, ros, sides, suite, transport
 from benchmarks.__main__ import main
 
 RESULT = {
@@ -79,6 +79,16 @@ def test_a_stored_result_is_shown_beside(tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.output
     assert "1.9" in next(line for line in shown.output.splitlines() if "engine.c_ratio" in line)
     assert json.loads(run("engine", "--json").output)["engine"]["c_ratio"]["median"] == 0.95
+
+
+def test_a_law_and_a_drive_of_a_user_are_measured_beside_ours(tmp_path, monkeypatch):
+    """Within the command, where no code of others is allowed by itself."""
+    monkeypatch.setattr(suite, "STORE", tmp_path)
+    monkeypatch.setattr(engine, "measure", lambda *, quick, **_: {"own": engine.own(quick=quick)})
+    monkeypatch.setattr(engine, "_asked", lambda turns, _: dict.fromkeys(turns, (1.0,)))
+    shown = run("engine", "--quick", "--json")
+    assert shown.exit_code == 0, shown.output
+    assert json.loads(shown.output.splitlines()[-1])["engine"]["own"]["law"]["ratio_to_ours"]["median"] == 1.0
 
 
 @pytest.mark.parametrize(

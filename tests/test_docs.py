@@ -156,6 +156,14 @@ def test_every_name_in_the_table_of_terms_exists() -> None:
     assert [found for found in names if not exists(found)] == []
 
 
+def test_paces_of_cells_of_nodes_stand_on_one_page() -> None:
+    """Two pages had different paces of the same cell; only that of the benchmarks is made from a stored result."""
+    paces = re.compile(r"--group.*\| [\d.]+ to [\d.]+, median|block 64, processes \|")
+    assert [page.name for page in (ROOT / "docs").glob("*.md") if paces.search(page.read_text("utf-8"))] == [
+        "performance.md"
+    ]
+
+
 def test_one_version_stands_everywhere() -> None:
     said = {
         re.search(pattern, (ROOT / path).read_text(encoding="utf-8"))[1]

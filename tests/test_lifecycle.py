@@ -5,6 +5,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,6 +21,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
+from lathe_rc.messages import ALIVE
+from lathe_rc.nodes import cell_node
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import has_ended, this_host
@@ -163,7 +166,6 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
     watch = tool.watch
     with subprocess.Popen(["/bin/sleep", "1000"]) as child:
         watch.follow(Announcement("", "/stopped", "tool", pid=child.pid, host=this_host()))
-        watch._changed("/stopped", SimpleNamespace(alive_count=1, not_alive_count=0))
         for number, change, silent in (
             (signal.SIGSTOP, os.WSTOPPED, ["/stopped"]),
             (signal.SIGCONT, os.WCONTINUED, []),
@@ -173,6 +175,40 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
             watch.look()
             assert list(watch.silent) == silent
         child.kill()
+
+
+def test_a_member_of_another_machine_is_silent_when_its_lease_has_run_out(tool):
+    """Its liveliness is polled, as an event of DDS can make a node stand still."""
+    code = (
+        "import rclpy, signal; from lathe_rc.nodes.liveliness import *; rclpy.init(); node = rclpy.create_node('far');"
+        f"node.create_publisher(Empty, '/far/{ALIVE}', liveliness()); signal.pause()"
+    )
+    tool.watch.follow(Announcement("", "/far", "tool", pid=1, host="another machine"))
+    with subprocess.Popen([sys.executable, "-c", code]) as process:
+        try:
+            inlet = next(each for each in tool.subscriptions if each.topic_name == f"/far/{ALIVE}")
+            until(inlet.get_publisher_count)
+            for number, silent in ((signal.SIGSTOP, ["/far"]), (signal.SIGCONT, [])):
+                process.send_signal(number)
+                until(lambda silent=silent: list(tool.watch.silent) == silent, tool.watch.look)
+        finally:
+            process.kill()
+
+
+def test_a_reader_that_is_stuck_costs_the_nodes_of_a_process_their_patience_once(tool, monkeypatch):
+    """A stopped panel acknowledges no status and no event, which each node publishes on topics of its own."""
+    clock, waits = [0.0], []
+
+    def wait(duration):
+        waits.append(duration.nanoseconds * 1e-9)
+        clock[0] += waits[-1]
+        return False
+
+    monkeypatch.setattr(cell_node.time, "monotonic", lambda: clock[0])
+    stuck = [SimpleNamespace(topic="/events", wait_for_all_acked=wait)] * 5
+    for _ in range(3):  # nodes
+        tool._wait_for_acknowledgement(stuck, 2.0)
+    assert (waits[0], sum(waits)) == (2.0, pytest.approx(2.0 + 14 * 0.05))
 
 
 def test_an_ended_process_is_known_by_its_announcement():

@@ -40,17 +40,20 @@ LENGTH = 12.0  # revolutions
 # --- without ROS: the backlog, the order
 
 
-def test_a_full_backlog_is_left_out_as_a_whole_and_what_is_taken_makes_room():
+def test_a_full_backlog_leaves_out_all_blocks_and_no_status():
+    """A message that is taken makes room."""
     backlog = Backlog(100)
     taken = iter(backlog)
     for number in range(7):
-        backlog.put(("/a", "", bytes([number]) * 80))
+        backlog.put(("/a", messages.TOOL, bytes([number]) * 80))
         assert next(taken)[2][0] == number
     for number in range(7):
-        backlog.put(("/a", "", bytes([number]) * 40))
+        backlog.put(("/a", messages.TOOL, bytes([number]) * 40), ("/b", messages.EVENT, bytes([10 + number])))
     backlog.put(None)
     backlog.close()
-    assert [message and message[2][0] for message in taken] == [6, None]
+    left = [message and message[2][0] for message in taken]
+    assert [number for number in left if number is None or number < 10] == [6, None]
+    assert [number for number in left if number is not None and number >= 10] == list(range(10, 17))
 
 
 @pytest.mark.parametrize(

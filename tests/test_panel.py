@@ -8,6 +8,7 @@ import re
 import socket
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import cells
@@ -18,15 +19,19 @@ from bags import lathe
 from cells import until
 
 import lathe_rc
-from lathe_rc import harness
+from lathe_rc import event_log, harness, messages
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
-from lathe_rc.view import page_server, panel, panel_part, panel_view
+from lathe_rc.view import page_server, panel, panel_lamp, panel_part, panel_view
+from lathe_rc.view.live_runs import Backlog
 from lathe_rc.view.page_server import Site
+from lathe_rc.view.panel_live import LivePanel
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, news
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
+from lathe_rc.view.rerun_signals import is_drawn
 
 ROOT = Path(__file__).parents[1]
 
@@ -177,6 +182,29 @@ def test_events_of_the_panel_repeat_its_run(opened, tmp_path):
     again = scenario("supervised", 20, *[f"{n}.events={json.dumps(e)}" for n, e in shown.cell.events.items()])
     assert set(shown.cell.events) == {"learning_controller", "spindle_encoder"}
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(again).digest
+
+
+def test_the_lamp_is_unknown_until_the_supervisor_was_heard(opened):
+    shown = opened(scenario("supervised", 3))
+    assert shown.take()["now"]["safety"]["state"] == "unknown"
+    shown.ask("start")
+    safety = shown.until(lambda now: now["state"] == "ended")["safety"]
+    assert (safety["state"], safety["cause"], safety["late"]) == ("nominal", "", False)
+    assert opened(scenario("piston", 3)).take()["now"]["safety"] is None
+
+
+def test_a_diverging_run_is_named_as_lathe_run_names_it(opened):
+    """By the same evaluation, although neither a supervisor nor the guard of the law ends the run."""
+    wrong = {"lead_time": 1e-4, "learning_gain": 0.5, "stop_ratio": 0.0, "allow_unstable": True}
+    cell = cells.scenario(spindle_encoder={"revolutions": 40.2}, learning_controller=wrong)
+    result = harness.run(cell)
+    assert result.growth.diverges
+    shown = opened(cell)
+    shown.ask("start")
+    assert shown.until(lambda now: now["state"] == "ended")["growth"] == {
+        "text": result.growth.told(),
+        "diverges": True,
+    }
 
 
 def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_path):
@@ -343,7 +371,7 @@ def test_what_a_page_can_ask_for_is_told(opened):
 def test_only_news_are_told():
     cell = LiveCell(scenario("piston", 3))
     cell.view.publish({"state": "paused"})
-    told = news(cell.view.wait(0, 1.0), Have(epoch=9, run=1))
+    told = news(cell.view, Have(epoch=9, run=1), 1.0)
     assert (told["rows"], told["history"], told["shape"], told["more"]) == ([], [], None, False)
 
 
@@ -430,3 +458,93 @@ def test_a_bag_takes_no_option_of_a_scenario(bag, tmp_path):
     done = lathe("panel", bag, "--revolutions", "3")
     assert (done.exit_code, "--revolutions with the bag" in done.stderr) == (2, True)
     assert lathe("panel", tmp_path).exit_code == 2
+
+
+# --- a cell of nodes: a bag stands for what is heard
+
+
+@pytest.fixture(scope="module")
+def retracted(bag):
+    """The message types of a cell that is retracted in revolution 5, and what would be heard of it."""
+    with Source(bag) as source:
+        types = {topic: kind.type for topic, kind in source.topics.items()}
+        types = {topic: kind for topic, kind in types.items() if is_drawn(kind) or kind in LivePanel.urgent}
+        return types, [(topic, types[topic], data) for topic, _, data in source.messages(set(types))]
+
+
+def attached(types):
+    live = LivePanel()
+    live.present = types
+    live.view.know(scenario())
+    return live
+
+
+def hear(live, heard, backlog=None):
+    """Take messages as the listener does, whose backlog is shown at once or later."""
+    for message in heard:
+        if message[1] in live.urgent:
+            live.hear(*message)
+        if is_drawn(message[1]):
+            live.take(*message) if backlog is None else backlog.put(message)
+
+
+def lamp(live):
+    return news(live.view, Have(), 0.0)["now"]["safety"]
+
+
+@pytest.mark.parametrize("latched_first", [True, False])
+def test_a_panel_that_comes_late_shows_state_alarm_and_fault_of_a_retracted_machine(retracted, latched_first):
+    """Blocks from then on, and the latched messages from before, in either order."""
+    types, heard = retracted
+    live = attached(types)
+    assert lamp(live)["state"] == "unknown"
+    late = [message for message in heard[-len(heard) // 5 :] if message[1] not in event_log.LOGGED]
+    latched = [message for message in heard if message[1] in event_log.LOGGED]
+    hear(live, [*latched, *late] if latched_first else [*late, *latched])
+    safety = lamp(live)
+    assert (safety["state"], safety["late"]) == ("safe", False)
+    assert safety["cause"].startswith("index_pulses encoder")
+    assert 4 * 3840 < safety["since"] < 6 * 3840  # in or after revolution 5, at 1000 rpm
+    assert news(live.view, Have(), 0.0)["now"]["faults"] == ["spindle_encoder: encoder missed_index"]
+
+
+def test_a_panel_under_full_load_shows_a_retraction_at_once_and_keeps_its_messages(retracted):
+    """Nothing of the backlog is shown yet, and all its blocks are left out."""
+    types, heard = retracted
+    live, backlog = attached(types), Backlog(100_000)
+    hear(live, heard[: len(heard) // 3])
+    hear(live, heard[len(heard) // 3 :], backlog)
+    assert lamp(live)["state"] == "safe"
+    backlog.close()
+    for message in backlog:
+        live.take(*message)
+    live.end()
+    log = news(live.view, Have(), 0.0)["log"]
+    assert any("left out" in line["text"] for line in log)
+    assert next(line["text"].partition(" ")[0] for line in log if line["source"] == "safety/status") == "index_pulses"
+
+
+def test_the_lamp_of_a_cell_that_falls_silent_is_late(retracted, monkeypatch):
+    types, heard = retracted
+    clock = [100.0]
+    monkeypatch.setattr(panel_lamp, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    live = attached(types)
+    hear(live, heard)
+    clock[0] += 2.9
+    assert not lamp(live)["late"]
+    clock[0] += 0.2
+    assert (lamp(live)["state"], lamp(live)["age"], lamp(live)["late"]) == ("safe", 3.1, True)
+    hear(live, heard[:1000])  # the same run again
+    assert (lamp(live)["state"], lamp(live)["late"]) == ("nominal", False)
+
+
+def test_a_cell_of_nodes_that_fails_is_told_in_its_own_words(retracted):
+    types, heard = retracted
+    live = attached(types)
+    hear(live, heard[:1000])
+    kind = messages.store().types[messages.CELL_STATE]
+    for state, text in ((3, "/learning_controller: learning diverges"), (1, "")):
+        told = messages.encode(messages.CELL_STATE, kind("run", state, 0, text, 0, [], 0))
+        hear(live, [("/cell_state", messages.CELL_STATE, told)])
+        now = news(live.view, Have(), 0.0)["now"]
+        assert (now["failure"], now["state"]) == (text, "failed" if text else "running")

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
+from std_msgs.msg import Empty, String
 
 from lathe_rc import harness
 from lathe_rc.bag.check import check
@@ -24,6 +24,8 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import publisher_info
+from lathe_rc.nodes.ports import latched_qos
+from lathe_rc.nodes.topic_recorder import TopicRecorder, TopicRecorderParameters
 
 LATCHED = "transient_local"
 TOPICS = {
@@ -228,6 +230,18 @@ def test_what_cannot_be_recorded_is_refused(domain, tmp_path):
         assert said in words
         assert "Traceback" not in words
     assert not (tmp_path / "new").exists()
+
+
+def test_a_later_publisher_that_offers_less_is_told(ghost, tmp_path):
+    """The first is latched, the second not; its messages do not reach the recorder, which polls the graph for it."""
+    recorder = TopicRecorder(ghost, TopicRecorderParameters(bag=str(tmp_path / "bag"), sim_time=False))
+    ghost.create_publisher(Empty, "/told", latched_qos(1))
+    until(lambda: "/told" in recorder._inlets, recorder._discover)
+    ghost.create_publisher(Empty, "/told", 1)
+    until(lambda: recorder._refused, recorder._discover)
+    assert recorder._refused == {"/told": "/told: a later publisher offers less than the first; it is not recorded"}
+    recorder._executor.shutdown()
+    recorder._writer.close()
 
 
 def test_a_type_that_is_not_installed_is_refused():

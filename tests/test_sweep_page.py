@@ -49,6 +49,8 @@ def swept(place, space, outcome, cell=PISTON):
         row = {"cell": number, "key": f"{number:032d}", "limits": "", **values, "seed": values.get("seed", 0)}
         if isinstance(came, tuple):
             row |= {"status": came[0], "reason": came[1]}
+        elif isinstance(came, dict):
+            row |= {"status": "done", **came}
         else:
             row |= {"status": "done", "tool.max_error": came, "tool.rms_error": came / 3, "margin": 0.5 - came * 1e3}
         rows.append(row)
@@ -195,6 +197,45 @@ class TestPage:
         rows = grid[1].rows("What was varied")
         assert [f"{LEAD} [s]", "1e-3:3e-3:9", "0.001", "0.003", "9", "0.001425"] in rows
         assert [LAW, "constant_angle, variable", "", "", "2", "variable"] in rows
+
+    @pytest.mark.parametrize(
+        ("best", "words", "sound"),
+        [
+            (1.4e-3, ["Its stability margin is 0.4999, beside 0.4949."], True),
+            (
+                1e-3,
+                [f"at the end of {LEAD} (0.001, the smallest): a better", "margin is 0.4999, beside 0.4949."],
+                False,
+            ),
+            (2.4e-3, ["margin is 0.4999, beside 0.4949.", "Beside it without a result: cell 8 (refused)."], False),
+        ],
+    )
+    def test_praises_no_best_cell_at_an_end_or_beside_a_refused_one(self, tmp_path, no_pictures, best, words, sound):
+        """The lead is at its best amid its axis, at its end, or beside a lead that is refused."""
+
+        def outcome(values):
+            refused = values[LEAD] > 2.5e-3
+            return ("refused", "too long") if refused else 1e-7 + 125.0 * (values[LEAD] - best) ** 2
+
+        shown = shown_page(swept(tmp_path / "sweep", Space(grid={LEAD: "1e-3:2.6e-3:9"}), outcome))
+        for each in words:
+            assert each in shown.text
+        assert ("lies at the end" in shown.text) == (best == 1e-3)
+        smallest = re.search(r'<div class="(\w*)"><b>[^<]*</b><span>smallest tool.max_error', shown.source)
+        assert (smallest[1] == "good") == sound
+
+    def test_says_that_the_best_cell_has_less_margin_than_those_beside_it(self, tmp_path, no_pictures):
+        """Drawn cells: the nearest are beside it, and the outermost twentieth of an axis is its end."""
+        space = Space(sampled={LEAD: "1e-3:3e-3"}, sample="random:40", sample_seed=1)
+        leads = sorted(float(values[LEAD]) for values in space.cells(PISTON))
+
+        def outcome(values):
+            margin = {leads[2]: 0.013, leads[1]: 0.045, leads[3]: 0.04}.get(values[LEAD], 0.5)
+            return {"tool.max_error": 1e-7 + abs(values[LEAD] - leads[2]), "margin": margin}
+
+        shown = shown_page(swept(tmp_path / "sweep", space, outcome))
+        assert f"at the end of {LEAD} ({leads[2]:.4g}, of {leads[0]:.4g} to {leads[-1]:.4g}): a better" in shown.text
+        assert "Its stability margin is 0.013, beside 0.04 to 0.045." in shown.text
 
     def test_lists_the_best_cells_in_order(self, grid):
         folder, shown = grid

@@ -16,6 +16,7 @@ from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
 from lathe_rc.cell.stage import Sparse, compile_kernels
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError
+from lathe_rc.jit import check_compiler
 from lathe_rc.messages import MAX_BLOCK, Samples, Signals
 
 K = TypeVar("K")
@@ -51,6 +52,7 @@ class Engine:
     """
 
     def __init__(self, cell: Cell, heard: Collection[str] | None = None) -> None:
+        check_compiler()
         self._chunk = chunk_of(cell.master.shared.block_size, [cell.shortest_feedback or 0])
         # Whole chunks, and thus whole blocks: no sink receives a partial block.
         self.piece = MAX_BLOCK // self._chunk * self._chunk

@@ -19,7 +19,6 @@ from lathe_rc_msgs.msg import Member
 from lathe_rc_msgs.msg import Progress as ProgressMessage
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -44,6 +43,7 @@ from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
 
 _TICK = 0.02  # [s] between polls of the graph while members join
+_BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
 _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
@@ -162,6 +162,7 @@ class CellNode(LifecycleNode):
         self.full_name = self.get_fully_qualified_name()
         self.namespace = self.get_namespace().rstrip("/") + "/"
         self.refused_messages = RefusedMessages(self._report_refused)
+        self._unfit: set[tuple[str, str, str]] = set()  # topic, node and reason, as reported
         self._diagnostics_due = time.monotonic() + _DIAGNOSTICS_PERIOD
         self._endpoints_of_rclpy = self._endpoints()
         self._service_change_state.callback = self._refusing(self._service_change_state.callback)
@@ -307,7 +308,7 @@ class CellNode(LifecycleNode):
         subscribe(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
         subscribe(CellStateMessage, "cell_state", self.guarded(self._on_cell_state, always=True), latched_qos())
         add(Empty, f"~/{messages.ALIVE}", liveliness())
-        self.watch = Watch(self, self._look)
+        self.watch = Watch(self)
 
     def _clean_up(self) -> None:
         assert self.role is not None, "the node is configured"
@@ -462,6 +463,7 @@ class CellNode(LifecycleNode):
             self.next_tick = min(self.next_tick, self.role.tick(now))
         if now >= self._diagnostics_due:
             self._diagnostics_due = now + _DIAGNOSTICS_PERIOD
+            self._report_unfit()
             self._publish_diagnostics()
 
     def work(self) -> None:
@@ -546,8 +548,12 @@ class CellNode(LifecycleNode):
             self._host["progress"].publish(messages.encode(_PROGRESS, progress))
 
     def _wait_for_acknowledgement(self, publishers: Sequence[Publisher], patience: float) -> None:
+        """Wait until all readers have acknowledged; a stuck one uses up the patience of a process only once."""
         for publisher in publishers:
-            if not publisher.wait_for_all_acked(Duration(seconds=patience)):
+            began = time.monotonic()
+            left = max(patience - self.exchange.waited, min(patience, _BRIEF))
+            if not publisher.wait_for_all_acked(Duration(seconds=left)):
+                self.exchange.waited += time.monotonic() - began
                 self.get_logger().warning(f"{publisher.topic}: not everybody has acknowledged the last message")
 
     # ---- topics -------------------------------------------------------------------------------------
@@ -637,25 +643,7 @@ class CellNode(LifecycleNode):
             self.guarded(self._in_turn(self._one_of_many(topic, callback))),
             signal_qos(self.table, topic),
             raw=True,
-            event_callbacks=self.subscription_events(topic),
         )
-
-    def subscription_events(self, topic: str) -> SubscriptionEventCallbacks:
-        """Return the event callbacks of a subscription, which report publishers with incompatible QoS.
-
-        A callback for lost messages can deadlock the node: rmw_fastrtps 8.4 takes its own lock and then the lock of
-        DDS, while DDS takes them in the opposite order (its pull request 890); a flood of foreign messages suffices.
-        It is not needed either: readers count every block and every message at a chosen sample.
-        """
-
-        def incompatible(status: Any) -> None:
-            why = (
-                f"a publisher offers a quality of service that does not fit ({status.last_policy_kind}); if it is a "
-                f"device that keeps no messages, add {topic} to {self.get_name()}.volatile_inputs"
-            )
-            self._refuse(ForeignMessage(topic, "", "", why))
-
-        return SubscriptionEventCallbacks(incompatible_qos=incompatible)
 
     def begun(self) -> Checkpoint | None:
         """Return the checkpoint that the time master announces; None: the run begins at sample 0.
@@ -683,6 +671,16 @@ class CellNode(LifecycleNode):
     def _refuse(self, message: ForeignMessage) -> None:
         """Count a rejected message from outside the cell, under the protocol's relative topic name if it has one."""
         self.refused_messages.refuse(message.on(self.resolve_topic_name(message.topic)))
+
+    def _report_unfit(self) -> None:
+        """Report each publisher once whose quality of service does not fit."""
+        for topic, name, why in set(graph.unfit(self, self.inlets)) - self._unfit:
+            self._unfit.add((topic, name, why))
+            told = (
+                f"a publisher offers a quality of service that does not fit ({why}); if it is a device that keeps no "
+                f"messages, add {topic} to {self.get_name()}.volatile_inputs"
+            )
+            self._refuse(ForeignMessage(topic, name, "", told))
 
     def _report_refused(self, message: ForeignMessage) -> None:
         publishers = graph.publishers(self, message.topic)

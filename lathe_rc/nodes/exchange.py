@@ -48,12 +48,14 @@ class Exchange:
         stages: active roles whose stage has not computed yet (see `lathe_rc.nodes.chain`).
         form: function that forms chains of a stage and the waiting stages of its cell; takes the role and the cell. By
             default there are no chains: each stage computes alone.
+        waited: time for which nodes of this process have waited in vain for acknowledgements [s].
     """
 
     def __init__(self, form: Callable[[Any, Cell | None], None] = lambda _role, _cell: None) -> None:
         self.form = form
         self.master: Callable[[Any], None] | None = None
         self.stages: list[Any] = []
+        self.waited = 0.0
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
 

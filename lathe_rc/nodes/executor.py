@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Executor of a process: takes the messages, requests and events of its nodes, and calls their callbacks."""
+"""Executor of a process: takes the messages and requests of its nodes, and calls their callbacks."""
 
 import time
 from collections.abc import Sequence
@@ -10,9 +10,11 @@ from rclpy.executors import Executor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
+from lathe_rc.messages import ALIVE
+
 _MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
-# [s] between looks at requests and events while messages keep coming, by node and at most: a look costs as much as 20
-# messages of each node.
+# [s] between looks at requests while messages keep coming, by node and at most: a look costs as much as 20 messages of
+# each node.
 _LOOK, _LONGEST_LOOK = 0.02, 0.1
 _SERIES = 0.1  # [s] after a request in which every wait is a look, so that a series of requests is answered at once
 
@@ -21,7 +23,8 @@ class Events:
     """Executor of the nodes of a process, in place of rclpy's, which cost more than the messages themselves.
 
     The messages that have arrived are taken without a wait. A process without any waits: for messages only if it has
-    looked at requests and events just now, otherwise for these as well.
+    looked at requests just now, otherwise for these as well. QoS events are not taken, since they can deadlock a node
+    (see `lathe_rc.nodes.graph.unfit`).
 
     Args:
         nodes: nodes of this process; they have no clients, timers and guard conditions.
@@ -59,15 +62,15 @@ class Events:
 
     def _list_endpoints(self) -> None:
         self._changed = False
+        # Topics of liveliness carry no messages, but each change of liveliness would end a wait.
         self._inlets = [
             (inlet, partial(cast("Any", inlet.handle).take_message, inlet.msg_type, inlet.raw))
             for node in self._nodes
             for inlet in node.subscriptions
+            if not inlet.topic_name.endswith(f"/{ALIVE}")
         ]
         self._services = [service for node in self._nodes for service in node.services]
-        self._others: list[Any] = [waitable for node in self._nodes for waitable in node.waitables]
-        events = sum(other.get_num_entities().num_events for other in self._others)
-        sizes = (len(self._inlets), 0, 0, 0, len(self._services), events)
+        sizes = (len(self._inlets), 0, 0, 0, len(self._services), 0)
         self._set = rclpy_implementation.WaitSet(*sizes, self._nodes[0].context.handle)
 
     def _take(self) -> bool:
@@ -84,18 +87,13 @@ class Events:
         return any_taken
 
     def _wait(self, wait: float, *, looks: bool) -> None:
-        """Wait for messages, and if this is a look, also for requests and events, whose callbacks are called."""
-        ready, services, others = self._set, self._services if looks else (), self._others if looks else ()
+        """Wait for messages, and if this is a look, also for requests, which are answered."""
+        ready, services = self._set, self._services if looks else ()
         ready.clear_entities()
         for inlet, _ in self._inlets:
             ready.add_subscription(inlet.handle)
         places = [ready.add_service(service.handle) for service in services]
-        for other in others:
-            other.add_to_wait_set(ready)
         ready.wait(round(wait * 1e9))
-        for other in [other for other in others if other.is_ready(ready)]:
-            if not self._changed:
-                other.callback(other.take_data())
         for service, place in zip(services, places, strict=True):
             if not self._changed and ready.is_ready("service", place):
                 self._answer(service)

@@ -9,6 +9,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from lathe_rc import allowed_code, resources
@@ -60,6 +61,24 @@ def unmatched(
         there = {_name(end) for end in node.get_subscriptions_info_by_topic(topic)}
         if not expected <= there or outlet.get_subscription_count() < len(expected):
             yield f"{topic} to {', '.join(sorted(expected - there or expected))}"
+
+
+def unfit(node: Node, inlets: Mapping[str, Subscription]) -> Iterator[tuple[str, str, str]]:
+    """Yield topic, node and reason of each publisher that DDS does not match with a subscription of the node.
+
+    The graph is polled because events of DDS can deadlock a node: rmw_fastrtps 8.4 takes its own lock and then the lock
+    of DDS, while DDS takes them in the opposite order (its pull request 890). So no node of a cell waits for events.
+    Lost messages need none, since readers count every block and every message at a chosen sample.
+
+    Args:
+        node: node that has the topics.
+        inlets: subscriptions by fully qualified topic.
+    """
+    for topic, inlet in inlets.items():
+        for end in node.get_publishers_info_by_topic(topic):
+            fits, why = qos_check_compatible(end.qos_profile, inlet.qos_profile)
+            if fits == QoSCompatibility.ERROR and end.node_name != _NOT_TOLD_YET:
+                yield topic, _name(end), "; ".join(part.removeprefix("ERROR: ") for part in why.split(";") if part)
 
 
 def _name(end: Any) -> str:

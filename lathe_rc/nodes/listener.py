@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Listener to running cells that takes no part in them, for views.
 
-It is not a member, so no node waits for it: it gives no credit, and its subscriptions are best effort and volatile. For
-a reliable reader, publishers would repeat missed messages, and at the end of a run they would wait 2 s for a stuck one.
+It is not a member, so no sample waits for it: it gives no credit, and its subscriptions to blocks are best effort and
+volatile. Status and events must not be lost, and reach a listener that comes late: these few messages are reliable and
+latched, so that the nodes of a process wait at most 2 s for a stuck listener when they leave at the end of a run.
 It polls its subscriptions 50 times a second: a wake-up for every message would cost the cell more than the whole
 display.
 """
@@ -17,7 +18,9 @@ from rclpy.subscription import Subscription
 
 from lathe_rc import messages
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes.ports import overhear, taken
+from lathe_rc.event_log import LOGGED
+from lathe_rc.nodes.ports import message_class, overhear, taken
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.view.live_runs import Backlog, LiveRuns, ShownRun
 from lathe_rc.view.rerun_signals import is_drawn
 
@@ -88,11 +91,15 @@ class Listener:
             topic: kind
             for topic, kinds in self._node.get_topic_names_and_types()
             for kind in kinds
-            if is_drawn(kind) and topic.startswith(namespace) and self._node.count_publishers(topic)
+            if (is_drawn(kind) or kind in self._live.urgent)
+            and topic.startswith(namespace)
+            and self._node.count_publishers(topic)
         }
         for topic in sorted(present.keys() - self._subscriptions.keys()):
-            self._subscriptions[topic] = overhear(self._node, topic, present[topic], _DEPTH), present[topic]
+            self._subscriptions[topic] = self._subscribe(topic, present[topic]), present[topic]
             self._node.get_logger().info(f"listens to {topic}")
+        # The supervisor's blocks first: their samples tell a repetition of a run, whose id is the same.
+        self._subscriptions = dict(sorted(self._subscriptions.items(), key=lambda each: each[1][1] != messages.SAFETY))
         quiet = self._heard == self._heard_before
         if quiet and self._live.present and not present:
             self._backlog.put(None)
@@ -101,6 +108,13 @@ class Listener:
         self._heard_before = self._heard
         return not quiet
 
+    def _subscribe(self, topic: str, msgtype: str) -> Subscription:
+        """Subscribe to a topic; of the supervisor's blocks, the newest one is enough."""
+        if msgtype in (*LOGGED, messages.CELL_STATE):
+            qos = asked(self._node.get_publishers_info_by_topic(topic))
+            return self._node.create_subscription(message_class(msgtype), topic, lambda _: None, qos, raw=True)
+        return overhear(self._node, topic, msgtype, 1 if msgtype == messages.SAFETY else _DEPTH)
+
     def _hear(self) -> None:
         """Take the received messages in turns, a few per topic, since chunks wait only briefly for late topics."""
         count = -1
@@ -108,7 +122,17 @@ class Listener:
             for topic, (subscription, msgtype) in self._subscriptions.items():
                 heard = [(topic, msgtype, data) for data, _ in taken(subscription, _BURST)]
                 self._heard += len(heard)
-                self._backlog.put(*heard)
+                if msgtype in self._live.urgent:
+                    for message in heard:
+                        self._tell(*message)
+                if is_drawn(msgtype):
+                    self._backlog.put(*heard)
+
+    def _tell(self, topic: str, msgtype: str, data: bytes) -> None:
+        try:
+            self._live.hear(topic, msgtype, data)
+        except ValueError as error:
+            raise LatheError(f"{topic}: {error}") from None
 
     def _show(self) -> None:
         """Show the received messages; main function of the second thread."""

@@ -7,18 +7,21 @@ from a stopped one; for processes on this machine, the operating system can.
 Fast DDS may report a silent writer as alive: if an assertion arrives at the moment at which the lease expires, the
 lease timer is not restarted, and only a further assertion would restart it. So a stopped process on this machine
 counts as silent, whatever DDS reports.
+
+DDS's state is polled; an event of a changed liveliness can deadlock a node (see `lathe_rc.nodes.graph.unfit`).
 """
 
 import os
 import select
 import time
-from collections.abc import Callable, Iterable
-from functools import cache, partial
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSSubscriptionEventType, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from std_msgs.msg import Empty
@@ -74,22 +77,28 @@ def _readable(processes: Iterable[int]) -> set[int]:
     return {process for process, _ in poll.poll(0)}
 
 
+def _is_silent(signs: Any) -> bool:
+    """Return True if DDS has heard of a member, and its lease has run out."""
+    with signs:
+        status = signs.take_event()
+    return bool(status and status.not_alive_count and not status.alive_count)
+
+
 class Watch:
     """Monitor of the liveliness of cell members in other processes.
 
     Args:
         node: node that monitors the members.
-        told: called when a member becomes silent or alive again.
 
     Attributes:
         silent: monotonic time since which a member is silent or stopped [s], by fully qualified name.
     """
 
-    def __init__(self, node: LifecycleNode, told: Callable[[], None]) -> None:
-        self._node, self._told, self._host = node, told, this_host()
+    def __init__(self, node: LifecycleNode) -> None:
+        self._node, self._host = node, this_host()
         self._pids: dict[str, int] = {}
         self._processes: dict[str, int] = {}  # file descriptors by member
-        self._unheard: set[str] = set()  # by DDS
+        self._signs: dict[str, Any] = {}  # liveliness by member, as DDS has it
         self.silent: dict[str, float] = {}
 
     def follow(self, member: Announcement, *, by_liveliness: bool = True) -> None:
@@ -97,13 +106,13 @@ class Watch:
         if (member.pid == os.getpid() and member.host == self._host) or self._pids.get(member.name) == member.pid:
             return
         if by_liveliness and member.name not in self._pids:
-            self._node.create_subscription(
-                Empty,
-                f"{member.name}/{ALIVE}",
-                lambda _: None,
-                liveliness(),
-                event_callbacks=SubscriptionEventCallbacks(liveliness=partial(self._changed, member.name)),
+            none = SubscriptionEventCallbacks(use_default_callbacks=False)
+            signs = self._node.create_subscription(
+                Empty, f"{member.name}/{ALIVE}", lambda _: None, liveliness(), event_callbacks=none
             )
+            changed = QoSSubscriptionEventType.RCL_SUBSCRIPTION_LIVELINESS_CHANGED
+            with signs.handle:
+                self._signs[member.name] = rclpy_implementation.EventHandle(signs.handle, changed)
         self._pids[member.name] = member.pid
         if member.name in self._processes:
             os.close(self._processes.pop(member.name))
@@ -117,22 +126,15 @@ class Watch:
 
     def close(self) -> None:
         """Stop the monitoring; the node destroys its subscriptions itself."""
+        while self._signs:
+            self._signs.popitem()[1].destroy_when_not_in_use()
         while self._processes:
             os.close(self._processes.popitem()[1])
 
-    def _changed(self, name: str, status: Any) -> None:
-        before = name in self.silent
-        if status.alive_count:
-            self._unheard.discard(name)
-        elif status.not_alive_count:
-            self._unheard.add(name)
-        self.look()
-        if before != (name in self.silent):
-            self._told()
-
     def look(self) -> None:
         """Update the set of silent members."""
-        silent = self._unheard | {name for name in self._processes if _is_stopped(self._pids[name])}
+        silent = {name for name in self._processes if _is_stopped(self._pids[name])}
+        silent |= {name for name, signs in self._signs.items() if _is_silent(signs)}
         self.silent = {name: self.silent.get(name, time.monotonic()) for name in silent}
 
     def ended(self) -> set[str]:

@@ -22,6 +22,7 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.nodes import publisher_info, standalone_node
+from lathe_rc.nodes.graph import unfit
 from lathe_rc.nodes.ports import message_class, taken
 
 LISTENS = "recording"  #: begin of the line that is logged once earlier publishers have been discovered
@@ -60,6 +61,7 @@ class TopicRecorder:
             hold_ns=round(parameters.hold * 1e9), sim_time=parameters.sim_time, began_ns=time.time_ns()
         )
         self._inlets: dict[str, Subscription] = {}
+        self._publishers: dict[str, int] = {}  # number by topic, at the last look
         self._blocks = {message_class(kind): kind for kind in messages.block_types()}
         self._continuity: dict[str, Continuity] = {}
         self._ends: dict[str, tuple[bytes, bytes]] = {}  # first and newest message of the topics of blocks
@@ -85,7 +87,8 @@ class TopicRecorder:
     def _discover(self) -> None:
         """Subscribe to new topics; with simulated time, subscribe to /clock first."""
         found, count = self._node.get_topic_names_and_types(), self._node.count_publishers
-        graph = {topic: types for topic, types in found if count(topic)}
+        publishers = {topic: count(topic) for topic, _ in found}
+        graph = {topic: types for topic, types in found if publishers[topic]}
         if self._looks <= _LOOKS:
             self._present |= graph.keys()
             self._looks += 1
@@ -95,6 +98,10 @@ class TopicRecorder:
             if _CLOCK in graph:
                 self._subscribe(_CLOCK, graph[_CLOCK])
             return
+        if publishers != self._publishers:
+            self._publishers = publishers
+            for topic, _, _ in unfit(self._node, self._inlets):
+                self._refused[topic] = f"{topic}: a later publisher offers less than the first; it is not recorded"
         for topic in sorted(graph):
             if self._wanted(topic) and topic not in self._inlets and topic not in self._refused:
                 try:
@@ -131,12 +138,9 @@ class TopicRecorder:
             cast("Any", partial(self._take, topic)),  # rclpy's type hints lack callbacks with message info
             publisher_info.asked(publishers),
             raw=True,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: self._mismatch(topic)),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),  # see `lathe_rc.nodes.graph.unfit`
         )
         self._node.get_logger().info(f"{topic}: {msgtype}")
-
-    def _mismatch(self, topic: str) -> None:
-        self._refused[topic] = f"{topic}: a later publisher offers less than the first; its messages are not recorded"
 
     # ---- messages -----------------------------------------------------------------------------------
 

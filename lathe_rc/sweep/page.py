@@ -19,6 +19,7 @@ import numpy as np
 from lathe_rc import __version__, files
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.sweep import figures, row
+from lathe_rc.sweep.best_cell import Surroundings, surroundings
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
@@ -87,6 +88,7 @@ def write(folder: Folder, goal: str = "") -> Written:
 
 def _text(seen: PageData, drawn: Charts) -> str:
     done = Yield(np.sort(seen.goal.values[seen.goal.order]), len(seen.cells), seen.goal.above)
+    place = surroundings(seen)
     sections: dict[str, Any] = {"nothing": _nothing(seen)}
     if not sections["nothing"]:
         sections |= _sections(seen, done, drawn)
@@ -95,7 +97,8 @@ def _text(seen: PageData, drawn: Charts) -> str:
         goal=seen.goal,
         default_goal=default_goal(seen.folder),
         cells=len(seen.cells),
-        facts=_facts(seen, done),
+        facts=_facts(seen, done, place),
+        surroundings=place.sentences,
         asked=seen.asked(),
         seeds=seen.seeds,
         outcomes=_outcomes(seen),
@@ -120,7 +123,7 @@ def _nothing(seen: PageData) -> str:
     return f"No cell has a {seen.goal.name}: {told}.{instead}"
 
 
-def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
+def _facts(seen: PageData, done: Yield, place: Surroundings) -> Iterator[tuple[str, str, str]]:
     """Yield the key figures at the top of the page: name, value and CSS class."""
     yield "cells", str(len(seen.cells)), ""
     for status in (row.DONE, row.REFUSED, row.DIVERGED, row.FAILED):
@@ -128,7 +131,7 @@ def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
             yield status, str(count), "" if status == row.DONE else "bad"
     if done.goal.size:
         best, which = (done.goal[-1], "largest") if done.above else (done.goal[0], "smallest")
-        yield f"{which} {seen.goal.name}", seen.goal.told(float(best)), "good"
+        yield f"{which} {seen.goal.name}", seen.goal.told(float(best)), "good" if place.sound else ""
         limit = done.point(0.95)
         kept = "not reached" if limit is None else seen.goal.told(limit)
         yield f"95 % of all cells {'from' if done.above else 'up to'}", kept, ""

@@ -28,13 +28,19 @@ _SAFE = 4  # CellState.SAFE
 _RESULTS = {messages.TOOL, messages.SERVO, messages.LEARNING, messages.PERIODIC, messages.MARGIN}
 
 
-class Backlog:
-    """Queue of messages to be shown. When it is full, all of them are dropped, so that later chunks are complete again.
+def _bulk(message: Message | None) -> int:
+    """Return the size of a block [B]; 0 for other messages."""
+    return len(message[2]) if message and message[1] in messages.block_types() else 0
 
-    If every second message were dropped instead, every chunk would have gaps.
+
+class Backlog:
+    """Queue of messages to be shown. When it is full, all blocks are dropped, so that later chunks are complete again.
+
+    If every second block were dropped instead, every chunk would have gaps. Messages at chosen samples, which are few,
+    are never dropped.
 
     Args:
-        limit: size of the queue [B].
+        limit: size of the blocks in the queue [B].
     """
 
     def __init__(self, limit: int) -> None:
@@ -48,9 +54,9 @@ class Backlog:
         """Add messages; None means that no publisher is left."""
         with self._news:
             for message in added:
-                size = len(message[2]) if message else 0
+                size = _bulk(message)
                 if self._size + size > self._limit:
-                    self._messages.clear()
+                    self._messages = deque(each for each in self._messages if not _bulk(each))
                     self._size = 0
                 self._size += size
                 self._messages.append(message)
@@ -70,7 +76,7 @@ class Backlog:
                 if not self._messages:
                     return
                 message = self._messages.popleft()
-                self._size -= len(message[2]) if message else 0
+                self._size -= _bulk(message)
             yield message
 
 
@@ -217,9 +223,12 @@ class LiveRuns:
         begin: returns the view of a run, given its first block received and the message types of its topics.
 
     Attributes:
+        urgent: message types that `hear` takes.
         present: message type by topic, for all topics with publishers; a new run begins with these topics.
         shown: summaries of the finished runs.
     """
+
+    urgent: frozenset[str] = frozenset()
 
     def __init__(self, begin: Callable[[Block, Mapping[str, str]], RunView]) -> None:
         self._begin = begin
@@ -230,6 +239,13 @@ class LiveRuns:
         self._run: RunView | None = None
         self._over = False  # the current run has ended; further samples of it are ignored
         self._early: list[Sparse] = []  # messages before the first block
+
+    def hear(self, topic: str, msgtype: str, data: bytes) -> None:
+        """Take an encoded message of an urgent type as it arrives, in the thread that listens.
+
+        Raises:
+            ValueError: the message is malformed.
+        """
 
     def take(self, topic: str, msgtype: str, data: bytes) -> None:
         """Add an encoded message of a plotted topic.

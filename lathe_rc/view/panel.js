@@ -6,6 +6,7 @@ const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], force: [], 
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
 const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
+const LATE = "#8a8a8a", OUT_OF_ORDER = ["degraded", "retracting", "safe"];
 const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
 const DOES = { // tool tips
   freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned",
@@ -52,6 +53,7 @@ async function follow() {
     if (document.hidden) await new Promise(done => document.addEventListener("visibilitychange", done, { once: true }));
     try {
       const told = await ask("frame", HAVE);
+      answered = performance.now();
       if (told.now.version !== version) {
         ABOUT = await ask("about");
         version = told.now.version;
@@ -88,7 +90,7 @@ function draw(changed, moving = true) {
   if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
-  drawSafety(now.safety);
+  drawSafety(now);
   for (const id of ["limits", "loops"]) $(id).textContent = (now[id] || []).join("\n");
   for (const place of document.querySelectorAll("[data-learning]")) {
     const found = JSON.parse(place.dataset.learning).map(topic => (now.learning || {})[topic]).filter(value => value !== undefined);
@@ -106,14 +108,23 @@ function draw(changed, moving = true) {
   drawLog();
 }
 
-function drawSafety(safety) {
-  $("lamp").style.background = safety ? COLOURS[safety.state] || "none" : "none";
+const SILENT = 5000; // [ms] without an answer from which on nothing on the page is current
+let answered = performance.now();
+function drawSafety({ safety, growth, failure }) {
+  const lost = performance.now() - answered > SILENT, late = lost || safety && safety.late;
+  const unknown = !safety || safety.state == "unknown", wrong = failure || growth && growth.diverges;
+  $("lamp").style.background = late ? LATE : wrong ? COLOURS.safe : unknown ? "none" : COLOURS[safety.state] || "none";
   const since = safety && safety.cause ? ` since ${(safety.since * (ABOUT.step || 0)).toFixed(3)} s` : "";
-  $("safety").textContent = safety ? (SAID[safety.state] || safety.state) + since : "no supervisor";
-  $("alarm").textContent = safety ? safety.cause : "";
+  const told = !safety ? "no supervisor" : unknown ? "unknown: the supervisor was not heard yet"
+    : late ? safety.state : (SAID[safety.state] || safety.state) + since;
+  $("safety").textContent = told + (lost ? ", no answer from lathe panel" : late ? `, last heard ${Math.round(safety.age)} s ago` : "");
+  $("alarm").textContent = !safety ? "" : safety.cause || (OUT_OF_ORDER.includes(safety.state) ? "(cause not heard)" : "");
+  $("growth").textContent = growth ? growth.text : "";
+  $("growth").className = growth && growth.diverges ? "said wrong" : "said";
   $("in-force").textContent = (SHOWN.now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
   $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }
+setInterval(() => { if (performance.now() - answered > SILENT) drawSafety(SHOWN.now); }, 1000);
 
 let logged = 0, loggedRun = 0;
 function drawLog() {

@@ -103,8 +103,7 @@ def _watching(view: View) -> dict[str, Answer]:
     """Return the answers that every run has: news, and the part as a file."""
 
     def frame(question: Mapping[str, Any]) -> object:
-        have = Have.of(question)
-        return news(view.wait(have.number, _PATIENCE), have)
+        return news(view, Have.of(question), _PATIENCE)
 
     def part(question: Mapping[str, Any]) -> object:
         from lathe_rc.view import panel_part

@@ -38,6 +38,7 @@ def _outlook(scenario: Scenario, step: float, rpm: float) -> dict[str, Any]:
         "radius": 1e3 * (cut.radius if cut else tool.part_radius if tool else 0.05),
         "rpm": rpm,
         "force": max(force.set_point, default=0.0) if force else 0.0,
+        "supervised": watch is not None,
         "margin": max(watch.margin_limit, default=0.0) if watch else 0.0,
         "revolutions": master.revolutions if master else 0.0,
     }

@@ -80,7 +80,8 @@ class Player:
             while self._told < len(self._said) and self._said[self._told].index < end_here:
                 sparse[self._said[self._told].topic].append(self._said[self._told])
                 self._told += 1
-            self.view.chunk(first, end_here - first, dense, sparse)
+            for sink in (self.view, self.view.lamp):
+                sink.chunk(first, end_here - first, dense, sparse)
             self.reached = end_here
             if end_here == self.samples:
                 self.view.finish()
@@ -96,6 +97,7 @@ class Player:
             raise InputError(f"sample {sample}; allowed: from {self.first} to {self.samples}")
         if sample < self.reached:
             self.view.clear()
+            self.view.lamp.clear()
             self.reached, self._told = self.first, 0
         self.advance(sample)
 

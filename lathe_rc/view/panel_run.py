@@ -309,7 +309,7 @@ class LiveCell:
 
     def advance(self, end: int) -> None:
         """Compute the samples before ``end``."""
-        sinks: list[Sink] = [self.view, self._recorder] if self._recorder else [self.view]
+        sinks: list[Sink] = [self.view, self.view.lamp, *([self._recorder] if self._recorder else [])]
         self._engine.advance(min(end, self.reached + self._engine.piece), sinks)
         if self.reached >= self.samples:
             self.view.finish()
@@ -375,6 +375,7 @@ class LiveCell:
             self.view.say(self.reached, "panel", f"goes on with {_listed(values)}")
         else:
             self.view.clear(self._margin())
+            self.view.lamp.clear()
         self._remark()
 
     def _waiting(self) -> dict[str, list[str]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""View of a run in the panel: the newest values, the form by revolution, the supervisor and the log.
+"""View of a run in the panel: the newest values, the form by revolution, and the log; the lamp is beside it.
 
 The cell's thread feeds the view with chunks of samples and publishes a snapshot a few times a second; it never waits
 for a reader. Readers take the newest snapshot, and from lists that only grow what they do not have yet, so that a slow
@@ -10,13 +10,13 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from lathe_rc import event_log, messages
-from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.arrays import Array
 from lathe_rc.cell.loops import Loop, loops, watches
 from lathe_rc.cell.scenario import Scenario
@@ -24,9 +24,9 @@ from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.safety.state_machine import State
 from lathe_rc.view import machine_state
 from lathe_rc.view.form_limits import form_limits, varying_speed
+from lathe_rc.view.panel_lamp import OUT, Lamp
 from lathe_rc.view.panel_outlook import outlook
 from lathe_rc.view.rerun_part import Outlook, Scale
 from lathe_rc.view.rerun_revolutions import ANGLES, Revolution, Revolutions
@@ -35,7 +35,6 @@ CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
 MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
-_OUT = (State.RETRACTING.name.lower(), State.SAFE.name.lower())  # states in which the tool is out of the part
 _AT_ONCE = 16  # rows in an answer
 _SHAPE = 90  # points of the part's outline
 _MOST_LINES = 2000  # of the log in an answer
@@ -132,17 +131,22 @@ class View:
         types: message type by topic.
         step_ns: sampling step [ns].
         margin: stability margin before the first cycle; None: unknown.
+        live: whether the cell runs elsewhere.
 
     Attributes:
         outlook: see `lathe_rc.view.panel_outlook`; empty: unknown.
+        lamp: state of the supervisor; a sink of its own, since it must not wait for the samples of a live view.
     """
 
-    def __init__(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
+    def __init__(
+        self, types: Mapping[str, str], step_ns: int, margin: float | None = None, *, live: bool = False
+    ) -> None:
         self._news = threading.Condition()
         self._due = 0.0
         self.run = 0
         self.latest: Snapshot | None = None
         self.outlook: Mapping[str, Any] = {}
+        self.lamp = Lamp(live=live)
         self._loops: Sequence[Loop] = ()
         self.begin(types, step_ns, margin)
 
@@ -171,10 +175,8 @@ class View:
         """Begin with another run of the same cell."""
         self.run += 1
         self._revolutions, self._soundness = Revolutions(), Soundness(self._form)
-        self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "safety": None}
-        if messages.SAFETY_STATUS in self._types.values():
-            self._now["safety"] = {"state": State.NOMINAL.name.lower(), "since": 0, "cause": "", "alarm": ""}
-        self._now |= {"learning": {}, "faults": []}
+        self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "learning": {}}
+        self._is_out = False
         self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
         self._end = 0  # sample after the last complete revolution
         self._scale: Scale | None = None
@@ -182,6 +184,8 @@ class View:
         self._rows: list[Row] = []
         self._newest: list[Row] = []
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
+        self._largest: list[float] = []  # form error of each revolution [m]
+        self._growth: tuple[int, dict[str, Any] | None] = (0, None)  # number of revolutions, and growth then
         self._conditions = event_log.Conditions()
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
@@ -197,6 +201,11 @@ class View:
     def reached(self) -> int:
         """Sample after the newest."""
         return int(self._now.get("sample", 0))
+
+    @property
+    def supervised(self) -> bool:
+        """Whether the cell has a supervisor, by its scenario or its topics."""
+        return bool(self.outlook.get("supervised")) or messages.SAFETY_STATUS in self._types.values()
 
     @property
     def turns(self) -> float:
@@ -259,6 +268,7 @@ class View:
             self._end = revolution.end
             rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
             self._history.append((revolution.number, rms, largest))
+            self._largest.append(revolution.largest)
             self._newest = [*self._newest[1 - WATERFALL :], row]
             if (revolution.number - 1) % self._every == 0:
                 self._rows.append(row)
@@ -274,22 +284,21 @@ class View:
         if message.type in event_log.LOGGED:
             self.say(message.index, topic.strip("/"), event_log.text(message))
         if message.type == messages.SAFETY_STATUS:
-            self._safety(message)
-        if message.type == messages.EVENT and self._conditions.take(message):
-            told = self._conditions.faults.items()
-            self._now["faults"] = [f"{node}: {fault}" for (node, _), found in told for fault in found]
+            out = event_log.supervisor_state(message) in OUT
+            if out != self._is_out:
+                self._is_out, self._out = out, (message.index, math.inf) if out else (self._out[0], message.index)
+        if message.type == messages.EVENT:
+            self._conditions.take(message)
 
-    def _safety(self, message: Sparse) -> None:
-        """Take a message of the supervisor; the cause of a state is its first one, that of a retraction stays."""
-        name, before = event_log.supervisor_state(message), self._now["safety"]
-        out = name in _OUT
-        if not before or name != before["state"]:
-            was_out = bool(before) and before["state"] in _OUT
-            cause = before["cause"] if out and was_out else event_log.cause(message)
-            before = {"since": message.index, "cause": cause}
-            if out != was_out:
-                self._out = (message.index, math.inf) if out else (self._out[0], message.index)
-        self._now["safety"] = {**before, "state": name, "alarm": event_log.text(message)}
+    def _growing(self) -> dict[str, Any] | None:
+        """Return the growth of the form error as `lathe_rc.harness.Result` evaluates it; None if it does not grow."""
+        count = len(self._largest)
+        if self._growth[0] != count:
+            found = growth(np.array(self._largest))
+            # A live view may lack revolutions.
+            found = found and replace(found, since=self._history[found.since - 1][0])
+            self._growth = count, {"text": found.told(), "diverges": found.diverges} if found else None
+        return self._growth[1]
 
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
@@ -337,7 +346,8 @@ class View:
         with self._news:
             number = self.latest.number + 1 if self.latest else 1
             scale = self._scale.deviation / 1e3 if self._scale else 1.0
-            current = {**self._now, **told, "exaggeration": scale, "limits": self._limiting(), "loops": self._looped()}
+            current = {**self._now, **told, "exaggeration": scale, "growth": self._growing()}
+            current |= {"limits": self._limiting(), "loops": self._looped()}
             self.latest = Snapshot(
                 number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
             )
@@ -398,12 +408,16 @@ def _told(row: Row) -> dict[str, Any]:
     return {"revolution": row.revolution.number, "cells": row.cells, "out": row.out}
 
 
-def news(snapshot: Snapshot, have: Have) -> dict[str, Any]:
-    """Return what a page lacks, as JSON data.
+def news(view: View, have: Have, patience: float) -> dict[str, Any]:
+    """Return what a page lacks, as JSON data, once there is a new snapshot, or after some seconds; the lamp is current.
 
     Rows of the map come a few at a time. A page with an older epoch first drops every second row for each later one,
     which leaves ⌈n/2⌉ of n rows.
+
+    Raises:
+        LatheError: there is no snapshot yet.
     """
+    snapshot = view.wait(have.number, patience)
     if have.run != snapshot.run or have.epoch > snapshot.epoch:
         have = Have(have.number)
     had = -(-have.rows // 2 ** (snapshot.epoch - have.epoch))
@@ -413,7 +427,7 @@ def news(snapshot: Snapshot, have: Have) -> dict[str, Any]:
         "number": snapshot.number,
         "run": snapshot.run,
         "epoch": snapshot.epoch,
-        "now": dict(snapshot.now),
+        "now": {**snapshot.now, **view.lamp.now(supervised=view.supervised)},
         "rows": [{**_told(row), "height": round(row.revolution.height * 1e3, 6)} for row in rows],
         "more": had + len(rows) < len(snapshot.rows),
         "log": snapshot.log[have.log : have.log + _MOST_LINES],

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``lathe panel --attach``: a cell of nodes is shown and commanded, and waits for no page."""
 
+import contextlib
 import http.client
 import json
+import os
 import re
 import signal
 import subprocess
@@ -49,15 +51,24 @@ class Asked:
         self.until(lambda told: told["now"]["state"] == "paused")
 
 
-@pytest.fixture
-def attached(domain):
+@contextlib.contextmanager
+def panel_of(domain):
     words = [sys.executable, "-m", "lathe_rc", "panel", "supervised", "--attach", "--no-browser", "--set", *HELD]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        yield Asked(process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
+        try:
+            yield Asked(process.stdout.readline())
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()
         assert process.returncode == 0, errors
         assert "Traceback" not in errors
+
+
+@pytest.fixture
+def attached(domain):
+    with panel_of(domain) as asked:
+        yield asked
 
 
 @pytest.mark.system
@@ -80,6 +91,39 @@ def test_a_running_cell_is_shown_and_broken_from_the_page(attached, domain):
     assert len(last["history"]) > 20
     again = load(SUPERVISED, ["spindle_encoder.revolutions=60", f"spindle_encoder.events={json.dumps([told['text']])}"])
     assert found[0].digest == harness.run(again).digest
+
+
+@pytest.mark.system
+def test_a_panel_that_attaches_to_a_retracted_machine_shows_state_alarm_and_fault(domain, tmp_path):
+    """It hears the latched messages of before; one that was there all along shows the retraction at once.
+
+    When the cell is killed, the lamp is late and keeps its state.
+    """
+    given = ["revolutions=400", "speed_factor=0.1", "faults=['revolution 5: encoder missed_index']"]
+    loaded = load(SUPERVISED, [f"spindle_encoder.{each}" for each in given])
+    cell = harness.with_recorder(loaded, tmp_path / "bag", keep=True)
+    with (
+        panel_of(domain) as first,
+        harness.Processes(cell, [[name] for name in cell.nodes], domain=domain) as processes,
+    ):
+
+        def retracted(told):
+            safety = told["now"]["safety"]
+            return safety["state"] == "safe" and safety["cause"]
+
+        shown = first.until(retracted)
+        assert shown["now"]["safety"]["cause"].startswith("index_pulses encoder")
+        with panel_of(domain) as late:
+            safety = late.until(retracted)["now"]["safety"]
+            assert safety["since"] == shown["now"]["safety"]["since"]
+            told = late.until(lambda told: told["now"]["faults"] and told["log"])
+            assert told["now"]["faults"] == ["spindle_encoder: encoder missed_index"]
+            assert any(line["text"].startswith("index_pulses encoder") for line in told["log"])
+            for pid in processes.pids.values():
+                os.kill(pid, signal.SIGKILL)
+            for panel in (first, late):
+                safety = panel.until(lambda told: told["now"]["safety"]["late"])["now"]["safety"]
+                assert (safety["state"], safety["age"] >= 3.0) == ("safe", True)
 
 
 @pytest.mark.system

@@ -1,24 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """The panel in a real browser, wide and narrow, light and dark."""
 
+import contextlib
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from matplotlib.image import imread
+from test_panel import attached, bag, hear, retracted, scenario
 
 import lathe_rc
 from chromium import Chromium
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.varied_loop import VariedLoop
-from lathe_rc.view import page_server, panel
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.view import page_server, panel, panel_lamp
 from lathe_rc.view.loop_page import LoopPage
 from lathe_rc.view.panel_run import Driver, LiveCell
 
 pytestmark = pytest.mark.system
+__all__ = ["bag", "retracted"]  # fixtures
 
 ROOT = Path(__file__).parents[2]
 STATE = "SHOWN.now.safety.state"
@@ -146,3 +151,32 @@ def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page
     browser.open(browser.run("document.querySelector('nav a:not([aria-current])').href"))
     browser.until("document.title == 'Loop of supervised_full_cell'")
     browser.until("document.querySelectorAll('.vega-embed').length > 2")
+
+
+def test_the_lamp_shows_what_was_heard_and_is_grey_when_nothing_is(retracted, tmp_path, monkeypatch):
+    """Before the first message, nominal, retracted, silent, diverging, and after the end of the server."""
+    types, heard = retracted
+    live, read = attached(types), "document.getElementById({!r}).textContent".format
+    colour = "getComputedStyle(document.getElementById('lamp')).backgroundColor"
+    with contextlib.ExitStack() as serving, Chromium(tmp_path) as browser:
+        site = panel.attached_site(live.view, Cell(scenario().nodes), SimpleNamespace(cannot={}))
+        browser.look(1440, 1000)
+        browser.open(serving.enter_context(page_server.serving(site)))
+        browser.until(f"{read('safety')}.startsWith('unknown')")
+        assert browser.run(colour) == "rgba(0, 0, 0, 0)"
+        hear(live, heard[: len(heard) // 3])
+        browser.until(f"{read('safety')} == 'nominal' && {colour} == 'rgb(46, 125, 79)'")
+        hear(live, heard[len(heard) // 3 :])
+        browser.until(f"{read('safety')}.startsWith('safe') && {colour} == 'rgb(179, 38, 46)'")
+        assert "index_pulses encoder" in browser.run(read("alarm"))
+        assert browser.run(read("in-force")) == "fault in force: spindle_encoder: encoder missed_index"
+        monkeypatch.setattr(panel_lamp, "_LATE", -1.0)
+        browser.until(f"{read('safety')}.includes('last heard') && {colour} == 'rgb(138, 138, 138)'")
+        monkeypatch.undo()
+        growth = {"text": "form error diverges from revolution 12 on", "diverges": True}
+        monkeypatch.setattr(live.view, "_growing", lambda: growth)
+        hear(live, heard[: len(heard) // 3])  # the run again
+        browser.until(f"{read('safety')} == 'nominal' && {colour} == 'rgb(179, 38, 46)'")
+        assert browser.run(read("growth")) == growth["text"]
+        serving.close()
+        browser.until(f"{read('safety')}.includes('no answer') && {colour} == 'rgb(138, 138, 138)'")

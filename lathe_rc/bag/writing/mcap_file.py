@@ -34,7 +34,7 @@ TIMES = (16, 8)  #: offsets of log time and publish time, backwards from a messa
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the following pairs of log time and offset
 _FOOTER = struct.Struct("<BQQQ")
 _ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # disk space reserved for index and metadata [B]
-_LEVEL = -5  # zstd level: 20 % of the time of the default level, for files that are 7 % larger (docs/bags.md)
+LEVEL = -5  #: zstd level: 20 % of the time of the default level, for files that are 7 % larger (docs/bags.md)
 
 
 class _Record(Protocol):
@@ -96,7 +96,7 @@ class McapFile:
         # Unbuffered, so that flush() hands all bytes to the operating system and `_put` can truncate a failed write.
         self._stream = path.open("xb", buffering=0)
         self._chunk_size, self._compress, self._profile = chunk_size, compress, profile
-        self._compressor = zstandard.ZstdCompressor(level=_LEVEL) if compress else None
+        self._compressor = zstandard.ZstdCompressor(level=LEVEL) if compress else None
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
         self._chunks = 0
