@@ -487,7 +487,8 @@ class _Tdms(Source):
         newest = max((start.seconds for start in starts.values()), default=0)  # a double resolves times since it
         self._clocks = {
             name: Clock(
-                float(found.get("wf_start_offset", 0.0)) + _since(starts.get(name), newest), float(found["wf_increment"])
+                float(found.get("wf_start_offset", 0.0)) + _since(starts.get(name), newest),
+                float(found["wf_increment"]),
             )
             for name, found in about.items()
             if found.get("wf_increment")
