@@ -16,6 +16,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
@@ -56,7 +57,7 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
-            return judge(recording.errors.largest, allowed, _turns_before(recording))
+            return judge(recording.errors.largest, allowed, _turns_before(recording), doubt=form_doubt(scenario.nodes))
     return None
 
 

@@ -50,6 +50,7 @@ class Form:
         tool: topic with the form error.
         tolerance: allowed form error in either direction [m]; 0: no tolerance.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
+        doubt: how far the desired form may be off between the points of its table [m].
 
     Attributes:
         tool, tolerance: see the arguments.
@@ -61,8 +62,10 @@ class Form:
         refused: reason why the form, or the rest of it, is not measured; empty if it is.
     """
 
-    def __init__(self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0) -> None:
-        self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
+    def __init__(
+        self, encoder: str, tool: str, tolerance: float = 0.0, nose_radius: float = 0.0, doubt: float = 0.0
+    ) -> None:
+        self._encoder, self.tool, self.tolerance, self._doubt = encoder, tool, tolerance, doubt
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
@@ -95,7 +98,7 @@ class Form:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
         if not self.tolerance or self.refused:
             return None
-        return judge(np.array(self._largest), self.tolerance, self._before)
+        return judge(np.array(self._largest), self.tolerance, self._before, doubt=self._doubt)
 
     @property
     def growth(self) -> Growth | None:
