@@ -12,15 +12,18 @@ The rows of a formula are joined by straight lines, too; their error is computed
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from lathe_rc.arrays import Array
 from lathe_rc.signals.measured_profile import Measured
 from lathe_rc.signals.profile import Profile
 from lathe_rc.signals.profile_table import ByContent, kept
+
+Places = npt.NDArray[np.signedinteger[Any]]
 
 _TURN = 2.0 * np.pi
 _ANGLES = _TURN * np.arange(720) / 720  # at which a formula is compared
@@ -61,12 +64,12 @@ def _of_points(form: Measured) -> tuple[float, float]:
     """Return the doubts over the angle and along the part [m]."""
     angle, heights, radius = form.angle, form.heights, form.radius
 
-    def around(knots: Array, at: Array) -> Array:
+    def around(knots: Places, at: Places) -> Array:
         places, rows = np.append(angle[knots], angle[knots[0]] + _TURN), radius[:, np.append(knots, knots[0])]
         spline = scipy.interpolate.CubicSpline(places, rows, axis=1, bc_type="periodic")
         return np.asarray(spline(angle[at] + _TURN * (angle[at] < places[0])) - radius[:, at])
 
-    def along(knots: Array, at: Array) -> Array:
+    def along(knots: Places, at: Places) -> Array:
         return np.asarray(scipy.interpolate.interp1d(heights[knots], radius[knots], axis=0)(heights[at]) - radius[at])
 
     def error(points: int, every: int, first: int, *, periodic: bool) -> float:
