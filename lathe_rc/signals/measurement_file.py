@@ -11,7 +11,7 @@ import csv
 import re
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,6 +51,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 _NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
 _LONGEST_HEADER = 2**20  # [B]
 _SAME_START = 1e-8  # [s] two columns that begin within it begin together
+_MISSING = ("", "nan")  # texts of a value that was not measured
 _MOST_COLUMNS = 12  # that an error message lists
 
 
@@ -84,8 +85,8 @@ class Source(ABC):
     units: Mapping[str, str]
 
     @abstractmethod
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
-        """Return columns by name, shape (n,) each."""
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
+        """Return columns by name, shape (n,) each; ``gaps``: those in which a missing value is NaN."""
 
     def clock(self, name: str) -> Clock | None:
         """Return the sampling of a column; None if the file does not state it."""
@@ -227,8 +228,12 @@ class Measurement:
             f"{self.name}: columns {self._listed()}; allowed: {allowed} (name others by --column QUANTITY=COLUMN:UNIT)"
         )
 
-    def read(self, *quantities: str) -> list[npt.NDArray[Any]]:
+    def read(self, *quantities: str, gaps: Collection[str] = ()) -> list[npt.NDArray[Any]]:
         """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
+
+        Args:
+            quantities: quantities to read.
+            gaps: those that may be missing in some rows, which are NaN.
 
         Raises:
             InputError: a column has no finite numbers, its unit is unknown, two columns are named by a quantity, the
@@ -242,14 +247,15 @@ class Measurement:
         columns = {quantity: self._columns[quantity] for quantity in quantities}
         self._check_starts([column for column, _ in columns.values()])
         with _readable(self._damaged()):
-            arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
+            missing = {columns[quantity].column for quantity in gaps}
+            arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())), missing)
         found = []
         for quantity, (column, unit) in columns.items():
             array = np.asarray(arrays[column])
             if array.dtype.kind not in "fiuc" or array.ndim != 1:
                 raise InputError(f"{self.name}: column {column!r} holds no numbers in a row; name another column")
             array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64, copy=False)
-            wrong = np.flatnonzero(~np.isfinite(array))
+            wrong = np.flatnonzero(np.isinf(array) if quantity in gaps else ~np.isfinite(array))
             if wrong.size:
                 raise InputError(
                     f"{self.name}: {column!r} is {array[wrong[0]]} in row {wrong[0] + 1}; allowed: finite numbers"
@@ -357,7 +363,7 @@ class _Csv(Source):
         skipped, header = next(lines, (0, ""))
         return skipped, header, next(lines, (0, ""))[1]
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
@@ -373,13 +379,13 @@ class _Csv(Source):
         try:
             table = arrow_csv.read_csv(self._path, **options)
         except pa.ArrowInvalid:  # comments among the rows, or an error whose line only the second reading knows
-            return self._read_by_line(names)
+            return self._read_by_line(names, gaps)
         arrays = {name: table.column(name).to_numpy() for name in names}
         if not all(np.isfinite(array).all() for array in arrays.values()):
-            return self._read_by_line(names)
+            return self._read_by_line(names, gaps)
         return arrays
 
-    def _read_by_line(self, names: Sequence[str]) -> Mapping[str, Array]:
+    def _read_by_line(self, names: Sequence[str], gaps: Collection[str]) -> Mapping[str, Array]:
         """Read the columns line by line; errors name the line."""
         places = [self._names.index(name) for name in names]
         lines = self._lines()
@@ -396,7 +402,14 @@ class _Csv(Source):
                     f"{self._path}:{line}: {len(row)} values; allowed: {len(self._names)}, as in the header{decimals}"
                 )
             point = "," if self._delimiter != "," else "."  # also if the first row has whole numbers
-            rows.append([number(row[place].replace(point, "."), self._path, line) for place in places])
+            rows.append(
+                [
+                    np.nan
+                    if name in gaps and row[place].strip().casefold() in _MISSING
+                    else number(row[place].replace(point, "."), self._path, line)
+                    for name, place in zip(names, places, strict=True)
+                ]
+            )
         return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
 
 
@@ -410,7 +423,7 @@ class _Parquet(Source):
         schema = self._file.schema_arrow
         self.units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         table = self._file.read(columns=list(names))
         return {name: table.column(name).to_numpy() for name in names}
 
@@ -436,7 +449,7 @@ class _Mat(Source):
         elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiuc":
             self._arrays[name] = value
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         return {name: self._arrays[name] for name in names}
 
     def _time(self, name: str) -> Array | None:
@@ -494,7 +507,7 @@ class _Tdms(Source):
             if found.get("wf_increment")
         }
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         import nptdms
 
         with nptdms.TdmsFile.open(self._path) as file:
@@ -519,7 +532,7 @@ class _Mdf(Source):
         }
         self.units = {name: self._file.get_channel_unit(name, *place) for name, place in self._places.items()}
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         return {name: self._file.get(name, *self._places[name], samples_only=True)[0] for name in names}
 
     def clock(self, name: str) -> Clock | None:

@@ -39,7 +39,7 @@ def _element(kind: Nodetype, detail: Any, name: str, value: Any) -> Iterator[tup
         raise InputError(f"{name} has {len(value)} elements; allowed in a table: {_MOST_COLUMNS} columns")
     else:
         for place, each in enumerate(value):
-            yield from _element(*detail[0], f"{name}[{place}]", each)
+            yield from _element(detail[0][0], detail[0][1], f"{name}[{place}]", each)
 
 
 def _row(msgtype: str, log_ns: int, data: bytes) -> dict[str, Cell]:
