@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a form may be off between the points of its table: the estimate beside the truth, and what is told of it."""
+"""How far a form may be off between the points of its table: the estimate beside the truth, and the verdict."""
 
 import re
 
