@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import cli, harness
 from lathe_rc.analysis import form_correction, part_record
-from lathe_rc.analysis.form_correction import align, correction, evaluate, harmonics
+from lathe_rc.analysis.form_correction import align, correction, evaluate, harmonics, outliers
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
@@ -195,7 +195,10 @@ def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, s
         ("angle_deg,angle_rad,radius_um\n0,0,1\n", [], r"'angle_deg' and 'angle_rad' are both angle; allowed: one"),
         ("angle_deg,radius_um\n0,x\n", [], r"r.csv:2: 'x' is not a number"),
         ("angle_deg,radius_um\n0\n", [], r"r.csv:2: 1 values; allowed: 2, as in the header"),
-        ("angle_deg,radius_um\n0,nan\n", [], r"r.csv:2: 'nan'; allowed: finite numbers"),
+        ("angle_deg,radius_um\n0,inf\n", [], r"r.csv:2: 'inf'; allowed: finite numbers"),
+        ("angle_deg,radius_um\nnan,1\n", [], r"r.csv:2: 'nan'; allowed: finite numbers"),
+        ("angle_deg,radius_um\n,1\n", [], r"r.csv:2: '' is not a number"),
+        ("angle_deg,radius_um\n0,nan\n", [], r"no complete revolution: 0 points over 0°; allowed"),
         ("angle_deg,radius_um\n0,1\n9,1\n18,1\n", [], r"no complete revolution: 3 points over 18°; allowed"),
         ("# nothing\n", [], r"no columns of numbers; allowed: angle and radius"),
         ("angle_deg,radius_um\n", [], r"no complete revolution: 0 points over 0°; allowed"),
@@ -227,6 +230,126 @@ def test_x3p_is_read_as_its_own_library_writes_it(tmp_path):
     assert_refused(lambda: part_record.read(tmp_path / "no.x3p", {}), "no X3P file")
     assert_refused(lambda: part_record.read(tmp_path / "none.x3p", {}), "cannot be read .*; check the path")
     assert_refused(lambda: part_record.read(tmp_path / "no.x3p", {"angle": ("a", "deg")}), "--column with an X3P file")
+
+
+# --- readings that stand out
+
+
+def near(angle, width, at=2.0):
+    """Distance from an angle over a width, around the circle."""
+    return np.abs((angle - at + np.pi) % TURN - np.pi) / width
+
+
+FORMS = {
+    "oval": lambda a: 200e-6 * np.sin(2 * a),
+    "steps": lambda a: 50e-6 * np.sign(np.sin(a + 0.3)),
+    "keyway": lambda a: np.where(near(a, 0.1) < 1.0, -1e-3, 0.0),
+    "slot": lambda a: np.where(near(a, 0.035) < 1.0, -1e-3, 0.0),
+    "flat": lambda a: 100e-6 * np.maximum(np.cos(a), 0.3),
+    "kinks": lambda a: 100e-6 * np.abs(np.sin(1.5 * a)),
+    "chatter": lambda a: 5e-6 * np.sin(70 * a) + 2e-6 * np.sin(133 * a),
+    "burst of chatter": lambda a: np.where(near(a, 0.3) < 1.0, 5e-6 * np.sin(80 * a), 0.0),
+    "groove": lambda a: -50e-6 * np.exp(-(near(a, 0.03) ** 2)),
+    "saw": lambda a: 20e-6 * (a * 5 / TURN % 1.0),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("points", [180, 360, 720, 1440])
+def test_no_real_form_stands_out(name, points):
+    """Edges, keyways, grooves, kinks, and waves above those that are fitted, with noise or without."""
+    random = np.random.default_rng(points)
+    for noise in (0.0, 1e-7):
+        radius = FORMS[name](even(points)) + noise * random.standard_normal(points)
+        assert outliers(even(points), radius, 50).size == 0
+
+
+@pytest.mark.parametrize("points", [360, 720, 1440])
+@pytest.mark.parametrize(
+    "wrong", [{7: 9e-3}, {7: -1e-3, 90: 2e-3}, {30: 50e-6}, {0: 9e-3, -1: 9e-3}, {5: 1.0, 150: -30e-6}]
+)
+def test_dust_and_cut_off_flags_stand_out(points, wrong):
+    """Two readings side by side as well, unless the record is too coarse to tell them from a groove."""
+    wrong = {place: value for place, value in wrong.items() if place >= 0 or points > 360}
+    angle = even(points)
+    radius = (
+        200e-6 * np.sin(2 * angle) + 5e-6 * np.sin(3 * angle) + 0.3e-6 * np.random.default_rng(1).normal(size=points)
+    )
+    for place, value in wrong.items():
+        radius[place] += value
+    assert outliers(angle[::-1], radius[::-1], 50).tolist() == sorted(points - 1 - place % points for place in wrong)
+
+
+def test_too_many_that_stand_out_are_refused():
+    radius = 1e-6 * np.sin(2 * even(720))
+    radius[::30] = 9e-3
+    assert_refused(
+        lambda: outliers(even(720), radius, 50), r"24 of 720 points stand out, first 9000 µm at 0°; allowed: up"
+    )
+
+
+def record(path, wrong, gap=""):
+    """Four revolutions of an eccentric part with a deviation of 5 µm at 3 UPR; ``wrong``: readings to replace."""
+    random, rows = np.random.default_rng(3), []
+    for k, angle in enumerate(np.linspace(0.0, 4 * 360.0, 4 * 720, endpoint=False).tolist()):
+        at = np.radians(angle)
+        value = 20 * np.sin(at) + 225 * np.sin(2 * at) + 10 * np.sin(3 * at) + 20 * np.sin(4 * at)
+        value = wrong.get(k, value + 0.1 * random.standard_normal())
+        rows.append(f"{angle:.6g},{gap if value is None else f'{value:.7g}'}")
+    path.write_text("\n".join(["angle_deg,radius_um", *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("wrong", "gap", "left_out"),
+    [
+        ({}, "", 0),
+        ({1540: 9000.0, 1541: 9000.0, 1542: 9000.0}, "", 3),
+        ({5: -9999.0, 800: 500.0}, "", 2),
+        (dict.fromkeys(range(100, 112)), "", 0),
+        (dict.fromkeys(range(900, 912)), "NaN", 0),
+        ({**dict.fromkeys(range(900, 906)), 2000: 9000.0}, " ", 1),
+    ],
+)
+def test_readings_that_stand_out_and_gaps_change_no_correction(tmp_path, wrong, gap, left_out):
+    """They are named with angle and value."""
+    path = record(tmp_path / "r.csv", wrong, gap)
+    told = lathe(path, "--scenario", form_scenario(tmp_path), "-o", tmp_path / "form.csv", "--json")
+    assert [(each["revolution"], each["angle_deg"], each["value_um"]) for each in told["left_out"]] == [
+        (k // 720 + 1, pytest.approx(k % 720 / 2), value) for k, value in wrong.items() if value is not None
+    ]
+    assert len(told["left_out"]) == left_out
+    assert told["harmonics"][3]["change"] == pytest.approx(5.0, abs=0.05)
+
+
+def form_scenario(folder):
+    path = folder / "cell.yaml"
+    tool = (
+        "{harmonic_order: [1, 2, 3, 4], harmonic_amplitude: [20.0e-6, 225.0e-6, 15.0e-6, 20.0e-6], tolerance: 1.0e-6}"
+    )
+    path.write_text(
+        "/spindle_encoder: {ros__parameters: {revolutions: 2.0}}\n/electrodynamic_actuator: {ros__parameters: {}}\n"
+        f"/learning_controller: {{ros__parameters: {{}}}}\n/tool: {{ros__parameters: {tool}}}\n"
+    )
+    return path
+
+
+def test_a_correction_of_nothing_for_want_of_clean_data_is_no_success(tmp_path):
+    """Noise that hides deviations above the tolerance: no file, exit code 1; less noise is a success."""
+    random = np.random.default_rng(2)
+    for noise, code in ((400.0, 1), (0.05, 0)):
+        angle = np.linspace(0.0, 4 * 360.0, 4 * 720, endpoint=False)
+        at = np.radians(angle)
+        radius = 20 * np.sin(at) + 225 * np.sin(2 * at) + 15 * np.sin(3 * at) + 20 * np.sin(4 * at)
+        path = table(
+            tmp_path / "r.csv", "angle_deg,radius_um", (angle, radius + noise * random.normal(size=angle.size))
+        )
+        given = ("--scenario", form_scenario(tmp_path), "-o", tmp_path / "form.csv", "--offset", 0, "--search", 0)
+        told = lathe(path, *given, code=code)
+        assert (tmp_path / "form.csv").exists() == (not code)
+        if code:
+            assert "nothing is corrected, and the noise hides deviations up to" in told
+            assert "(tolerance: ±1 µm); no file written" in told
 
 
 # --- the command, from part to part

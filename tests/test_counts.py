@@ -21,6 +21,7 @@ from lathe_rc.bag.reading import stream
 from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cli import main
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
@@ -397,8 +398,8 @@ EVENT = {"allow_faults": True, "events": ["revolution 1: repair encoder"]}
     ("changed", "message"),
     [
         ({"revolutions": 50.0}, r"at 0.0995 s, after 1\.6\d+ revolutions; encoder_device.revolutions = 50, allowed"),
-        ({"max_gap": 1e-4}, r"counts.csv: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap = 0.1 ms"),
-        ({"inverted": True}, r"counts.csv: the encoder has gone back by"),
+        ({"max_gap": 1e-4}, r"counts.csv:3: no counts from 0 to 0.0005 s, for 0.5 ms; allowed: up to max_gap = 0.1 ms"),
+        ({"inverted": True}, r"counts.csv:3: the encoder has gone back by"),
         ({"max_deviation": 0.9}, "at 199 rad/s the cycle leaves"),
         ({"counts_file": ""}, r"encoder_device.counts_file is empty with source = file; allowed: a name"),
         ({"source": "line"}, r"encoder_device.device is empty with source = line; allowed: a name"),
@@ -440,9 +441,129 @@ def test_what_its_file_or_its_controller_cannot_have_is_refused(path):
     nodes["learning_controller"] = nodes["learning_controller"].model_copy(update={"lead_law": "exact_preview"})
     unknown = "exact_preview, but nobody knows the speed of encoder_device in advance"
     assert_refused(lambda: harness.run(Scenario("device", nodes)), unknown)
-    path.write_text("time_ns,counts\n0,0\n1000000,2\n1000000,3\n2000000,5\n")
-    late = "1 readings are not later than those before them; allowed: times that rise"
+    path.write_text("time_ns,counts\n0,0\n1000000,17\n2000000,33\n1900000,40\n")
+    late = "counts.csv:5: a reading that is not later than the one before; allowed: times that rise"
     assert_refused(lambda: harness.run(follower(path, revolutions=0.0)), late)
+
+
+# --- files that are not what they seem
+
+
+def turning(seconds=0.5, rpm=1000.0, counts=COUNTS):
+    """Times once a millisecond [s], and the counts of a spindle whose speed swings by 3 %."""
+    time = np.arange(0.0, seconds, 1e-3)
+    turns = rpm / 60.0 * (time + 0.03 * (1.0 - np.cos(40.0 * time)) / 40.0)
+    return time, np.floor(turns * counts).astype(int)
+
+
+def changed_at(place, by):
+    """Counts with one reading or all later ones changed."""
+    time, counts = turning()
+    counts[place] += by
+    return time, counts
+
+
+def in_bursts(readings, apart):
+    """Readings that come together, ``apart`` seconds from one to the next."""
+    time, counts = turning()
+    place = np.arange(time.size)
+    return (place // readings + 1) * readings * 1e-3 + apart * (place % readings), counts
+
+
+def zeroed_at(place):
+    time, counts = turning()
+    counts[place:] -= counts[place]
+    return time, counts
+
+
+@pytest.mark.parametrize(
+    ("made", "changed", "message"),
+    [
+        *(
+            (
+                turning(counts=of),
+                {},
+                rf"rpm on average is {said} nominal_rpm = 1000; .*counts_per_revolution = {of}, or",
+            )
+            for of, said in (
+                (250, r"a quarter \(x1 for x4\?\) of"),
+                (500, r"half \(x2 for x4\?\) of"),
+                (2000, r"twice \(x4 for x2\?\)"),
+                (4000, r"four times \(x4 for x1\?\)"),
+            )
+        ),
+        (turning(rpm=700.0), {}, r"70\d\.\d rpm on average is 0\.70\d of .*allowed: within max_deviation = 0\.2"),
+        *(
+            ((turning()[0], (turning()[1] + half) % wraps - half), {}, rf"anew{often}: counter_range = {wraps}\)$")
+            for wraps, half, often in ((2**12, 0, ""), (2**12, 2**11, ""), (1000, 0, ", by its index\\?"))
+        ),
+        (zeroed_at(33), {}, r"counts.csv:35: .* gone back by .* at 0.033 s; .*\(the counter was zeroed or set"),
+        *(
+            (changed_at(at, by), {}, rf"counts.csv:102: the counter runs ahead by {by + 16} counts from 0.099 to 0.1 s")
+            for at, by in ((slice(100, None), 400), (100, 1000), (100, 2**16))
+        ),
+        (changed_at(100, 22), {}, r"counts.csv:103: the counter jumps ahead at 0.1 s and back by \d counts at 0.101 s"),
+        (changed_at(100, -200), {}, r"counts.csv:102: the encoder has gone back by 18\d counts at 0.1 s"),
+        *(
+            (in_bursts(*burst), {"max_gap": 0.1}, "time stamps come in bursts: .* allowed: the time at which")
+            for burst in ((16, 0.0), (16, 2e-5), (4, 1e-5), (2, 1e-5), (64, 1e-6))
+        ),
+    ],
+)
+def test_a_file_that_is_not_what_it_seems_is_refused_by_its_cause(path, made, changed, message):
+    """Counts per revolution, counters that begin anew or are set, spikes at their own reading, bursts of stamps."""
+    rows = (f"{time:.6f},{count}\n" for time, count in zip(*made, strict=True))
+    path.write_text("time_s,counts\n" + "".join(rows))
+    assert_refused(lambda: EncoderDevice("encoder_device", follower(path, **changed).nodes["encoder_device"]), message)
+
+
+@pytest.mark.parametrize("left", [3, 4, 9])
+def test_a_last_line_that_is_torn_is_named(path, left):
+    write_rows(path, turning()[1])
+    *lines, last = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, last[:left]]))
+    torn = rf"counts.csv:501: .*\(the last line, '{last[:left]}', has no end: torn\? remove it\)"
+    assert_refused(lambda: EncoderDevice("encoder_device", follower(path).nodes["encoder_device"]), torn)
+
+
+def index_rows(path, counts, pulses, column):
+    """A file whose index column has the newest pulse."""
+    time = turning()[0]
+    rows = []
+    for at, count in zip(time, counts.tolist(), strict=True):
+        come = [pulse for pulse in pulses if pulse <= count]
+        value = come[-1] if come and column == "counts" else f"{np.interp(come[-1], counts, time):.6f}" if come else ""
+        rows.append(f"{at:.6f},{count},{value}\n")
+    path.write_text(f"time_s,counts,index_{column}\n" + "".join(rows))
+
+
+@pytest.mark.parametrize("column", ["counts", "s"])
+@pytest.mark.parametrize("share", [1.0, 15 / 16, 1000 / 1024, 31 / 32, 33 / 32])
+def test_index_pulses_show_lost_counts_and_the_angle_zero(path, column, share):
+    """Counts that are lost are refused with an index and told as a ratio without one."""
+    counts = np.floor(turning()[1] * share).astype(int)
+    pulses = np.round((np.arange(12) + 0.3) * COUNTS * share).astype(int).tolist()
+    index_rows(path, counts, pulses, column)
+    table = follower(path).nodes["encoder_device"]
+    if share == 1.0:
+        device = EncoderDevice("encoder_device", table)
+        assert device.warnings(1.0) == []
+        assert_allclose(device.counted.take(0, 1) * COUNTS / TURN, 0.7 * COUNTS, atol=2.0)
+        return
+    middle = f"{COUNTS * share:.4g}"[:2]
+    lost = rf"counts from index pulse 1 to the next, and {middle}.* in the middle; allowed: counts_per_rev.* = 1000 "
+    assert_refused(lambda: EncoderDevice("encoder_device", table), lost)
+    write_rows(path, counts)
+    (said,) = EncoderDevice("encoder_device", table).warnings(1.0)
+    ratio = {1000 / 1024: "1000 for 1024 lines"}.get(share, f"{round(32 * share) if share != 15 / 16 else 15}/")
+    assert f"({ratio}" in said
+
+
+def test_one_index_pulse_shows_no_lost_counts_and_this_is_told(path):
+    _, counts = turning()
+    index_rows(path, counts, [300], "counts")
+    (said,) = EncoderDevice("encoder_device", follower(path).nodes["encoder_device"]).warnings(1.0)
+    assert said.endswith("1 index pulses: lost counts are not looked for; two or more show them")
 
 
 def still(*pieces):

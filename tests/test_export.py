@@ -10,6 +10,7 @@ import pytest
 from bags import lathe
 from cells import scenario
 from pyarrow import parquet
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
@@ -219,7 +220,127 @@ def test_what_cannot_be_used_is_refused(recorded, arguments, said):
 
 @pytest.mark.parametrize("topic", ["/../../etc/x", "/a.b", "/a b", "/" + "a" * 300, "/ä"])
 def test_topics_that_would_leave_the_folder_or_are_no_signals_are_refused(topic):
-    for kind, said in ((messages.TOOL, "no name of ROS"), ("std_msgs/msg/String", "nothing to export")):
-        source = SimpleNamespace(path="bag", topics={topic: SimpleNamespace(type=kind)})
+    for kind, said in ((messages.TOOL, "no name of ROS"), ("own_msgs/msg/Unknown", "nothing to export")):
+        about = SimpleNamespace(type=kind, count=1)
+        source = SimpleNamespace(path="bag", topics={topic: about}, step_ns=lambda _: STEP_NS)
         with pytest.raises(InputError, match=said):
             exporting._selected(source, [])
+
+
+# --- messages without blocks
+
+
+def recorded_messages(path, topics, count=19, first=1_700_000_000_123_456_789):
+    """A bag of another recorder: messages of each topic 10 ms apart, as ``topics`` makes them from their number."""
+    types = messages.store().types
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, (kind, make) in topics.items():
+            channel = writer.add_connection(topic, kind, typestore=messages.store())
+            for k in range(count):
+                stamp = first + k * 10_000_000
+                data = messages.store().serialize_cdr(make(types, k), kind)
+                writer.write(channel, stamp, data)
+    return path
+
+
+def header(types, k):
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](5, k), "base")
+
+
+def joints(types, k):
+    names = ["a", "b"][: 1 + k % 2]
+    return types[messages.JOINTS](header(types, k), names, np.arange(len(names)) + float(k), np.empty(0), np.empty(0))
+
+
+def pose(types, k):
+    of = {name: types[f"geometry_msgs/msg/{name}"] for name in ("PoseStamped", "Pose", "Point", "Quaternion")}
+    return of["PoseStamped"](
+        header(types, k), of["Pose"](of["Point"](1.0 * k, 0.0, 0.0), of["Quaternion"](0, 0, 0, 1.0))
+    )
+
+
+def diagnostics(types, k):
+    of = {name: types[f"diagnostic_msgs/msg/{name}"] for name in ("DiagnosticArray", "DiagnosticStatus", "KeyValue")}
+    value = of["KeyValue"]("number", str(k))
+    return of["DiagnosticArray"](header(types, k), [of["DiagnosticStatus"](1, "n", 'm, "x"', "h", [value])])
+
+
+FOREIGN = {
+    "/joint_states": (
+        messages.JOINTS,
+        joints,
+        {"name[0]": "a", "position[0]": 3.0, "position[1]": 4.0, "stamp_ns": 5_000_000_003},
+    ),
+    "/pose": ("geometry_msgs/msg/PoseStamped", pose, {"pose.position.x": 3.0, "pose.orientation.w": 1.0}),
+    "/speed": ("std_msgs/msg/Float64", lambda types, k: types["std_msgs/msg/Float64"](k / 3.0), {"data": 1.0}),
+    "/on": ("std_msgs/msg/Bool", lambda types, k: types["std_msgs/msg/Bool"](k == 3), {"data": True}),
+    "/text": ("std_msgs/msg/String", lambda types, k: types["std_msgs/msg/String"](f"k={k}"), {"data": "k=3"}),
+    "/diagnostics": (
+        "diagnostic_msgs/msg/DiagnosticArray",
+        diagnostics,
+        {"status[0].values[0].value": "3", "status[0].message": 'm, "x"'},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_messages_without_blocks_have_a_row_each(tmp_path, kind):
+    """Of standard types, flattened, with the times of the log; ``read_bag`` has them as well."""
+    bag = recorded_messages(tmp_path / "bag", {topic: made[:2] for topic, made in FOREIGN.items()})
+    done = lathe("export", bag, f"--{kind}", "-o", tmp_path / "out")
+    assert (done.exit_code, done.stdout) == (0, f"6 topics, {6 * 19} rows: {tmp_path / 'out'}\n")
+    for topic, (_, _, wanted) in FOREIGN.items():
+        if kind == "csv":
+            rows = {name.partition(" [")[0]: values for name, values in from_csv(tmp_path / "out", topic).items()}
+        else:
+            rows = read(kind, tmp_path / "out", topic, "")
+        assert {len(values) for values in rows.values()} == {19}
+        assert [int(stamp) for stamp in rows["log_ns"]] == [1_700_000_000_123_456_789 + k * 10**7 for k in range(19)]
+        for name, value in wanted.items():
+            found = str(rows[name][3])
+            assert found == value if isinstance(value, str) else float(found.lower() == "true" or found) == value, name
+    stamps = reader.read_bag(bag).sparse["/joint_states"].stamps
+    assert stamps == [1_700_000_000_123_456_789 + k * 10**7 for k in range(19)]
+
+
+def test_what_has_no_table_is_refused_by_name(tmp_path):
+    """Too many columns; no messages at all; a copy of no message."""
+    wide = "sensor_msgs/msg/LaserScan"
+
+    def scan(types, k):
+        return types[wide](header(types, k), *[0.0] * 7, np.zeros(2000, np.float32), np.zeros(0, np.float32))
+
+    bag = recorded_messages(tmp_path / "bag", {"/scan": (wide, scan)}, 2)
+    done = lathe("export", bag, "--csv", "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "/scan at " in done.stderr
+    assert "ranges has 2000 elements; allowed in a table: 1024 columns" in done.stderr
+    empty = recorded_messages(tmp_path / "empty", {topic: made[:2] for topic, made in FOREIGN.items()}, 0)
+    done = lathe("export", empty, "--csv", "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "no messages of known types" in done.stderr
+    for chosen in (["--start", "1000"], ["--without", "/scan"], ["--end", "1e-12", "--without", "/scan"]):
+        done = lathe("bag", "copy", bag, "-o", tmp_path / "copy", *chosen)
+        assert done.exit_code == 2
+        assert "no message of" in done.stderr
+        assert not (tmp_path / "copy").exists()
+
+
+def test_messages_of_a_cell_without_its_blocks_have_a_row_each(recorded, tmp_path):
+    assert lathe("bag", "copy", recorded[0], "-o", tmp_path / "only", "--topics", "/coarse/learning").exit_code == 0
+    done = lathe("export", tmp_path / "only", "--csv", "-o", tmp_path / "out")
+    assert done.exit_code == 0
+    stamps = recorded[1].sparse["/coarse/learning"].stamps
+    assert from_csv(tmp_path / "out", "/coarse/learning")["log_ns [ns]"] == list(map(str, stamps))
+
+
+def test_samples_that_only_some_topics_have_are_told(recorded, tmp_path):
+    """A topic that ends, or begins, where others do not: its further samples are in no table, with exit code 3."""
+    for name, window in (("end", ["--end", "0.05"]), ("start", ["--start", "0.05"])):
+        part, rest = tmp_path / f"{name}-part", tmp_path / f"{name}-rest"
+        assert lathe("bag", "copy", recorded[0], "-o", part, "--topics", "/tool", *window).exit_code == 0
+        assert lathe("bag", "copy", recorded[0], "-o", rest, "--topics", "/encoder").exit_code == 0
+        assert lathe("bag", "copy", part, rest, "-o", tmp_path / name).exit_code == 0
+        done = lathe("export", tmp_path / name, "--csv", "-o", tmp_path / f"{name}-csv")
+        assert done.exit_code == 3
+        assert "left out: " in done.stderr

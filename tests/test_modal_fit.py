@@ -311,6 +311,59 @@ def test_formats_are_read_as_their_libraries_write_them(tmp_path, kind, columns)
     assert found.clock(None, "command", "response").step == pytest.approx(STEP)
 
 
+def starting(folder, kind, late, first):
+    """Two channels of a record that begin ``late`` seconds apart, as each format states it."""
+    path = folder / f"{late}.{kind}"
+    values = np.sin(np.arange(50.0))
+    if kind == "tdms":
+        import nptdms
+
+        start = np.datetime64("2015-11-20T20:13:43.500000") + np.timedelta64(first, "us")
+        about = {"wf_increment": STEP, "wf_start_offset": 0.0, "unit_string": "m"}
+        times = {"u": start, "x": start + np.timedelta64(round(late * 1e6), "us")}
+        channels = [
+            nptdms.ChannelObject("servo", name, values, {**about, "wf_start_time": at}) for name, at in times.items()
+        ]
+        with nptdms.TdmsWriter(path) as writer:
+            writer.write_segment(channels)
+    elif kind == "mat":
+        time = first + STEP * np.arange(50)
+        scipy.io.savemat(path, {"u": {"time": time, "u": values}, "x": {"time_ms": 1e3 * (time + late), "x": values}})
+    else:
+        import asammdf
+
+        file = asammdf.MDF(version="4.10")
+        for name, begin in (("u", 0.0), ("x", late)):
+            file.append([asammdf.Signal(values, timestamps=begin + STEP * np.arange(50), name=name, unit="m")])
+        file.save(path)
+        file.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "late", "first"),
+    [("tdms", 3e-3, 0), ("tdms", -3e-3, 1), ("tdms", STEP, 999_999), ("mat", 2e-3, 1.7), ("mf4", 3e-3, 0)],
+)
+def test_columns_that_begin_at_different_times_are_refused(tmp_path, kind, late, first):
+    """A record of a response, and pairs of command and displacement without a time; columns of one start are read."""
+    suffix = {"mat": ("u.u", "x.x")}.get(kind, ("u", "x"))
+    for response in ("response", "displacement"):
+        columns = measurement_file.parse_mapping([f"command={suffix[0]}:m", f"{response}={suffix[1]}:m"])
+        together = measurement_file.read(starting(tmp_path, kind, 0.0, first), columns)
+        assert len(together.read("command", response)) == 2
+        assert together.clock(None, "command", response).step == pytest.approx(STEP)
+        apart = measurement_file.read(starting(tmp_path, kind, late, first), columns)
+        with pytest.raises(InputError, match=f"begin at different times, {abs(late):.6g} s apart; cut both alike"):
+            apart.read("command", response)
+
+
+def test_a_rate_beside_a_stated_sampling_is_refused(tmp_path):
+    path = starting(tmp_path, "tdms", 0.0, 0)
+    done = lathe(tmp_path, path, "--column", "command=u", "--column", "response=x", "--rate", 100)
+    assert done.exit_code == 2
+    assert "--rate 100 beside the sampling that the file states; leave --rate out" in done.stderr
+
+
 def test_damaged_files_are_refused_in_one_line(tmp_path):
     """A header of another format, and pages that are damaged after a sound header."""
     (tmp_path / "none.mf4").write_bytes(b"MDF 4.10" * 100)

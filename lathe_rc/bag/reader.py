@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Samples, Signals
 
 
@@ -36,6 +38,7 @@ def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
 
     If members of the cell were lost, the recording ends there, and its ``lost`` gives the reason: later samples are
     held, or may rest on held ones.
+    In a bag without blocks, the stamps of messages are their log times.
 
     Args:
         path: path of the bag.
@@ -67,6 +70,13 @@ def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
             sparse[topic] = SparseTopic()
             for message in collected.sparse.get(topic, []):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
+    if not dense and sparse:  # without blocks, the log states the times
+        with Source(Path(path)) as source:
+            for topic, log_ns, data in source.messages(set(sparse)):
+                try:
+                    sparse[topic].append(log_ns, messages.values_of(header.types[topic], data))
+                except ValueError as error:
+                    raise LatheError(f"{path}: {topic}: at {log_ns} ns: {shown(error)}") from None
     samples = next((array.size for signals in dense.values() for array in signals.values()), 0)
     lost = str(header.loss or "")
     return Recording(header.types, dense, sparse, header.step_ns, header.samples - samples, lost)

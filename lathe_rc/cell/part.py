@@ -17,6 +17,7 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
@@ -60,7 +61,8 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(scenario).items():
         if topic.endswith(f"/{of}"):
-            return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=recording.sound_form[1])
+            why, doubt = recording.sound_form[1], form_doubt(scenario.nodes)
+            return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=why, doubt=doubt)
     return None
 
 

@@ -3,6 +3,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,12 +15,13 @@ from lathe_rc.analysis import form_correction, part_record, profile_csv
 from lathe_rc.analysis.form_correction import Alignment, Correction, Revolution
 from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
+from lathe_rc.cell import part
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, fields_of, refuse_faults
 from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.commands import completers, lossy, measured, options, tables
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.profile import Profile
@@ -91,6 +93,15 @@ def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
     return found
 
 
+class _Outlier(NamedTuple):
+    """Reading that is left out: file, revolution from 1, angle of the record, and value."""
+
+    record: str
+    revolution: int
+    angle_deg: float
+    value_um: float
+
+
 class _Read(NamedTuple):
     """Records, aligned.
 
@@ -98,11 +109,25 @@ class _Read(NamedTuple):
         deviations: desired less actual of each revolution of each record.
         alignments: by record.
         points: mean number of points of a revolution.
+        left_out: readings that stand out, with their places.
     """
 
     deviations: list[list[Complex]]
     alignments: list[Alignment]
     points: float
+    left_out: list[_Outlier]
+
+
+def _clean(path: Path, revolutions: list[Revolution], highest: int, left_out: list[_Outlier]) -> list[Revolution]:
+    """Leave out readings that stand out (see `lathe_rc.analysis.form_correction.outliers`), and append them."""
+    found = []
+    for k, each in enumerate(revolutions, 1):
+        places = form_correction.outliers(each.angle, each.radius, highest, f"{path}, revolution {k}")
+        for place in places.tolist():
+            angle, value = float(np.degrees(each.angle[place])), float(each.radius[place])
+            left_out.append(_Outlier(str(path), k, angle, value * 1e6))
+        found.append(replace(each, angle=np.delete(each.angle, places), radius=np.delete(each.radius, places)))
+    return found
 
 
 def _read(
@@ -125,12 +150,13 @@ def _read(
     if search is None:
         search = 180.0 if offset is None else 0.0
     around, within, sense = np.radians(offset or 0.0), np.radians(search), -1.0 if reverse else 1.0
-    found, points = _Read([], [], 0.0), []
+    found, points = _Read([], [], 0.0, []), []
     for path in records:
         bag = measured.is_bag(path)
         if bag:
             measured.tell_origin(path)
         revolutions = _of_bag(path, last, topic) if bag else part_record.read(path, mapping)
+        revolutions = _clean(path, revolutions, highest, found.left_out)
         points += [each.angle.size for each in revolutions]
         waves = [
             form_correction.harmonics(sense * each.angle, each.radius, highest, f"{path}, revolution {k}")
@@ -187,6 +213,26 @@ def _check_likeness(path: Path, aligned: Alignment) -> None:
         )
 
 
+def _hidden(made: Correction, lowest: int, guard: float, scenario: Scenario) -> str:
+    """Return a warning if noise may hide deviations above the tolerance; empty otherwise.
+
+    Raises:
+        LatheError: in addition, nothing is corrected.
+    """
+    most = guard * float(made.noise[lowest:].max())
+    allowed = min(part.tolerances(scenario).values(), default=0.0)
+    if most <= allowed:
+        return ""
+    told = f"tolerance: ±{allowed * 1e6:.4g} µm" if allowed else "no tolerance"
+    hides = f"the noise hides deviations up to {most * 1e6:.4g} µm in a harmonic, --guard times its noise ({told})"
+    if not made.corrected.any():
+        raise LatheError(
+            f"nothing is corrected, and {hides}; no file written; allowed: a record with less noise, or of more "
+            "revolutions or parts"
+        )
+    return hides
+
+
 def _write(path: Path, programmed: Profile, change: Complex, comment: str) -> None:
     """Write the programmed form with its change as a profile file."""
     heights = programmed.heights
@@ -205,9 +251,9 @@ def _summary(found: _Read, made: Correction, records: Sequence[Path], forms: _Fo
             "record": str(path),
             "offset_deg": float(np.degrees(each.offset)) % 360.0,
             "correlation": None if np.isnan(each.correlation) else each.correlation,
-            "revolutions": len(part),
+            "revolutions": len(deviations),
         }
-        for path, each, part in zip(records, found.alignments, found.deviations, strict=True)
+        for path, each, deviations in zip(records, found.alignments, found.deviations, strict=True)
     ]
     waves = [
         {
@@ -221,6 +267,7 @@ def _summary(found: _Read, made: Correction, records: Sequence[Path], forms: _Fo
     ]
     return {
         "records": aligned,
+        "left_out": [each._asdict() for each in found.left_out],
         "node": forms.node,
         "unit": "um",
         "deviation": float(np.abs(form_correction.evaluate(made.deviation, _ANGLES)).max()) * 1e6,
@@ -240,6 +287,14 @@ def _show(summary: dict[str, Any], output: Path) -> None:
             f"{each['record']}: {count} revolution{'s' if count > 1 else ''}, angle 0 of the part at "
             f"{each['offset_deg']:.4g}° ({how})"
         )
+    left_out = summary["left_out"]
+    for each in left_out[:_ROWS]:
+        out.print(
+            f"left out, since it stands out: {each['value_um']:.6g} µm at {each['angle_deg']:.6g}° in revolution "
+            f"{each['revolution']} of {each['record']}"
+        )
+    if len(left_out) > _ROWS:
+        out.print(f"and {len(left_out) - _ROWS} more: see --json")
     lines = tables.table("UPR", "deviation [µm]", "noise [µm]", "correction [µm]")
     largest = sorted(summary["harmonics"], key=lambda wave: -wave["amplitude"])
     shown = [wave for wave in largest if wave["corrected"]][:_ROWS]
@@ -323,7 +378,8 @@ def correct(
     (docs/metrology.md).
     """
     check_place("--output", output)
-    forms = _forms(scenarios.load(scenario, overrides), node)
+    loaded = scenarios.load(scenario, overrides)
+    forms = _forms(loaded, node)
     lowest = _ROUNDNESS if roundness else 0
     found = _read(records, forms.desired, highest=highest, lowest=lowest, **how)
     revolutions = sum(map(len, found.deviations))
@@ -333,10 +389,13 @@ def correct(
     made = form_correction.correction(
         found.deviations, lowest=lowest, gain=gain, guard=guard, cutoff=cutoff, noise=given
     )
+    hidden = _hidden(made, lowest, guard, loaded)
     _write(
         output, forms.programmed, made.change, f"programmed form of the next part, from {', '.join(map(str, records))}"
     )
     summary = _summary(found, made, records, forms, output)
+    if hidden:
+        click.echo(f"warning: {hidden}", err=True)
     if as_json:
         click.echo(json.dumps(summary))
     else:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lathe_rc.commands import completers, lossy, options
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LossyRunError
 
 if TYPE_CHECKING:
     from lathe_rc.c_library.library import Library
@@ -31,9 +31,13 @@ def export() -> None:
     type=options.PATH,
     help="folder, for --npz file, to make; must not exist; default: BAG-csv, BAG-parquet or BAG.npz, here",
 )
-@options.topics("all signals")
-def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[str, ...]) -> None:
-    """Export the signal topics of a recording, with units."""
+@options.topics("all signals, or all topics of a recording without blocks")
+@click.pass_context
+def bag(ctx: click.Context, bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[str, ...]) -> None:
+    """Export the topics of a recording, with units.
+
+    Exit code 3: samples or messages of these topics are not in the tables.
+    """
     if len(kinds) != 1:
         raise InputError(f"{len(kinds)} formats; allowed: one of --csv, --parquet and --npz")
     from lathe_rc.bag.exporting import export as exporting
@@ -43,8 +47,13 @@ def bag(bag: Path, kinds: tuple[str, ...], output: Path | None, topics: tuple[st
     name = name_of(bag).removesuffix(".mcap")
     place = output or Path(f"{name}.npz" if kind == "npz" else f"{name}-{kind}")
     done = exporting.export_bag(bag, place, kind, topics)
+    for line in done.left_out:
+        click.echo(f"left out: {line}", err=True)
+    if done.others:
+        click.echo(f"not exported, unless named by --topics: {', '.join(done.others)}", err=True)
     click.echo(f"{len(done.rows)} topics, {sum(done.rows.values())} rows: {done.place}")
-    lossy.end(bag)
+    lost = lossy.tell([bag])
+    ctx.exit(LossyRunError.exit_code if lost or done.left_out else 0)
 
 
 @export.command("c")

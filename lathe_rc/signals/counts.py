@@ -31,10 +31,13 @@ _READING = re.compile(rf"{_NUMBER}(?:[,;]|\s){_NUMBER}(?:(?:[,;]|\s){_NUMBER})?"
 _PLAIN = {"time_ns,counts": 1, "time_s,counts": 10**9}  # header, and nanoseconds per unit of the times
 _TIMED = {"time_ns,counts,edge_ns": 1, "time_s,counts,edge_s": 10**9}  # with the time of the counter's last edge
 _HEADERS = _PLAIN | _TIMED
+_COLUMNS = re.compile(r"(time_(n?s),counts(?:,edge_\2)?)(?:,index_(\2|counts))?")  # header of a file
 _MOST_TIME = 2**63  # [ns], exclusive
-_MOST_COUNT = 2.0**64  # largest magnitude of a counter
+MOST_COUNT = 2.0**64  #: largest magnitude of a counter
 _LONGEST_LINE = 256
 _GOES_ON = 3600  # [s] of extrapolation
+_FASTEST = 2.0  # highest expected speed, relative to the nominal one
+_COUNTER_BITS = range(8, 49)  # of a counter that begins anew
 _PIECE = 65536  # bytes per read
 _BAUD = {int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r"B[1-9][0-9]+", name)}
 _IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # indices in the list of termios.tcgetattr
@@ -87,35 +90,70 @@ def _reading(text: str, unit: int, where: str, *, timed: bool) -> Reading:
 class CsvReader(Reader):
     """Reader of a CSV file with the header ``time_ns,counts`` or ``time_s,counts``; ignores lines starting with #.
 
-    With a third column, ``edge_ns`` or ``edge_s``, it has the times of the last edges.
+    With the column ``edge_ns`` or ``edge_s``, it has the times of the last edges. A last column ``index_counts`` has
+    the counter at the newest index pulse, and ``index_ns`` or ``index_s`` the time of this pulse; it is empty before
+    the first pulse.
 
     Args:
         path: path of the file.
 
     Attributes:
         timed: whether the file has the times of the last edges.
+        index: kind of the index column, ``counts`` or a unit of time; empty without one.
+        pulses: place among the readings of the first one after each index pulse, and counter or time [ns] of the
+            pulse.
+        numbers: line numbers of the readings.
 
     Raises:
         InputError: the file cannot be read, or has another header; `read` raises it for malformed lines.
     """
 
     def __init__(self, path: Path) -> None:
-        lines = enumerate(read_text(path, "counts").splitlines(), 1)
-        self._path = path
+        text = read_text(path, "counts")
+        lines = enumerate(text.splitlines(), 1)
+        self._path, self._ends = path, text.endswith(("\n", "\r"))
         self._lines = [(n, line) for n, line in lines if line.strip() and line.lstrip()[0] != "#"]
         header = self._lines[0][1].replace(" ", "") if self._lines else ""
-        if header not in _HEADERS:
+        found = _COLUMNS.fullmatch(header)
+        if not found:
             edges = " and ".join(name.rpartition(",")[2] for name in _TIMED)
             raise InputError(
-                f"{path}: header {shown(header)!r}; allowed: {' or '.join(_PLAIN)}, and {edges} for the times of edges"
+                f"{path}: header {shown(header)!r}; allowed: {' or '.join(_PLAIN)}, and {edges} for the times of "
+                "edges, and index_counts, index_ns or index_s for index pulses"
             )
-        self._unit, self.timed = _HEADERS[header], header in _TIMED
+        self._unit, self.timed = _HEADERS[found[1]], found[1] in _TIMED
+        self.index: str = found[3] or ""
+        self.pulses: list[tuple[int, int | float]] = []
+        self.numbers = [number for number, _ in self._lines[1:]]
 
     def read(self) -> Iterator[Reading]:
         """Yield all readings of the file, once."""
-        for number, line in [] if self.ended else self._lines[1:]:
-            yield _reading(line, self._unit, f"{self._path}:{number}", timed=self.timed)
+        for place, (number, line) in enumerate([] if self.ended else self._lines[1:]):
+            where, text = f"{self._path}:{number}", line
+            try:
+                if self.index:
+                    text, _, pulse = line.rpartition(",")
+                    self._add_pulse(place, pulse.strip(), where)
+                yield _reading(text, self._unit, where, timed=self.timed)
+            except InputError as error:
+                raise InputError(f"{error}{self.torn(place)}") from None
         self.ended = True
+
+    def torn(self, place: int) -> str:
+        """Return a remark on the last line if it is that of a reading and has no end; otherwise an empty text."""
+        last = place == len(self._lines) - 2 and not self._ends
+        return f" (the last line, {shown(self._lines[-1][1])!r}, has no end: torn? remove it)" if last else ""
+
+    def _add_pulse(self, place: int, text: str, where: str) -> None:
+        """Append an index pulse if the column shows another one than before."""
+        if not text:
+            return
+        try:
+            pulse = _count(text) if self.index == "counts" else _time_ns(text, self._unit)
+        except (ValueError, ArithmeticError):
+            raise InputError(f"{where}: index_{self.index} = {shown(text)!r}; allowed: a number, or nothing") from None
+        if not self.pulses or pulse != self.pulses[-1][1]:
+            self.pulses.append((place, pulse))
 
 
 class LineReader(Reader):
@@ -205,11 +243,14 @@ class CountedAngle:
         wraps: number of counts after which the counter restarts at 0; 0: never.
         inverted: whether the counter counts down while the spindle turns forward.
         max_reverse: largest backward motion [counts]; the angle is constant during it.
+        max_forward: largest angle by which the counter may run ahead of a spindle at twice the nominal speed [rad].
         max_gap: longest time between readings [s].
         edge_clock: resolution of the times of edges [s].
-        nominal_speed: speed assumed from the first reading to the next edge [rad/s], with times of edges.
+        nominal_speed: nominal speed of the spindle [rad/s]; also that from the first reading to the next edge, with
+            times of edges. 0: not known, and nothing runs ahead.
 
     Attributes:
+        zero: counts turned from the first reading to the one at which the angle is 0; None: the counter's own 0.
         late: number of ignored readings, which arrived after a more recent one.
     """
 
@@ -222,6 +263,7 @@ class CountedAngle:
         inverted: bool,
         max_reverse: float,
         max_gap: float,
+        max_forward: float = 0.1,
         edge_clock: float = 0.0,
         nominal_speed: float = 0.0,
     ) -> None:
@@ -230,6 +272,12 @@ class CountedAngle:
         self._start_ns = 0
         self._newest: tuple[int, int | float] | None = None
         self._turned = self._highest = self._reached = 0.0  # [count], the last with the part of a count since its edge
+        self._rate = nominal_speed * counts / (2.0 * np.pi) * _FASTEST * 1e-9  # [count/ns], the highest expected
+        self._max_ahead = max_forward * counts / (2.0 * np.pi)
+        self._ahead = 0.0  # counts beyond those of the highest expected speed
+        self._changed_ns = 0  # time of the reading at which the counter has changed last
+        self._older = 0.0  # turned counts at the reading before the newest one
+        self.zero: float | None = None
         self._edges = edge_table(edge_clock, 0.0, 0.0, nominal_speed * counts / (2.0 * np.pi))
         self._times: list[float] = []  # [ns] after sample 0, of readings added since the last `_gather`
         self._angles: list[float] = []
@@ -255,16 +303,18 @@ class CountedAngle:
         """Add a reading of the encoder: its time [ns], the counter and, if known, the time of its last edge [ns].
 
         Raises:
-            LatheError: the last reading was too long ago, the counter has moved back too far, or a value is invalid.
+            LatheError: the last reading was too long ago, the counter has moved back or ahead too far, or a value is
+                invalid.
         """
-        if not abs(count) <= _MOST_COUNT:
+        if not abs(count) <= MOST_COUNT:
             raise LatheError(f"counter of {count:.6g} at {time_ns} ns; allowed: finite numbers up to 2^64")
         if edge_ns is not None and edge_ns > time_ns:
             raise LatheError(f"last edge at {edge_ns} ns in a reading at {time_ns} ns; allowed: not after the reading")
         before = self._newest
         if before is None:
-            self._start_ns, self._newest = time_ns, (time_ns, count)
-            self._turned = self._highest = float((count * self._sign) % self._counts)
+            self._start_ns, self._newest, self._changed_ns = time_ns, (time_ns, count), time_ns
+            self._turned = (count * self._sign if self.zero is None else -self.zero) % self._counts
+            self._turned = self._highest = self._older = float(self._turned)
             if edge_ns is not None:
                 self._edges.last[[STAMP, COUNT]] = (edge_ns - time_ns) * 1e-9, self._turned
             self._keep(edge_ns)
@@ -282,12 +332,7 @@ class CountedAngle:
         if self._wraps:
             moved = ((2 * moved + self._wraps) % (2 * self._wraps) - self._wraps) / 2
         self._newest = time_ns, count
-        self._turned += moved * self._sign
-        if (back := self._highest - self._turned) > self._max_reverse:
-            raise LatheError(
-                f"the encoder has gone back by {back:.6g} counts at {self.time:.9g} s; allowed: up to max_reverse = "
-                f"{self._max_reverse:g}, a spindle that turns one way (inverted turns the sign)"
-            )
+        self._turn(moved * self._sign, before[0])
         if edge_ns is not None and self._turned > self._highest:
             # The edge of a new count comes after the reading before; both times are rounded to nanoseconds.
             least = before[0] - math.ceil(self._edges.clock * 1e9) - 1
@@ -299,6 +344,60 @@ class CountedAngle:
                 )
         self._highest = max(self._highest, self._turned)
         self._keep(edge_ns)
+
+    def _turn(self, moved: float, before_ns: int) -> None:
+        """Turn the angle by counts since the reading before, which came at ``before_ns``.
+
+        Raises:
+            LatheError: the counter has moved back or ahead too far.
+        """
+        assert self._newest is not None, "a reading has come"
+        time_ns, older = self._newest[0], self._older
+        self._older = self._turned
+        self._turned += moved
+        if (back := self._highest - self._turned) > self._max_reverse:
+            raise LatheError(self._gone_back(back, -moved, before_ns, spike=self._turned > older))
+        if moved > 0.0 and self._rate:
+            self._ahead = max(self._ahead + moved - self._rate * (time_ns - self._changed_ns), 0.0)
+            if self._ahead > self._max_ahead:
+                most = self._max_ahead * 2.0 * np.pi / self._counts
+                raise LatheError(
+                    f"the counter runs ahead by {moved:.6g} counts from {self._seconds(before_ns)} to "
+                    f"{self.time:.9g} s; allowed: max_forward = {most:g} rad more than at {_FASTEST:g} times "
+                    "nominal_rpm (a reading that stands out, a counter that was set, stamps in bursts, or another "
+                    "counts_per_revolution)"
+                )
+        if moved:
+            self._changed_ns = time_ns
+
+    def _seconds(self, time_ns: int) -> str:
+        return f"{(time_ns - self._start_ns) * 1e-9:.9g}"
+
+    def _gone_back(self, back: float, moved: float, before_ns: int, *, spike: bool) -> str:
+        """Describe a counter that has gone back, and what may have caused it.
+
+        Args:
+            back: counts from the highest reading back.
+            moved: counts from the reading before back.
+            before_ns: time of the reading before [ns].
+            spike: whether the counter has risen since the reading before that one.
+        """
+        assert self._newest is not None, "a reading has come"
+        time_ns, count = self._newest
+        if spike:
+            return (
+                f"the counter jumps ahead at {self._seconds(before_ns)} s and back by {moved:.6g} counts at "
+                f"{self.time:.9g} s: the first of these readings stands out; allowed: a spindle that turns one way"
+            )
+        said = f"the encoder has gone back by {back:.6g} counts at {self.time:.9g} s; allowed: up to max_reverse = "
+        most = self._max_ahead + self._rate * (time_ns - before_ns)
+        for turn in (self._counts, *(2**bits for bits in _COUNTER_BITS)):
+            if turn != self._wraps and moved > turn / 2.0 and -self._max_reverse <= turn - moved <= most:
+                often = ", by its index?" if turn == self._counts else ""
+                return f"{said}{self._max_reverse:g} (a counter that begins anew{often}: counter_range = {turn})"
+        if 0.0 <= count * self._sign <= most < moved:
+            return f"{said}{self._max_reverse:g} (the counter was zeroed or set: begin the file after it)"
+        return f"{said}{self._max_reverse:g}, a spindle that turns one way (inverted turns the sign)"
 
     def go_on(self, speed: float) -> None:
         """Extrapolate the most recent reading by an hour at ``speed`` [rad/s]."""

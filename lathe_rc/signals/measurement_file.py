@@ -11,7 +11,7 @@ import csv
 import re
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,6 +50,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 }  #: factors to SI units [s, m, rad/s, 1, rad] by quantity and unit; "": no unit known
 _NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
 _LONGEST_HEADER = 2**20  # [B]
+_SAME_START = 1e-8  # [s] two columns that begin within it begin together
+_MISSING = ("", "nan")  # texts of a value that was not measured
 _MOST_COLUMNS = 12  # that an error message lists
 
 
@@ -83,12 +85,17 @@ class Source(ABC):
     units: Mapping[str, str]
 
     @abstractmethod
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
-        """Return columns by name, shape (n,) each."""
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
+        """Return columns by name, shape (n,) each; ``gaps``: those in which a missing value is NaN."""
 
     def clock(self, name: str) -> Clock | None:
         """Return the sampling of a column; None if the file does not state it."""
         return None
+
+    def start(self, name: str) -> float | None:
+        """Return the time of the first value of a column [s]; None if the file does not state it."""
+        clock = self.clock(name)
+        return clock.start if clock else None
 
 
 class Mapped(NamedTuple):
@@ -155,12 +162,13 @@ def _is_of(quantity: str, column: str) -> bool:
     return name == quantity or any(name == f"{quantity}_{unit}" for unit in UNITS[quantity] if unit)
 
 
-def even_clock(time: Array, what: str) -> Clock:
+def even_clock(time: Array, what: str, cure: str = "resample the record") -> Clock:
     """Return start and step of evenly spaced times.
 
     Args:
         time: times [s], shape (n,), n at least 2.
         what: description of the times for error messages.
+        cure: remedy for times that are not even.
 
     Raises:
         InputError: the times are not even.
@@ -173,7 +181,7 @@ def even_clock(time: Array, what: str) -> Clock:
         at = int(off.argmax())
         raise InputError(
             f"{what}: not in even steps, {time[at]:.9g} s at sample {at} is {off[at]:.3g} s off; allowed: even steps "
-            "(resample the record, or give --rate and no column of the time)"
+            f"({cure})"
         )
     return Clock(float(time[0]), step)
 
@@ -220,12 +228,16 @@ class Measurement:
             f"{self.name}: columns {self._listed()}; allowed: {allowed} (name others by --column QUANTITY=COLUMN:UNIT)"
         )
 
-    def read(self, *quantities: str) -> list[npt.NDArray[Any]]:
+    def read(self, *quantities: str, gaps: Collection[str] = ()) -> list[npt.NDArray[Any]]:
         """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
+
+        Args:
+            quantities: quantities to read.
+            gaps: those that may be missing in some rows, which are NaN.
 
         Raises:
             InputError: a column has no finite numbers, its unit is unknown, two columns are named by a quantity, the
-                lengths differ, or the file is damaged.
+                lengths or the times of the first values differ, or the file is damaged.
         """
         for quantity in self._doubles.keys() & set(quantities):
             one, other, *_ = self._doubles[quantity]
@@ -233,15 +245,17 @@ class Measurement:
                 f"{self.name}: {one!r} and {other!r} are both {quantity}; allowed: one (--column {quantity}={one})"
             )
         columns = {quantity: self._columns[quantity] for quantity in quantities}
+        self._check_starts([column for column, _ in columns.values()])
         with _readable(self._damaged()):
-            arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())))
+            missing = {columns[quantity].column for quantity in gaps}
+            arrays = self._source.read(list(dict.fromkeys(column for column, _ in columns.values())), missing)
         found = []
         for quantity, (column, unit) in columns.items():
             array = np.asarray(arrays[column])
             if array.dtype.kind not in "fiuc" or array.ndim != 1:
                 raise InputError(f"{self.name}: column {column!r} holds no numbers in a row; name another column")
             array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64, copy=False)
-            wrong = np.flatnonzero(~np.isfinite(array))
+            wrong = np.flatnonzero(np.isinf(array) if quantity in gaps else ~np.isfinite(array))
             if wrong.size:
                 raise InputError(
                     f"{self.name}: {column!r} is {array[wrong[0]]} in row {wrong[0] + 1}; allowed: finite numbers"
@@ -252,6 +266,17 @@ class Measurement:
             lengths = ", ".join(f"{size} of {name}" for name, size in zip(quantities, sizes, strict=True))
             raise InputError(f"{self.name}: {lengths}; allowed: as many of each")
         return found
+
+    def _check_starts(self, columns: Sequence[str]) -> None:
+        """Check that columns begin at the same time, as far as the file states times."""
+        with _readable(self._damaged()):
+            starts = [(column, start) for column in columns if (start := self._source.start(column)) is not None]
+        for column, start in starts[1:]:
+            if (late := abs(start - starts[0][1])) > _SAME_START:
+                raise InputError(
+                    f"{self.name}: {starts[0][0]!r} and {column!r} begin at different times, {late:.6g} s apart; cut "
+                    "both alike"
+                )
 
     def _damaged(self) -> str:
         return f"{self.name}: damaged after its header; record or copy it again"
@@ -278,25 +303,26 @@ class Measurement:
             InputError: nothing states it, ``rate`` and a column do, it is not even, or it differs between the
                 quantities.
         """
+        columns = [self._columns[quantity].column for quantity in quantities]
+        self._check_starts(columns)
+        with _readable(self._damaged()):
+            stated = [(column, clock) for column in columns if (clock := self._source.clock(column)) is not None]
+        for column, clock in stated[1:]:
+            if abs(clock.step - stated[0][1].step) > 1e-6 * clock.step:
+                raise InputError(f"{self.name}: {stated[0][0]!r} and {column!r} are sampled differently; resample one")
+        if rate is not None and ("time" in self or stated):
+            what = f"times in {self._columns['time'].column!r}" if "time" in self else "sampling that the file states"
+            raise InputError(f"{self.name}: --rate {rate:g} beside the {what}; leave --rate out")
         if rate is not None:
-            if "time" in self:
-                column = self._columns["time"].column
-                raise InputError(f"{self.name}: --rate {rate:g} beside the times in {column!r}; leave --rate out")
             return Clock(0.0, 1.0 / rate)
         if "time" in self:
-            return even_clock(self.read("time")[0], f"{self.name}: time")
-        columns = [self._columns[quantity].column for quantity in quantities]
-        with _readable(self._damaged()):
-            clocks = [self._source.clock(column) for column in columns]
-        known = [clock for clock in clocks if clock is not None]
-        if not known:
+            cure = "resample the record, or give --rate and no column of the time"
+            return even_clock(self.read("time")[0], f"{self.name}: time", cure)
+        if not stated:
             raise InputError(f"{self.name}: no time; give --rate HZ, or a column by --column time=COLUMN:UNIT")
-        for column, clock in zip(columns, clocks, strict=True):
-            if clock is None or abs(clock.step - known[0].step) > 1e-6 * known[0].step:
-                raise InputError(f"{self.name}: {columns[0]!r} and {column!r} are sampled differently; resample one")
-            if abs(clock.start - known[0].start) > 1e-3 * known[0].step:
-                raise InputError(f"{self.name}: {columns[0]!r} and {column!r} begin at different times; cut both alike")
-        return known[0]
+        if lacking := [column for column in columns if column not in dict(stated)]:
+            raise InputError(f"{self.name}: {stated[0][0]!r} has times and {lacking[0]!r} none; resample one")
+        return stated[0][1]
 
 
 # --- formats
@@ -337,7 +363,7 @@ class _Csv(Source):
         skipped, header = next(lines, (0, ""))
         return skipped, header, next(lines, (0, ""))[1]
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
@@ -353,13 +379,13 @@ class _Csv(Source):
         try:
             table = arrow_csv.read_csv(self._path, **options)
         except pa.ArrowInvalid:  # comments among the rows, or an error whose line only the second reading knows
-            return self._read_by_line(names)
+            return self._read_by_line(names, gaps)
         arrays = {name: table.column(name).to_numpy() for name in names}
         if not all(np.isfinite(array).all() for array in arrays.values()):
-            return self._read_by_line(names)
+            return self._read_by_line(names, gaps)
         return arrays
 
-    def _read_by_line(self, names: Sequence[str]) -> Mapping[str, Array]:
+    def _read_by_line(self, names: Sequence[str], gaps: Collection[str]) -> Mapping[str, Array]:
         """Read the columns line by line; errors name the line."""
         places = [self._names.index(name) for name in names]
         lines = self._lines()
@@ -376,7 +402,14 @@ class _Csv(Source):
                     f"{self._path}:{line}: {len(row)} values; allowed: {len(self._names)}, as in the header{decimals}"
                 )
             point = "," if self._delimiter != "," else "."  # also if the first row has whole numbers
-            rows.append([number(row[place].replace(point, "."), self._path, line) for place in places])
+            rows.append(
+                [
+                    np.nan
+                    if name in gaps and row[place].strip().casefold() in _MISSING
+                    else number(row[place].replace(point, "."), self._path, line)
+                    for name, place in zip(names, places, strict=True)
+                ]
+            )
         return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
 
 
@@ -390,13 +423,13 @@ class _Parquet(Source):
         schema = self._file.schema_arrow
         self.units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         table = self._file.read(columns=list(names))
         return {name: table.column(name).to_numpy() for name in names}
 
 
 class _Mat(Source):
-    """MATLAB file; a field of a structure is ``NAME.FIELD``."""
+    """MATLAB file; a field of a structure is ``NAME.FIELD``; a field ``time`` states the sampling of its structure."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -416,8 +449,31 @@ class _Mat(Source):
         elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiuc":
             self._arrays[name] = value
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         return {name: self._arrays[name] for name in names}
+
+    def _time(self, name: str) -> Array | None:
+        """Return the times beside a field [s]; None if there are none."""
+        structure = name
+        while structure := structure.rpartition(".")[0]:
+            for field, time in self._arrays.items():
+                place, _, last = field.rpartition(".")
+                if place == structure and _is_of("time", last) and time.size == self._arrays[name].size:
+                    return time * (_factor("time", _unit_of("time", last) or "") or 1.0)
+        return None
+
+    def clock(self, name: str) -> Clock | None:
+        time = self._time(name)
+        return None if time is None else even_clock(time, f"the time beside {name}")
+
+    def start(self, name: str) -> float | None:
+        time = self._time(name)
+        return None if time is None or not time.size else float(time[0])
+
+
+def _since(start: Any, seconds: int) -> float:
+    """Return the time of a TDMS time stamp after whole seconds since 1904 [s]; of none: that of 1904."""
+    return float(start.seconds - seconds + start.second_fractions / 2**64) if start else float(-seconds)
 
 
 class _Tdms(Source):
@@ -428,7 +484,7 @@ class _Tdms(Source):
             import nptdms
 
         self._path = path
-        with nptdms.TdmsFile.read_metadata(path) as file:
+        with nptdms.TdmsFile.read_metadata(path, raw_timestamps=True) as file:
             channels = [channel for group in file.groups() for channel in group.channels()]
             names = [channel.name for channel in channels]
             self._places = {
@@ -440,13 +496,18 @@ class _Tdms(Source):
             }
             about = dict(zip(self._places, (channel.properties for channel in channels), strict=True))
         self.units = {name: str(found.get("unit_string", "")) for name, found in about.items()}
+        starts = {name: found["wf_start_time"] for name, found in about.items() if "wf_start_time" in found}
+        newest = max((start.seconds for start in starts.values()), default=0)  # a double resolves times since it
         self._clocks = {
-            name: Clock(float(found.get("wf_start_offset", 0.0)), float(found["wf_increment"]))
+            name: Clock(
+                float(found.get("wf_start_offset", 0.0)) + _since(starts.get(name), newest),
+                float(found["wf_increment"]),
+            )
             for name, found in about.items()
             if found.get("wf_increment")
         }
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         import nptdms
 
         with nptdms.TdmsFile.open(self._path) as file:
@@ -471,12 +532,16 @@ class _Mdf(Source):
         }
         self.units = {name: self._file.get_channel_unit(name, *place) for name, place in self._places.items()}
 
-    def read(self, names: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         return {name: self._file.get(name, *self._places[name], samples_only=True)[0] for name in names}
 
     def clock(self, name: str) -> Clock | None:
         time = self._file.get_master(self._places[name][0])
         return even_clock(np.asarray(time, np.float64), name)
+
+    def start(self, name: str) -> float | None:
+        time = self._file.get_master(self._places[name][0])
+        return float(time[0]) if time.size else None
 
 
 _FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {

@@ -181,7 +181,7 @@ class Demand:
     acceleration: float  #: largest acceleration [m/s²]
 
 
-class _ByContent:
+class ByContent:
     """Cache key of a profile, equal for profiles with equal content.
 
     Args:
@@ -193,14 +193,14 @@ class _ByContent:
         self.content = pickle.dumps(profile)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByContent) and self.content == other.content
+        return isinstance(other, ByContent) and self.content == other.content
 
     def __hash__(self) -> int:
         return hash(self.content)
 
 
 @lru_cache(maxsize=8)
-def _table(given: _ByContent) -> "ProfileTable":
+def _table(given: ByContent) -> "ProfileTable":
     """Return the table of a profile; the table of a file is also cached on disk."""
     if isinstance(given.profile, Measured):  # others vary with parameters, and a sweep would cache thousands
         return ProfileTable(given.profile, made=partial(kept, given.content))
@@ -209,7 +209,7 @@ def _table(given: _ByContent) -> "ProfileTable":
 
 def tabulated(profile: Profile) -> "ProfileTable":
     """Return the read-only table of a profile, shared by equal profiles, since computing it takes 20 ms or more."""
-    return _table(_ByContent(profile))
+    return _table(ByContent(profile))
 
 
 class ProfileTable:

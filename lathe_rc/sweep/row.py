@@ -44,6 +44,7 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.command_limits import LIMITED
+from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
@@ -171,6 +172,7 @@ class _Keeper(Errors):
         self._limited: set[str] = set()
         tools = [stage for stage in cell.stages.values() if isinstance(stage, Tool)]
         self._tolerance = tools[0].parameters.tolerance if tools else 0.0
+        self._doubt = form_doubt({n: each.parameters for n, each in cell.stages.items()}) if self._tolerance else 0.0
         self._measures = measures
         # The digest of a cell without a tool is that of what is measured.
         self._signals = {
@@ -217,7 +219,9 @@ class _Keeper(Errors):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
                 found[f"tool.{name}_errors"] = values
         if self._tolerance and not self.soundness.why:
-            found["tool.in_tolerance_from"] = judge(errors.largest, self._tolerance, self._before).since or None
+            found["tool.in_tolerance_from"] = (
+                judge(errors.largest, self._tolerance, self._before, doubt=self._doubt).since or None
+            )
         return found
 
 

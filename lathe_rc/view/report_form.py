@@ -53,6 +53,7 @@ class Form:
         tolerance: allowed form error in either direction [m]; 0: no tolerance.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
         types: message types of the bag by topic, for the signals that the form error is made of.
+        doubt: how far the desired form may be off between the points of its table [m].
 
     Attributes:
         tool, tolerance: see the arguments.
@@ -70,10 +71,11 @@ class Form:
         tool: str,
         tolerance: float = 0.0,
         nose_radius: float = 0.0,
+        doubt: float = 0.0,
         types: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._soundness = Soundness(fields_of(types, FORM))
-        self._encoder, self.tool, self.tolerance = encoder, tool, tolerance
+        self._encoder, self.tool, self.tolerance, self._doubt = encoder, tool, tolerance, doubt
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
@@ -113,7 +115,7 @@ class Form:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
         if not self.tolerance or self.refused:
             return None
-        return judge(np.array(self._largest), self.tolerance, self._before)
+        return judge(np.array(self._largest), self.tolerance, self._before, doubt=self._doubt)
 
     @property
     def growth(self) -> Growth | None:

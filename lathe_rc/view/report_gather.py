@@ -212,12 +212,14 @@ def gather(path: Path) -> Gathered:
         except InputError as error:
             unjudged = str(error)
         allowed, nose = provenance.tolerances(nodes), provenance.nose_radius(source.about)
+        doubt = provenance.doubt_of(source.about)
         forms = [
             Form(
                 encoder,
                 tool,
                 next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0),
                 nose,
+                doubt,
                 types,
             )
             for encoder in of_type(types, messages.ENCODER)[:1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export of a bag's signal topics; the memory required does not depend on the length of the bag."""
+"""Export of a bag's topics; the memory required does not depend on the length of the bag."""
 
 import os
 import re
@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.bag.exporting import message_rows
 from lathe_rc.bag.exporting.formats import FORMATS, Format, Rows
+from lathe_rc.bag.exporting.message_rows import is_known
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.reading.stream import BagHeader, feed, first_of
 from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.names import instead
 
@@ -28,17 +30,26 @@ _ROWS = 65536  # number of rows of a table collected before they are written
 
 @dataclass(frozen=True)
 class Exported:
-    """Result of an export: its path, and the number of rows by topic."""
+    """Result of an export.
+
+    Attributes:
+        place: path of the file or folder.
+        rows: number of rows by topic.
+        left_out: exported topics with samples or messages that are not in their tables, with the reason, one line each.
+        others: topics that were not asked for and are not exported.
+    """
 
     place: Path
     rows: Mapping[str, int]
+    left_out: Sequence[str] = ()
+    others: Sequence[str] = ()
 
 
 class _Table:
     """Row buffer of a topic's table, written out in batches."""
 
     def __init__(self, table: Sequence[Column], writer: Rows) -> None:
-        self.columns, self.rows = table, 0
+        self.columns, self.rows, self.messages = table, 0, 0
         self._writer = writer
         self._waiting: list[Mapping[str, Samples]] = []
         self._pending = 0
@@ -87,6 +98,7 @@ class Exporter:
         for topic, found in sparse.items():
             table = self._tables.get(full(topic))
             if table and found:
+                table.messages += len(found)
                 table.add(sparse_rows(table.columns, found, self._step_ns))
 
     def close(self) -> Mapping[str, int]:
@@ -96,18 +108,41 @@ class Exporter:
         self._target.finish()
         return {topic: table.rows for topic, table in self._tables.items()}
 
+    def left_out(self, source: Source, header: BagHeader) -> list[str]:
+        """Return what was not passed on of the blocks and messages of a bag, one line each."""
+        first, said = first_of(source), list[str]()
+        for topic, table in self._tables.items():
+            about = source.topics[topic]
+            if about.type in messages.block_types():
+                early = next((block.first_index for block in source.blocks(topic)), first)
+                if early < first:
+                    said.append(f"{topic}: samples {early} to {first - 1}, which other topics lack")
+            elif about.count > table.messages:
+                said.append(f"{topic}: {about.count - table.messages} messages at times without samples of all topics")
+        if header.left:
+            said.append(f"samples from {header.samples} on, of topics that have up to {header.left} more than others")
+        return said
+
 
 def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
-    """Return the message types of the topics to export, by name."""
-    found = sorted(source.topics.items())
-    types = {topic: said.type for topic, said in found if said.type in messages.signal_types()}
-    if not types:
-        raise InputError(f"{source.path}: no signal topics of lathe_rc; nothing to export")
+    """Return the message types of the topics to export, by name.
+
+    Without topics that are asked for: those with signals of a cell or, in a bag without blocks, all.
+    """
+    known = {topic: said.type for topic, said in sorted(source.topics.items()) if is_known(said.type)}
+    signals = {topic: kind for topic, kind in known.items() if kind in messages.signal_types()}
+    unread = {topic: said.type for topic, said in source.topics.items() if topic not in known}
     for topic in map(full, wanted):
-        if topic not in types:
-            known = instead(topic, types, listing=f"lathe bag info {source.path}")
-            raise InputError(f"--topics {topic}: not in the bag; {known}")
-    chosen = {topic: types[topic] for topic in dict.fromkeys(map(full, wanted))} or types
+        if topic in unread:
+            raise InputError(f"--topics {topic}: {shown(unread[topic])} is no type that is known here; name others")
+        if topic not in known:
+            raise InputError(
+                f"--topics {topic}: not in the bag; {instead(topic, known, listing=f'lathe bag info {source.path}')}"
+            )
+    default = signals if _step_ns(source) else known
+    chosen = {topic: known[topic] for topic in dict.fromkeys(map(full, wanted))} or default
+    if not any(source.topics[topic].count for topic in chosen):
+        raise InputError(f"{source.path}: no messages of known types in {', '.join(chosen) or 'it'}; nothing to export")
     for topic in chosen:
         if not _TOPIC.fullmatch(topic) or len(topic) > _LONGEST_TOPIC:
             raise InputError(
@@ -132,13 +167,16 @@ def _refuse_existing(place: Path) -> None:
 def export_bag(
     bag: str | os.PathLike[str], place: str | os.PathLike[str], kind: str, topics: Sequence[str] = ()
 ) -> Exported:
-    """Export signal topics of a bag to other files, atomically.
+    """Export topics of a bag to other files, atomically.
+
+    Signals of a cell have a row per sample, its messages one per message and element. Other topics, and all topics of
+    a bag without blocks, have one row per message (see `lathe_rc.bag.exporting.message_rows`).
 
     Args:
         bag: path of the bag.
         place: folder to create; for ``npz``, the file to create.
         kind: ``csv``, ``parquet`` or ``npz``.
-        topics: topics to export, with or without the leading slash; all topics if empty.
+        topics: topics to export, with or without the leading slash; if empty, all signals or, without blocks, all.
 
     Raises:
         InputError: the output exists, a topic does not exist, or the path is not a bag.
@@ -155,17 +193,23 @@ def export_bag(
         raise InputError(f"{place}: no such folder {place.absolute().parent}; make it first")
     with Source(bag) as source:
         types, step_ns = _selected(source, topics), _step_ns(source)
+        signals = {topic: kind for topic, kind in types.items() if step_ns and kind in messages.signal_types()}
+        others = [] if topics else sorted(source.topics.keys() - types.keys())
     try:
         with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.absolute().parent) as workshop:
             result = Path(workshop) / "result"
             target = FORMATS[kind](result)
             if target.folder:
                 result.mkdir()
-            exporter = Exporter(types, step_ns, target)
-            feed(bag, [exporter])
-            rows = exporter.close()
+            exporter = Exporter(signals, step_ns, target)
+            with Source(bag) as source:
+                rows = {topic: message_rows.export(source, topic, target) for topic in types if topic not in signals}
+            header = feed(bag, [exporter]) if signals else None
+            rows |= exporter.close()
+            with Source(bag) as source:
+                left_out = exporter.left_out(source, header) if header else []
             _refuse_existing(place)  # another process may have created it meanwhile; the rename would replace it
             result.rename(place)
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None
-    return Exported(place, rows)
+    return Exported(place, {topic: rows[topic] for topic in types}, left_out, others)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals of a bag as columns of a measurement: ``TOPIC.FIELD``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from lathe_rc import messages
@@ -39,8 +39,8 @@ class BagColumns(measurement_file.Source):
                         unit = columns.units(about.type).get(field, "").partition(" or ")[0]
                         self.units[f"{topic}.{field}"] = unit
 
-    def read(self, names: Sequence[str]) -> Mapping[str, Samples]:
-        """Return signals by column, shape (n,) each.
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, Samples]:
+        """Return signals by column, shape (n,) each; none has ``gaps``.
 
         Raises:
             LatheError: samples are missing or not finite.

@@ -11,7 +11,7 @@ from lathe_rc.bag import loss, provenance
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.bag.repairing.salvage import Message, Salvage
 from lathe_rc.bag.writing.writer import BagWriter, Topic, refuse_existing
-from lathe_rc.errors import LatheError, shown
+from lathe_rc.errors import InputError, LatheError, shown
 
 _CHUNK = 2**20  # [B]
 
@@ -82,6 +82,11 @@ def copy(paths: Sequence[Path], target: Path, choice: Choice) -> list[Salvage]:
     """
 
     def about(salvages: Sequence[Salvage]) -> dict[str, str]:
+        if not any(each.saved for each in salvages):
+            raise InputError(
+                f"no message of {', '.join(map(str, paths))} is chosen; allowed: topics and times with some (lathe bag "
+                "info)"
+            )
         of = ", ".join(_copied_of(salvage) for salvage in salvages)
         abouts = [each.about for each in salvages]
         before = abouts[0] if len(abouts) == 1 else loss.together(abouts)

@@ -15,12 +15,14 @@ from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.signals.counts import CountedAngle, CsvReader
+from lathe_rc.signals import count_checks
+from lathe_rc.signals.counts import MOST_COUNT, CountedAngle, CsvReader, Reading
 
 TOO_FAST, TOO_SLOW, LATE = "too fast", "too slow", "late"  #: events that come about by themselves
 
 _TURN = 2.0 * np.pi
 _RPM = 30.0 / np.pi  # rpm per rad/s
+_FEWEST = 8  # readings of a file whose speed is looked at
 
 
 class EncoderDeviceParameters(TimeMasterParameters):
@@ -50,12 +52,18 @@ class EncoderDeviceParameters(TimeMasterParameters):
     )
     baud_rate: Annotated[int, Ge(50)] = parameter(115200, "line: speed of a terminal, in baud", "1/s")
     counts_file: str = parameter(
-        "", "file: CSV file with time_ns,counts or time_s,counts (edge_clock: and edge_ns)", path=True
+        "",
+        "file: CSV file with time_ns,counts or time_s,counts (edge_clock: and edge_ns), perhaps also index_counts or "
+        "index_ns",
+        path=True,
     )
     counter_range: Annotated[int, Ge(0)] = parameter(0, "the counter begins anew after so many counts; 0: never")
     inverted: bool = parameter(default=False, doc="the counter counts down while the spindle turns forward")
     max_reverse: NonNegative = parameter(
         2.0, "counts that the counter may go back by; the angle stands still meanwhile"
+    )
+    max_forward: NonNegative = parameter(
+        0.1, "angle that the counter may run ahead of a spindle at twice the nominal speed; more is an error", "rad"
     )
     max_gap: Positive = parameter(0.01, "longest time between two readings; a longer one is an error", "s")
     max_silence: Positive = parameter(1.0, "topic, line: longest wall time without a reading; longer is an error", "s")
@@ -92,6 +100,7 @@ class EncoderDevice(TimeMaster):
         self._revolution = -1.0
         self._told: set[str] = set()
         self._told_late = 0
+        self._doubts: list[str] = []
         self._check()
         if not self.live:
             self._read(resources.find(Path(parameters.counts_file)))
@@ -117,22 +126,50 @@ class EncoderDevice(TimeMaster):
             )
 
     def _read(self, path: Path) -> None:
+        reader = CsvReader(path)
+        self._check_edges(path, timed=reader.timed)
+        readings = list(reader.read())
         try:
-            reader = CsvReader(path)
-            self._check_edges(path, timed=reader.timed)
-            for reading in reader.read():
-                self.counted.add(*reading)
-        except InputError:
-            raise
-        except LatheError as error:
+            self._check_file(reader, readings)
+        except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        if self.counted.late:
-            raise InputError(
-                f"{path}: {self.counted.late} readings are not later than those before them; allowed: times that rise"
-            )
+        for place, reading in enumerate(readings):
+            try:
+                self.counted.add(*reading)
+            except LatheError as error:
+                raise InputError(f"{path}:{reader.numbers[place]}: {error}{reader.torn(place)}") from None
+            if self.counted.late:
+                late = "a reading that is not later than the one before; allowed: times that rise"
+                raise InputError(f"{path}:{reader.numbers[place]}: {late}{reader.torn(place)}")
         self.end()
         if self.samples is None:
             raise InputError(self._too_short(str(path)))
+
+    def _check_file(self, reader: CsvReader, readings: Sequence[Reading]) -> None:
+        """Check stamps, speed and index pulses of a file, and turn its angle to the index.
+
+        Raises:
+            InputError: they contradict the parameters.
+        """
+        parameters, shared = self.parameters, self.shared
+        times, counts = [reading[0] for reading in readings], [reading[1] for reading in readings]
+        if len(readings) < _FEWEST or not all(abs(count) <= MOST_COUNT for count in counts):
+            return  # adding the readings tells what is wrong
+        time = np.array([at - times[0] for at in times], dtype=float) * 1e-9
+        wraps, inverted, of = parameters.counter_range, parameters.inverted, parameters.counts_per_revolution
+        turned = count_checks.turned_by(counts, wraps, inverted=inverted)
+        count_checks.check_stamps(time, turned)
+        speed = count_checks.typical_speed(time, turned, of, shared.nominal_speed / _TURN)
+        doubt = ""
+        if speed is not None:
+            doubt = count_checks.check_speed(60.0 * speed, shared.nominal_rpm, of, parameters.max_deviation)
+        if reader.index:
+            timed = reader.index != "counts"
+            at = count_checks.index_counts(reader.pulses, times, counts, turned, wraps, timed=timed, inverted=inverted)
+            few = count_checks.check_index(at, of, parameters.max_reverse)
+            doubt = f"{few}; {doubt}".rstrip("; ") if few else ""
+            self.counted.zero = float(at[0]) if at.size else None
+        self._doubts = [f"{self.name}.counts_file = {parameters.counts_file}: {doubt}"] if doubt else []
 
     def _check_edges(self, path: Path, *, timed: bool) -> None:
         """Check that a file has the times of edges if, and only if, their resolution is given."""
@@ -152,6 +189,10 @@ class EncoderDevice(TimeMaster):
             f"{what} ends at {self.counted.time:.6g} s, after {at_most(self.counted.angle / _TURN)} revolutions; "
             f"{self.name}.revolutions = {self.parameters.revolutions:g}, allowed: up to that, or 0 for all there is"
         )
+
+    def warnings(self, seconds: float) -> list[str]:
+        """Return the warnings about the file of counts."""
+        return self._doubts
 
     # ---- readings -----------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Ge, Le, Lt
 
 from lathe_rc import messages, resources
+from lathe_rc.analysis.tolerance import DOUBTED
 from lathe_rc.arrays import put
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Value, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
@@ -17,12 +18,14 @@ from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
+from lathe_rc.signals.interpolation_doubt import Doubt, doubt
 from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
 from lathe_rc.signals.part_profile import PartProfile, checked
 from lathe_rc.signals.profile import Harmonics, Piston, Polygon, Profile
 from lathe_rc.signals.profile_table import ProfileTable, deviation_along, height_along, tabulated
 from lathe_rc.signals.tip_path import TipPath
 
+_DOUBTED = 1e-3  # part of the form's height from which its doubt is told without a tolerance
 _OWN = ("harmonics", "piston", "polygon", "csv")
 #: third-party profiles, by name; built-in profiles have parameters of their own
 PROFILES: Registry[PartProfile] = Registry("profile", PartProfile, {}, "lathe_rc.profiles")
@@ -109,6 +112,15 @@ class FormParameters(NodeParameters):
         with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
+    def doubt(self, node: str) -> Doubt:
+        """Return how far the form of a node may be off between the points or rows of its table.
+
+        Raises:
+            InputError: as for `form`.
+        """
+        with code_of_others(f"{node}.profile = {self.profile!r}"):
+            return doubt(self.form(node))
+
     def programmed_form(self, node: str) -> Measured | None:
         """Return the programmed form of the controllers of a node; None: the form itself.
 
@@ -119,6 +131,12 @@ class FormParameters(NodeParameters):
             return None
         with about(node, "programmed_file"):
             return read_csv(resources.find(Path(self.programmed_file)))
+
+
+def form_doubt(nodes: Mapping[str, NodeParameters]) -> float:
+    """Return how far the form of a scenario may be off between the points of its table [m]; 0 without a form."""
+    owner = next(((n, t) for n, t in nodes.items() if isinstance(t, FormParameters) and t.known()), None)
+    return owner[1].doubt(owner[0]).whole if owner else 0.0
 
 
 FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters
@@ -209,6 +227,7 @@ class Form:
         inputs: input ports.
         table: table for `evaluate`.
         doubts: warnings about the files of the form, one line each.
+        doubt: error of the interpolation of the form.
 
     Raises:
         InputError: as for `FormParameters.form`, or the tip does not fit the form, or a slide would have to restart.
@@ -226,6 +245,9 @@ class Form:
             if isinstance(read, Measured)
             for doubt in doubts(read)
         ]
+        self.doubt = parameters.doubt(node)
+        file = parameters.profile_file if parameters.profile == "csv" else ""
+        self._named = f"profile_file = {file}" if file else f"profile = {parameters.profile}"
         self.surface = path = tabulated(form)
         self.profile = path if programmed is None else tabulated(programmed)
         if parameters.tip_radius:
@@ -249,6 +271,25 @@ class Form:
             self.inputs.append(Input("longitudinal/state", messages.STATE, ("position", "measured_position")))
             if parameters.part_revolutions:
                 raise InputError(f"{node}.part_revolutions with height_from = slide; allowed: 0, a slide does not jump")
+
+    def warnings(self, node: str, tolerance: float) -> list[str]:
+        """Return the warnings about the form of a node, one line each; ``tolerance``: of the form [m], 0 for none."""
+        across, along = self.doubt
+        told = []
+        if np.isnan(across) or np.isnan(along):
+            few = f"{self.surface.heights.size} heights" if np.isnan(along) else "so few angles"
+            told.append(f"{few}: nothing shows how far the form between them is from what was meant")
+        stroke = float(np.ptp(self.surface.table[..., 3]))
+        if self.doubt.whole > (DOUBTED * tolerance or _DOUBTED * stroke):
+            allowed = f" (tolerance: ±{tolerance * 1e6:.4g} µm)" if tolerance else ""
+            parts = {"angles": across, "heights": along}
+            off = [
+                f"{each * 1e6:.3g} µm off between its {of}"
+                for of, each in parts.items()
+                if each > 0.01 * self.doubt.whole
+            ]
+            told.append(f"the form may be {' and '.join(off)}{allowed}: more of them help")
+        return [*self.doubts, *(f"{node}.{self._named}: {text}" for text in told)]
 
 
 @kernel
@@ -280,8 +321,8 @@ class ProfileStage(Stage):
         )
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the file of the form, one line each."""
-        return self.form.doubts
+        """Return the warnings about the form, one line each."""
+        return self.form.warnings(self.name, 0.0)
 
     @property
     def memory(self) -> FormTable:

@@ -164,8 +164,8 @@ class Tool(Stage):
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
-        """Return the warnings about the file of the form, one line each."""
-        return self.form.doubts if self.form else []
+        """Return the warnings about the form, one line each."""
+        return self.form.warnings(self.name, self.parameters.tolerance) if self.form else []
 
     def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
         """Check that the first drive can follow the profile and that the flank does not rub."""
