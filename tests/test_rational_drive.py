@@ -7,8 +7,10 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 import lathe_rc
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.plants.modes import Modes, carriage
 from lathe_rc.plants.tool_drive import ToolDrive
@@ -30,7 +32,8 @@ def response(modes, place, angular=ANGULAR):
     p = 1j * angular
     parts = getattr(modes, place)
     velocities = modes.velocity or (0.0,) * len(parts)
-    own_velocity = -(np.dot(velocities, modes.frequency) + sum(r / t for r, t in zip(modes.lag, modes.lag_time))) / LOOP[0]
+    rates = sum(r / t for r, t in zip(modes.lag, modes.lag_time, strict=True))
+    own_velocity = -(np.dot(velocities, modes.frequency) + rates) / LOOP[0]
     sections = [(*LOOP, 1.0 - sum(parts) - sum(modes.lag), own_velocity)]
     sections += list(zip(modes.frequency, modes.damping, parts, velocities, strict=True))
     value = sum((e + v * p / w) / (1.0 + 2.0 * z * p / w + (p / w) ** 2) for w, z, e, v in sections)
@@ -80,8 +83,6 @@ def test_drive_is_exact_for_commands_linear_between_samples(modes, gain):
 
 @pytest.mark.parametrize("gain", [0.5, -2.0])
 def test_coupled_drives_have_the_gain_with_and_without_a_current_loop(gain):
-    from lathe_rc.plants.coil import Coil
-
     coil = Coil(resistance=2.0, inductance=2e-3, bandwidth=12e3, back_emf=True, current_limit=np.inf,
                 voltage_limit=np.inf, slew_rate=np.inf)  # fmt: skip
     for each in (None, coil):
@@ -98,7 +99,9 @@ def test_laws_take_the_second_order_drive_of_low_frequencies():
     ratio = LOOP[0] * LAG
     below = 1.0 - 2.0 * LOOP[1] * ratio + ratio**2  # of the loop at the real pole
     modes = Modes(lag_time=(LAG,), lag=(ratio**2 / below,))
-    product = 1.0 / ((1.0 + 2.0 * LOOP[1] * 1j * ANGULAR / LOOP[0] - (ANGULAR / LOOP[0]) ** 2) * (1.0 + 1j * ANGULAR * LAG))
+    product = 1.0 / (
+        (1.0 + 2.0 * LOOP[1] * 1j * ANGULAR / LOOP[0] - (ANGULAR / LOOP[0]) ** 2) * (1.0 + 1j * ANGULAR * LAG)
+    )
     assert_allclose(response(modes, "sensor"), product, rtol=1e-9)
     frequency, damping = modes.model(*LOOP)
     assert_allclose(2.0 * damping / frequency, 2.0 * LOOP[1] / LOOP[0] + LAG)
@@ -125,8 +128,6 @@ def test_margin_and_run_have_the_gain_and_a_wrong_sign_diverges():
 
 
 def test_lost_members_make_a_drive_go_to_its_safe_position_whatever_its_gain():
-    from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
-
     for gain in (1.0, -0.5):
         drive = ElectrodynamicActuator("drive", ElectrodynamicActuatorParameters(gain=gain))
         drive.go_safe()
@@ -144,8 +145,8 @@ def test_retraction_by_the_law_has_the_sign_of_the_drive():
 @pytest.mark.parametrize(
     ("scenario", "changes", "said"),
     [
-        ("piston", ["electrodynamic_actuator.gain=0"], "electrodynamic_actuator.gain = 0; allowed: of either sign, not 0"),
-        ("piston", ["electrodynamic_actuator.lag_participation=[0.1]"], r"lags: lengths \[0, 1\]; allowed: as many of each"),
+        ("piston", ["electrodynamic_actuator.gain=0"], "actuator.gain = 0; allowed: of either sign, not 0"),
+        ("piston", ["electrodynamic_actuator.lag_participation=[0.1]"], r"lags: lengths \[0, 1\]; allowed: as many"),
         ("robust_cutting", ["loaded_drive.coarse_lag_time=[1e-3]", "loaded_drive.coarse_lag_participation=[0.1]"],
          "mode_velocity and lag_time say how the drive follows its command, not how it gives way to a force"),
     ],

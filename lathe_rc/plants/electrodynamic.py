@@ -107,7 +107,9 @@ def _advance_modes(
         state[0], state[1] = between_stops(state[0], state[1], drive.stroke)
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k], sensed[k] = state[drive.edge], state[drive.edge + 1], state[0]
-        current[k] = (drive.spring * (drive.gain * delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        current[k] = (
+            drive.spring * (drive.gain * delayed - state[0]) - drive.damper * state[1]
+        ) * drive.force_per_current
     put(drive.line, sent[command.size :])
 
 

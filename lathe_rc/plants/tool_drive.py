@@ -15,10 +15,10 @@ the position loop acts on its sensor. The coil's current i is set by the drive's
 
     i* = (m/k)·(ω1²·(g·u(t - τ) - x1) - 2ζ1ω1·x1')
 
-with M alone, where only the command is delayed; the gain g is 1 in the papers. The current follows either at once (``coil=None``: the second-order
-drive of papers 000 and 001, bit-identical without force), or by a current loop. That loop is sampled with the step of
-the cell (`lathe_rc.plants.coil`): from the state of a sample it computes the voltage U that is held until the next
-one,
+with M alone, where only the command is delayed; the gain g is 1 in the papers. The current follows either at once
+(``coil=None``: the second-order drive of papers 000 and 001, bit-identical without force), or by a current loop. That
+loop is sampled with the step of the cell (`lathe_rc.plants.coil`): from the state of a sample it computes the voltage U
+that is held until the next one,
 
     L·di/dt = U - R·i - k·x1'
 
@@ -162,7 +162,8 @@ class ToolDrive:
 
     Raises:
         InputError: the current loop is too fast for the step, it oscillates, or there are modes beside it; the modes
-            are not normal, so that their motion under a force is unknown; direct compensation would oscillate, or the step is too coarse for it.
+            are not normal, so that their motion under a force is unknown; direct compensation would oscillate, or the
+            step is too coarse for it.
     """
 
     def __init__(
