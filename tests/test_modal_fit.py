@@ -315,12 +315,12 @@ def test_reversed_phase_and_inverse_are_refused_with_their_cure(tmp_path):
     """The cure cures."""
     random, frequency = np.random.default_rng(12), TURN * np.linspace(5.0, 800.0, 120)
     value = shown(random, replace(PLAIN, gain=0.8).response(frequency))
-    done = lathe(tmp_path, points_of(tmp_path, "turned", value.conj(), frequency))
+    done = lathe(tmp_path, points_of(tmp_path, "turned", value.conj(), frequency), "--modes", 0)
     assert (done.exit_code, done.stdout) == (2, "")
     cure = re.search(r"convention exp\(-jωt\); allowed: exp\(jωt\) \(--column (\S+)\)", done.stderr)[1]
-    done = lathe(tmp_path, tmp_path / "turned.csv", "--column", cure, "--json")
+    done = lathe(tmp_path, tmp_path / "turned.csv", "--column", cure, "--modes", 0, "--json")
     assert json.loads(done.stdout)["parameters"]["gain"] == pytest.approx(0.8, rel=1e-2)
-    done = lathe(tmp_path, points_of(tmp_path, "inverse", 1.0 / value, frequency))
+    done = lathe(tmp_path, points_of(tmp_path, "inverse", 1.0 / value, frequency), "--modes", 0)
     assert done.exit_code == 2
     assert "inverse.csv: the response is the inverse of that of a drive" in done.stderr
 
@@ -332,15 +332,17 @@ def test_swapped_columns_and_a_reversed_sensor_of_a_record_are_recognised(tmp_pa
     rows = np.stack((np.arange(command.size) * STEP, command, response), axis=1)
     for name, header in (("swapped", "time,response,command"), ("record", "time,command,response")):
         np.savetxt(tmp_path / f"{name}.csv", rows, "%.12g", ",", header=header, comments="")
-    done = lathe(tmp_path, tmp_path / "swapped.csv", "--band", "5:800")
+    done = lathe(tmp_path, tmp_path / "swapped.csv", "--band", "5:800", "--modes", 0)
     assert done.exit_code == 2
     cure = re.search(r"command and position are swapped; allowed: (.*)\n", done.stderr)[1].split()
-    done = lathe(tmp_path, tmp_path / "swapped.csv", "--band", "5:800", *cure)
+    done = lathe(tmp_path, tmp_path / "swapped.csv", "--band", "5:800", "--modes", 0, *cure)
     assert done.exit_code == 0, done.stderr
     gain, hint = re.search(r"gain: (\S+) .*(--column \S+)\)", done.stdout).groups()
     assert float(gain) == pytest.approx(-1.4, rel=1e-2)
     assert hint == "--column response=command:-1"
-    done = lathe(tmp_path, tmp_path / "record.csv", "--band", "5:800", "--column", "response=response:-1", "--json")
+    done = lathe(
+        tmp_path, tmp_path / "record.csv", "--band", "5:800", "--modes", 0, "--column", "response=response:-1", "--json"
+    )
     assert json.loads(done.stdout)["parameters"]["gain"] == pytest.approx(1.4, rel=1e-2)
 
 
@@ -348,7 +350,7 @@ def test_a_fit_beyond_its_bound_is_shown_and_writes_nothing(tmp_path):
     """A response that no drive has: exit code 1, with its figures."""
     random, frequency = np.random.default_rng(14), TURN * np.linspace(5.0, 2500.0, 60)
     value = PLAIN.response(frequency) * np.exp(0.5 * random.normal(size=(2, 60)).T @ [1.0, 1j])
-    done = lathe(tmp_path, points_of(tmp_path, "wild", value, frequency))
+    done = lathe(tmp_path, points_of(tmp_path, "wild", value, frequency), "--modes", 0)
     assert done.exit_code == 1
     assert "error of the model beyond the noise" in done.stdout
     assert re.search(r"wild.csv: fit: .*; allowed: .*; nothing is written\n", done.stderr)
@@ -392,7 +394,7 @@ def test_set_of_several_measurements_covers_all_of_them(tmp_path):
     ]
     (tmp_path / "drive.points-3.csv").write_text("old")
     (tmp_path / "drive.points-mine.csv").write_text("kept")
-    done = lathe(tmp_path, *files, "--json", "--drives", 4)
+    done = lathe(tmp_path, *files, "--modes", 0, "--json", "--drives", 4)
     assert done.exit_code == 0, done.stderr
     (table_of,) = yaml.safe_load((tmp_path / "drive.yaml").read_text()).values()
     assert table_of["ros__parameters"]["natural_frequency"] == pytest.approx(TURN * 160.0, rel=1e-3)
