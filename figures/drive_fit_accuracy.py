@@ -38,7 +38,7 @@ def measured(drive: ModalDrive, frequency: Array, random: np.random.Generator, a
     """H1 estimate at frequencies [rad/s] of white noise at 60 dB whose coherence falls to 0.85 at the modes."""
     response, shape = drive.response(frequency), (averages, frequency.size)
     coherence = np.full(frequency.size, 1.0 / (1.0 + 1e-6))
-    for mode, damping, _ in drive.modes:
+    for mode, damping, *_ in drive.modes:
         coherence *= 1.0 - 0.15 / (1.0 + ((frequency - mode) / (2.0 * damping * mode)) ** 2)
     u, noise = (random.normal(size=shape) + 1j * random.normal(size=shape) for _ in range(2))
     y = response * u + np.abs(response) * np.sqrt((1.0 - coherence) / coherence) * noise
@@ -49,13 +49,13 @@ def measured(drive: ModalDrive, frequency: Array, random: np.random.Generator, a
 
 def simulated(drive: ModalDrive, command: Array, hold: str = "foh") -> Array:
     """Exact position [m] of a drive whose delay is a whole number of samples, from its command [m]."""
-    shares = [(drive.natural_frequency, drive.damping, 1.0 - sum(drive.mode_participation)), *drive.modes]
     position = np.zeros(command.size)
-    for frequency, damping, share in shares:
+    for frequency, damping, share, velocity in drive.sections:
         part = np.empty(command.size)
         bottom = (1.0, 2.0 * damping * frequency, frequency**2)
-        LinearSystem(TransferFunction((frequency**2,), bottom), STEP, hold).block(command, part)
-        position += share * part
+        top = (velocity * frequency, share * frequency**2)
+        LinearSystem(TransferFunction(top, bottom), STEP, hold).block(command, part)
+        position += drive.gain * part
     late = round(drive.delay / STEP)
     return np.concatenate((np.zeros(late), position[: position.size - late]))
 

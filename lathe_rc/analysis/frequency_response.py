@@ -74,6 +74,7 @@ class FrequencyResponse:
         spread: standard deviation of the frequencies over which each value is an average [rad/s], shape (n,); None: 0.
         sampling: sampling frequency whose images of the response the values contain [rad/s]; 0: none.
         holding: power with which the hold of the command lowers the images: 1 held, 2 linear.
+        left_out: which points of the measurement are left out and why, in words.
 
     Raises:
         InputError: the arrays are not such a response.
@@ -87,6 +88,7 @@ class FrequencyResponse:
     spread: Array | None = None
     sampling: float = 0.0
     holding: int = 0
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         frequency, count = self.frequency, self.frequency.size
@@ -138,6 +140,7 @@ class FrequencyResponse:
             None if self.spread is None else self.spread[kept],
             self.sampling,
             self.holding,
+            self.left_out,
         )
 
     def within(self, low: float, high: float) -> "FrequencyResponse":
@@ -308,7 +311,10 @@ def estimate(
     width = 2.0 * np.pi / (window.size * step)
     offset = sums.offset[bins] / power_u[bins]
     spread = np.sqrt(np.maximum(sums.offset_square[bins] / power_u[bins] - offset**2, 0.0))
-    sure &= (np.abs(offset) < _NEXT) & (spread < _FAR)  # otherwise it shows other bins
+    own = (np.abs(offset) < _NEXT) & (spread < _FAR)  # otherwise it shows other bins
+    left_out = _left_out("bins", frequency[bins], ~sure, "incoherent with the command there")
+    left_out += _left_out("bins", frequency[bins], sure & ~own, "the command moves at neighbouring frequencies instead")
+    sure &= own
     bins, coherence, offset, spread = bins[sure], coherence[sure], offset[sure], spread[sure] * width
     if bins.size < LEAST:
         raise _too_few(bins.size)
@@ -323,7 +329,17 @@ def estimate(
         None if period else spread,
         0.0 if hold == "none" else 2.0 * np.pi / step,
         2 if hold == "linear" else 1,
+        left_out,
     )
+
+
+def _left_out(kind: str, frequency: Array, where: npt.NDArray[np.bool_], reason: str) -> tuple[str, ...]:
+    """Return how many of the frequencies [Hz] are left out, from which to which, and why; empty if none is."""
+    if not where.any():
+        return ()
+    low, high = frequency[where].min(), frequency[where].max()
+    between = f"at {low:.4g} Hz" if low == high else f"between {low:.4g} and {high:.4g} Hz"
+    return (f"{np.count_nonzero(where)} of {where.size} {kind} left out, {between}: {reason}",)
 
 
 def _too_few(frequencies: int) -> InputError:
@@ -396,8 +412,11 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
         known = "no coherence" if coherence is None else "a relative_uncertainty"
         raise InputError(f"{measurement.name}: --averages of a response with {known}; allowed: with a coherence alone")
     count = AVERAGES if averages is None else averages
+    left_out = _left_out("points", frequency, frequency <= 0.0, "no response at 0 Hz")
     if coherence is not None:
-        kept = kept[coherence[kept] >= _LEAST_COHERENCE]
+        low = coherence[kept] < _LEAST_COHERENCE
+        left_out += _left_out("points", frequency[kept] / (2.0 * np.pi), low, f"coherence below {_LEAST_COHERENCE:g}")
+        kept = kept[~low]
     if given is not None:
         deviation = np.maximum(given, _LEAST_DEVIATION)
     elif coherence is not None:
@@ -411,6 +430,7 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
             None if deviation is None else deviation[kept],
             None if coherence is None else coherence[kept],
             0.0 if coherence is None or given is not None else count,
+            left_out=left_out,
         )
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command ``lathe fit drive``: delay, second order and modes of a drive from a measurement."""
+"""Command ``lathe fit drive``: gain, delay, second order, modes and lags of a drive from measurements."""
 
 import csv
+import glob
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 import numpy as np
@@ -16,12 +18,13 @@ from lathe_rc import files
 from lathe_rc.analysis import drive_measurement, frequency_response, modal_fit
 from lathe_rc.analysis.frequency_response import Hold
 from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.analysis.modal_fit import ModalFit, ResponseData, StepData
+from lathe_rc.analysis.modal_fit import ModalFit, NoFitError, ResponseData, StepData, Structure
 from lathe_rc.arrays import Array
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture, tables
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.signals.measurement_file import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 
 _TURN = 2.0 * np.pi
 _NOTHING = 1e-6  # relative error of a model
+_FAR_BETTER = 0.3  # error of a fit over that of the response as it is given
+_ALIKE = 3  # structures whose BIC is printed
 _OCTAVES = 8  # of the table of residuals; the last one has all that is below
 _GREY, _RED, _BLUE = "#7f7f7f", "#c0392b", "#1f6f8b"
 _NODE = ElectrodynamicActuator.kind
@@ -49,7 +54,7 @@ def _band(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tu
 
 
 @click.command("drive")
-@measured_options.argument
+@click.argument("measured", type=options.PATH, nargs=-1, required=True)
 @measured_options.columns
 @click.option("--rate", type=options.POSITIVE, help="sampling frequency of a record without time [Hz]")
 @click.option(
@@ -69,14 +74,14 @@ def _band(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tu
 )
 @click.option("--modes", type=click.IntRange(0, 24), help="number of modes; default: that of the least BIC")
 @click.option(
-    "--drives", type=click.IntRange(1, 4096), default=32, show_default=True, help="of the set, beside the fit"
+    "--drives", type=click.IntRange(1, 4096), default=32, show_default=True, help="of the set, beside each fit"
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="of the set")
 @click.option("-o", "--output", type=options.PATH, default=Path("drive.yaml"), show_default=True, help="parameter file")
 @click.option("--figure", type=options.PATH, default=Path("fit-drive.png"), show_default=True)
 @options.as_json
 def drive(
-    measured: Path,
+    measured: tuple[Path, ...],
     columns: tuple[str, ...],
     rate: float | None,
     hold: Hold,
@@ -91,43 +96,108 @@ def drive(
     *,
     as_json: bool,
 ) -> None:
-    """Delay, second order and modes of an electrodynamic drive (docs/drives.md).
+    """Gain, delay, second order, modes and lags of an electrodynamic drive (docs/drives.md).
 
     MEASURED is a bag, or a file (CSV, Parquet, .mat, TDMS, MDF) with time,response of a step of 1; with
     time,command,response of a record; or with frequency and magnitude,phase or real,imaginary. A unit may follow:
-    time_ms, command_um.
+    time_ms, command_um. The parameters are those of the first one; the set of drives covers several, which may be
+    measured in different states.
     """
     picture.check_place(figure)
     files.check_place("--output", output)
-    data = drive_measurement.data(
-        measured_options.opened(measured, columns),
-        rate=rate, hold=hold, resolution=resolution, averages=averages, band=band,
-    )  # fmt: skip
-    try:
-        if isinstance(data, ResponseData):
-            modal_fit.refuse_other_gain(data)
-        fit = modal_fit.fit(data, modes=modes)
-    except InputError as error:
-        raise InputError(f"{measured}: {error}") from None
+    found: list[_Measured] = []
+    for path in measured:
+        measurement = measured_options.opened(path, columns)
+        data = drive_measurement.data(
+            measurement, rate=rate, hold=hold, resolution=resolution, averages=averages, band=band
+        )
+        try:
+            if isinstance(data, ResponseData):
+                modal_fit.refuse_other_gain(data)
+            fit = modal_fit.fit(data, modes=modes)
+        except LatheError as error:
+            if cure := _cure(measurement, data, modes, error):
+                raise InputError(f"{path}: {cure}") from None
+            if not isinstance(error, NoFitError):
+                raise type(error)(f"{path}: {error}") from None
+            _tell([*found, _Measured(path, measurement, data, error.fit)], {}, chosen=modes is None, as_json=as_json)
+            raise LatheError(f"{path}: {error}; nothing is written") from None
+        found.append(_Measured(path, measurement, data, fit))
     places = {"parameters": output, "drives": output.with_suffix(".drives.csv")}
-    if isinstance(data, ResponseData):
-        places["points"] = output.with_suffix(".points.csv")
-    comment = f"{measured}: {_count(fit)}"
-    files.write(places["parameters"], _parameter_file(fit, comment))
-    files.write(places["drives"], _drives_file(fit.drives(drives, seed)))
-    if isinstance(data, ResponseData):
-        frequency_response.write_points(places["points"], _unsmoothed(data, fit), _uncertainty(data, fit), comment)
-    _draw(figure, data, fit)
-    places["figure"] = figure
+    files.write(places["parameters"], _parameter_file(found[0].fit, found[0].comment))
+    files.write(places["drives"], _drives_file([each for one in found for each in one.fit.drives(drives, seed)]))
+    places |= _write_points(found, output)
+    for number, one in enumerate(found, 1):
+        place = figure if number == 1 else figure.with_stem(f"{figure.stem}-{number}")
+        _draw(place, one.data, one.fit)
+        places["figure" if number == 1 else f"figure-{number}"] = place
+    _tell(found, places, chosen=modes is None, as_json=as_json)
+
+
+class _Measured(NamedTuple):
+    """Measurement of a drive with its fit."""
+
+    path: Path
+    measurement: Measurement
+    data: ResponseData | StepData
+    fit: ModalFit
+
+    @property
+    def comment(self) -> str:
+        """First line of the files."""
+        return f"{self.path}: {_count(self.fit)}"
+
+
+def _cure(measurement: Measurement, data: ResponseData | StepData, modes: int | None, error: LatheError) -> str:
+    """Return why the response is another one than that of position to command, and the cure; empty: it is not known."""
+    if not isinstance(data, ResponseData):
+        return ""
+    record = "frequency" not in measurement
+    limit = _FAR_BETTER * error.fit.model_error if isinstance(error, NoFitError) else np.inf
+    if modal_fit.swapped(data, modes, limit):
+        cure = measurement.swapped("command", "response") if record else "the position over the command"
+        return f"the response is the inverse of that of a drive: command and position are swapped; allowed: {cure}"
+    if not record and modal_fit.reversed_phase(data, modes, limit):
+        turned = next((name for name in ("phase", "imaginary") if name in measurement), "")
+        cure = measurement.negative(turned) if turned else "its conjugate"
+        return f"the phase rises with frequency, in the convention exp(-jωt); allowed: exp(jωt) ({cure})"
+    return ""
+
+
+def _write_points(found: Sequence[_Measured], output: Path) -> dict[str, Path]:
+    """Write the points of each response beside the parameters, in place of those of earlier fits; return the files."""
+    for old in output.parent.glob(f"{glob.escape(output.stem)}.points*.csv"):
+        if re.fullmatch(r"\.points(-\d+)?\.csv", old.name.removeprefix(output.stem)):
+            old.unlink()
+    places: dict[str, Path] = {}
+    for one in found:
+        if isinstance(one.data, ResponseData):
+            name = f"points-{len(places) + 1}" if places else "points"
+            places[name] = output.with_suffix(f".{name}.csv")
+            uncertainty = _uncertainty(one.data, one.fit)
+            frequency_response.write_points(places[name], _unsmoothed(one.data, one.fit), uncertainty, one.comment)
+    return places
+
+
+def _tell(found: Sequence[_Measured], places: dict[str, Path], *, chosen: bool, as_json: bool) -> None:
+    """Print the results."""
     if as_json:
-        click.echo(json.dumps(_summary(data, fit, places)))
-    else:
-        _show(data, fit, places, chosen=modes is None)
+        first, *further = (_summary(one.data, one.fit) for one in found)
+        click.echo(
+            json.dumps({**first, "further": further, "files": {name: str(path) for name, path in places.items()}})
+        )
+        return
+    out = tables.console()
+    for one in found:
+        if len(found) > 1:
+            out.print(f"{one.path}:")
+        _show(one, chosen=chosen)
+    for name, path in places.items():
+        out.print(f"{name + ':':12}{path}")
 
 
 def _count(fit: ModalFit) -> str:
-    count = len(fit.drive.mode_frequency)
-    return f"{count} {'mode' if count == 1 else 'modes'}"
+    return str(Structure.of(fit.drive))
 
 
 def _parameter_file(fit: ModalFit, comment: str) -> str:
@@ -140,8 +210,9 @@ def _drives_file(drives: Sequence[ModalDrive]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     rows = [drive.parameters() for drive in drives]
-    writer.writerow(f"{_NODE}.{name}" for name in rows[0])
-    writer.writerows(row.values() for row in rows)
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer.writerow(f"{_NODE}.{name}" for name in names)
+    writer.writerows([row.get(name, []) for name in names] for row in rows)
     return text.getvalue()
 
 
@@ -182,55 +253,74 @@ def _missed(data: ResponseData, fit: ModalFit) -> list[dict[str, float]]:
     return rows
 
 
-def _summary(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path]) -> dict[str, Any]:
+def _summary(data: ResponseData | StepData, fit: ModalFit) -> dict[str, Any]:
     """Return the results as JSON, in SI units."""
     return {
         "parameters": fit.drive.parameters(),
         "standard_error": fit.errors.parameters(),
         "modes": len(fit.drive.mode_frequency),
-        "bic": list(fit.bic),
+        "bic": {str(structure): value for structure, value in fit.bic.items()},
         "model_error": fit.model_error,
         "averages": data.measured.averages if isinstance(data, ResponseData) else None,
+        "left_out": list(data.measured.left_out) if isinstance(data, ResponseData) else None,
         "missed": _missed(data, fit) if isinstance(data, ResponseData) else None,
-        "files": {name: str(path) for name, path in places.items()},
+        "between_points": list(fit.unresolved),
     }
 
 
-def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path], *, chosen: bool) -> None:
-    """Print the results."""
-    out = tables.console()
+def _show(one: _Measured, *, chosen: bool) -> None:
+    """Print the results of a measurement."""
+    out, data, fit = tables.console(), one.data, one.fit
     if isinstance(data, ResponseData):
         measured = data.measured
         band = f"{measured.frequency[0] / _TURN:.4g} to {measured.frequency[-1] / _TURN:.4g} Hz"
         averages = f", {measured.averages:.3g} averages" if measured.averages else ""
         out.print(f"frequency response: {measured.frequency.size} points from {band}{averages}")
+        for line in measured.left_out:
+            out.print(line)
     else:
         out.print(f"step response: {data.time.size} samples")
-    table = tables.table("", "frequency [Hz]", "damping", "participation", "delay [µs]", left=1)
     drive, errors = fit.drive, fit.errors
+    velocities = ["velocity"] if drive.mode_velocity else []
+    table = tables.table("", "frequency [Hz]", "damping", "participation", *velocities, "delay [µs]", left=1)
 
     def told(value: float, error: float, digits: int = 5) -> str:
         return f"{value:#.{digits}g} ± {error:.1g}"
 
+    _, _, own, own_velocity = drive.sections[0]
     table.add_row(
         "drive",
         told(drive.natural_frequency / _TURN, errors.natural_frequency / _TURN),
         told(drive.damping, errors.damping, 4),
-        f"{1.0 - sum(drive.mode_participation):.4g}",
+        f"{own:.4g}",
+        *[f"{own_velocity:.4g}" for _ in velocities],
         told(drive.delay * 1e6, errors.delay * 1e6),
     )
     for number, (mode, error) in enumerate(zip(drive.modes, errors.modes, strict=True), 1):
         table.add_row(
             f"mode {number}",
             told(mode[0] / _TURN, error[0] / _TURN),
-            told(mode[1], error[1], 4),
-            told(mode[2], error[2], 4),
+            *(told(value, off, 4) for value, off in zip(mode[1 : 3 + len(velocities)], error[1:], strict=False)),
+            "",
+        )
+    for number, ((time, share), (time_error, share_error)) in enumerate(zip(drive.lags, errors.lags, strict=True), 1):
+        corner = 1.0 / (_TURN * time)
+        table.add_row(
+            f"lag {number}",
+            told(corner, corner * time_error / time),
+            "",
+            told(share, share_error, 4),
+            *velocities and [""],
             "",
         )
     out.print(table)
+    out.print(f"gain: {told(drive.gain, errors.gain)}{_sign(one.measurement, drive.gain)}")
     if chosen:
-        values = ", ".join(f"{count}: {value - min(fit.bic):.4g}" for count, value in enumerate(fit.bic))
-        out.print(f"{_count(fit)}, chosen by BIC (above the least, by number of modes: {values})")
+        near = sorted(fit.bic.items(), key=lambda pair: pair[1])[:_ALIKE]
+        values = ", ".join(f"{structure}: {value - near[0][1]:.4g}" for structure, value in near)
+        out.print(f"{_count(fit)}, chosen by BIC (above the least: {values})", soft_wrap=True)
+    for text in fit.unresolved:
+        out.print(f"{text}; its height there rests on the model alone", soft_wrap=True)
     if isinstance(data, ResponseData):
         missed = tables.table("octave [Hz]", "largest residual [%]", "at [Hz]", "noise [%]", "RMS [%]", left=1)
         for row in _missed(data, fit):
@@ -246,8 +336,15 @@ def _show(data: ResponseData | StepData, fit: ModalFit, places: dict[str, Path],
         out.print(f"error of the model beyond the noise: {beyond}")
     else:
         out.print(f"residual: {100.0 * fit.model_error:.3g} % of the step, RMS")
-    for name, path in places.items():
-        out.print(f"{name + ':':12}{path}")
+
+
+def _sign(measurement: Measurement, gain: float) -> str:
+    """Return a hint for a negative gain."""
+    if gain > 0.0:
+        return ""
+    given = [name for name in ("response", "real", "imaginary", "magnitude") if name in measurement]
+    cure = " ".join(measurement.negative(name) for name in given)
+    return f" (negative: if the sensor is mounted the other way round, {cure})"
 
 
 def _draw(path: Path, data: ResponseData | StepData, fit: ModalFit) -> None:

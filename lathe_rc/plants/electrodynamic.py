@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarse electrodynamic (voice-coil) tool drive with its own closed loops.
 
-    Wi(p) = e^{-pτ} / (1 + 2ζp/ωn + p²/ωn²)
+    Wi(p) = g·e^{-pτ} / (1 + 2ζp/ωn + p²/ωn²)
 
 Source: papers 000 and 001; parameters identified from the table of 001. The coil current follows from the acceleration
-of the carriage, i = m·x''/k. Further resonances are those of `lathe_rc.plants.modes`.
+of the carriage, i = m·x''/k. The gain g of the papers is 1. Further resonances are those of
+`lathe_rc.plants.modes`.
 """
 
 from typing import NamedTuple
@@ -35,6 +36,7 @@ class CoarseTable(NamedTuple):
 
     Attributes:
         transition, weights, part: difference equation of the plant, with the fraction of the delay.
+        gain: g, included in the weights.
         spring, damper: gains of the drive's loops divided by the moving mass [1/s², 1/s].
         force_per_current: moving mass over force constant [A·s²/m].
         stroke: [m].
@@ -46,6 +48,7 @@ class CoarseTable(NamedTuple):
     transition: Array
     weights: Array
     part: float
+    gain: float
     spring: float
     damper: float
     force_per_current: float
@@ -64,7 +67,7 @@ def advance(
         _advance_modes(drive, command, position, velocity, current, sensed)
         return
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
-    spring, damper, force_per_current = drive.spring, drive.damper, drive.force_per_current
+    gain, spring, damper, force_per_current = drive.gain, drive.spring, drive.damper, drive.force_per_current
     # Scalars in locals: the compiler cannot know that the output arrays do not overlap the matrices.
     a, w = drive.transition, drive.weights
     a00, a01, a10, a11 = a[0, 0], a[0, 1], a[1, 0], a[1, 1]
@@ -79,7 +82,7 @@ def advance(
         x, v = between_stops(x, v, stroke)
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k] = x, v
-        current[k] = (spring * (delayed - x) - damper * v) * force_per_current
+        current[k] = (spring * (gain * delayed - x) - damper * v) * force_per_current
     state[0], state[1] = x, v
     put(line, sent[command.size :])
     put(sensed, position)
@@ -104,7 +107,9 @@ def _advance_modes(
         state[0], state[1] = between_stops(state[0], state[1], drive.stroke)
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k], sensed[k] = state[drive.edge], state[drive.edge + 1], state[0]
-        current[k] = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        current[k] = (
+            drive.spring * (drive.gain * delayed - state[0]) - drive.damper * state[1]
+        ) * drive.force_per_current
     put(drive.line, sent[command.size :])
 
 
@@ -120,6 +125,7 @@ class ElectrodynamicDrive:
         force_constant: [N/A].
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
+        gain: g, static gain from the command to the position, of either sign.
         modes: further resonances.
 
     Attributes:
@@ -138,14 +144,16 @@ class ElectrodynamicDrive:
         force_constant: float,
         step: float,
         method: Discretisation,
+        gain: float = 1.0,
         modes: Modes = NONE,
     ) -> None:
         a, b, _, edge = carriage(natural_frequency, damping, modes)
-        self.plant: DiscretePlant = discretise(a, b, delay, step, method)
+        self.plant: DiscretePlant = discretise(a, gain * b, delay, step, method)
         self.table = CoarseTable(
             transition=self.plant.transition,
             weights=self.plant.weights,
             part=self.plant.fraction,
+            gain=gain,
             spring=natural_frequency**2,
             damper=2.0 * damping * natural_frequency,
             force_per_current=moving_mass / force_constant,

@@ -13,12 +13,12 @@ The stack's stiffness is mt·ω2²; ω2, ζ2 are those of the tool on a blocked 
 the carriage. With the further resonances of `lathe_rc.plants.modes`, x1 is the carriage's edge, where the piezo sits;
 the position loop acts on its sensor. The coil's current i is set by the drive's position loop
 
-    i* = (m/k)·(ω1²·(u(t - τ) - x1) - 2ζ1ω1·x1')
+    i* = (m/k)·(ω1²·(g·u(t - τ) - x1) - 2ζ1ω1·x1')
 
-with M alone, where only the command is delayed. The current follows either at once (``coil=None``: the second-order
-drive of papers 000 and 001, bit-identical without force), or by a current loop. That loop is sampled with the step of
-the cell (`lathe_rc.plants.coil`): from the state of a sample it computes the voltage U that is held until the next
-one,
+with M alone, where only the command is delayed; the gain g is 1 in the papers. The current follows either at once
+(``coil=None``: the second-order drive of papers 000 and 001, bit-identical without force), or by a current loop. That
+loop is sampled with the step of the cell (`lathe_rc.plants.coil`): from the state of a sample it computes the voltage U
+that is held until the next one,
 
     L·di/dt = U - R·i - k·x1'
 
@@ -151,6 +151,7 @@ class ToolDrive:
         coil: current loop; None: the force of the position loop acts at once.
         piezo: piezo drive on the carriage; None: the carriage alone carries the tool.
         resolution: of the carriage's position sensor [m]; 0 for none.
+        gain: static gain of the position loop, of either sign.
         modes: further resonances of the carriage, at whose edge the tool or the piezo sits.
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
@@ -160,8 +161,9 @@ class ToolDrive:
         table: constants and state for `advance` and `advance_loaded` of `lathe_rc.plants.tool_motion`.
 
     Raises:
-        InputError: the current loop is too fast for the step, it oscillates, or there are modes beside it; direct
-            compensation would oscillate, or the step is too coarse for it.
+        InputError: the current loop is too fast for the step, it oscillates, or there are modes beside it; the modes
+            are not normal, so that their motion under a force is unknown; direct compensation would oscillate, or the
+            step is too coarse for it.
     """
 
     def __init__(
@@ -177,6 +179,7 @@ class ToolDrive:
         coil: Coil | None = None,
         piezo: Piezo | None = None,
         resolution: float = 0.0,
+        gain: float = 1.0,
         modes: Modes = NONE,
         step: float,
         method: Discretisation,
@@ -184,6 +187,11 @@ class ToolDrive:
     ) -> None:
         if coil and modes.frequency:
             raise InputError("modes belong to a closed position loop; allowed: without a current loop")
+        if not modes.normal:
+            raise InputError(
+                "mode_velocity and lag_time say how the drive follows its command, not how it gives way to a force; "
+                "allowed: in an electrodynamic_actuator"
+            )
         mass = carriage(natural_frequency, damping, modes)
         spring, damper = natural_frequency**2, 2.0 * damping * natural_frequency
         base, tool, mass_of_tool = mass.edge, mass.edge, moving_mass
@@ -199,7 +207,7 @@ class ToolDrive:
             count += 2
         servo, order = _joined(mass.a, mass.force, place, piezo, base), count + (coil is not None)
         a, drives, extends, loads = servo, *np.zeros((3, order))
-        drives[place] = mass.command
+        drives[place] = gain * mass.command
         if piezo:
             extends[place] = -piezo.mass_ratio * stiff * mass.force
             extends[_TOOL + 1] = stiff
@@ -230,6 +238,7 @@ class ToolDrive:
             base=base,
             delay=self._coarse.delay,
             part=self._coarse.fraction,
+            gain=gain,
             spring=spring,
             damper=damper,
             force_per_current=moving_mass / force_constant,
@@ -301,7 +310,7 @@ class ToolDrive:
         row = np.zeros(order + 1)
         row[0], row[1] = -table.spring * table.force_per_current, -table.damper * table.force_per_current
         row[order - 1] = -1.0
-        wanted = table.spring * table.force_per_current
+        wanted = table.gain * table.spring * table.force_per_current
         closed, weight = np.zeros((order + 1, order + 1)), np.zeros(order + 1)
         closed[:order, :order] = table.weights.transition
         closed[:order] += np.outer(table.weights.coarse[:, 0], gain * row + coil.integral * np.eye(order + 1)[order])

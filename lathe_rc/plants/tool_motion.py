@@ -61,6 +61,7 @@ class MotionTable(NamedTuple):
         tool: index of the tool's position in the state.
         base: index of the carriage's position where the tool or the piezo sits; its sensor is at index 0.
         delay, part: delay of the command: whole samples and fraction [sample].
+        gain: static gain of the position loop, included in the weights of the command.
         spring, damper, force_per_current: constants of the position loop.
         carriage_stroke: [m].
         stack, memory, full_voltage: constants, state and full voltage of the piezo.
@@ -82,6 +83,7 @@ class MotionTable(NamedTuple):
     base: int
     delay: int
     part: float
+    gain: float
     spring: float
     damper: float
     force_per_current: float
@@ -113,7 +115,7 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     d0, d1, d2 = u0, u1, u2
     if drive.coil.on:
         wanted = (1.0 - part) * u1 + part * u2
-        asked = (drive.spring * (wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
+        asked = (drive.spring * (drive.gain * wanted - state[0]) - drive.damper * state[1]) * drive.force_per_current
         # The voltage is held through the step: its whole effect is that of one weight.
         d0, d1, d2 = applied(drive.coil, n, asked, state[state.size - 1]), 0.0, 0.0
     order = transition.shape[0]  # known to the compiler, unlike the size of `free`
@@ -222,7 +224,7 @@ def _settle(drive: MotionTable, free: Array, e: float, pushes: float, noise: flo
 def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, float, float, float, float]:
     """Return the carriage's position, velocity, current and reading; the piezo's extension, its velocity, voltage."""
     state, extension, rate, voltage = drive.state, 0.0, 0.0, 0.0
-    current = (drive.spring * (delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
+    current = (drive.spring * (drive.gain * delayed - state[0]) - drive.damper * state[1]) * drive.force_per_current
     if drive.coil.on:
         current = state[state.size - 1]
     base = drive.base

@@ -9,6 +9,7 @@ and units that differ.
 
 import csv
 import re
+import shlex
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -277,6 +278,18 @@ class Measurement:
                     f"{self.name}: {starts[0][0]!r} and {column!r} begin at different times, {late:.6g} s apart; cut "
                     "both alike"
                 )
+
+    def negative(self, quantity: str) -> str:
+        """Return the option that reads a quantity with the other sign."""
+        column, unit = self._columns[quantity]
+        named = _unit_of(quantity, column)
+        factor = _factor(quantity, unit or (named if named is not None else self._source.units[column]))
+        return "--column " + shlex.quote(f"{quantity}={column}:{-(factor or 1.0):.9g}")
+
+    def swapped(self, one: str, other: str) -> str:
+        """Return the options that exchange two quantities."""
+        pairs = ((one, other), (other, one))
+        return " ".join("--column " + shlex.quote(f"{to}={self._columns[of].column}") for to, of in pairs)
 
     def _damaged(self) -> str:
         return f"{self.name}: damaged after its header; record or copy it again"

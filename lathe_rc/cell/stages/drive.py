@@ -42,11 +42,13 @@ class OwnRetraction:
     Args:
         parameters: parameter table of the node.
         stroke: largest displacement of the drive in either direction [m]; commands beyond it are out of reach.
+        gain: static gain from the command to the displacement; position and bounds are those of the displacement.
     """
 
-    def __init__(self, parameters: RetractionParameters, stroke: float) -> None:
-        reach = stroke + abs(parameters.safe_position)
-        self._takeover = Takeover(parameters.bounds(), parameters.safe_position, parameters.step, reach=reach)
+    def __init__(self, parameters: RetractionParameters, stroke: float, gain: float = 1.0) -> None:
+        reach = (stroke + abs(parameters.safe_position)) / abs(gain)
+        bounds = Bounds(*(each / abs(gain) for each in vars(parameters.bounds()).values()))
+        self._takeover = Takeover(bounds, parameters.safe_position / gain, parameters.step, reach=reach)
 
     @property
     def table(self) -> TakeoverTable:

@@ -14,7 +14,7 @@ from lathe_rc.analysis.measured_drive import MeasuredDrive, read_points
 from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.stages.command_limits import limited
-from lathe_rc.cell.stages.drive import followed
+from lathe_rc.cell.stages.drive import OwnRetraction, followed
 from lathe_rc.cell.stages.plant import PlantMemory, PlantParameters, SingleDrive
 from lathe_rc.cell.stages.tables import made_of
 from lathe_rc.errors import InputError
@@ -26,11 +26,12 @@ from lathe_rc.signals.noise import measure
 
 
 class ElectrodynamicActuatorParameters(PlantParameters):
-    """Drive with closed internal loops, e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
+    """Drive with closed internal loops, g·e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
 
     natural_frequency: Positive = parameter(1038.0, "natural frequency ωn", "rad/s")
     damping: Positive = parameter(0.804, "damping ratio ζ", "1")
     delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "delay τ", "s")
+    gain: float = parameter(1.0, "static gain g from command to position, of either sign", "1")
     discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
     moving_mass: Positive = parameter(1.2, "carriage, coil and tool", "kg")
     force_constant: Positive = parameter(30.0, "force of the coil per current", "N/A")
@@ -40,7 +41,11 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         [], "their parts in the motion of the position sensor; the part of the drive itself is the rest to 1", "1"
     )
     mode_edge: list[float] = parameter([], "their parts in the motion of the edge; empty: as at the sensor", "1")
-
+    mode_velocity: list[float] = parameter(
+        [], "parts of their velocities over their frequencies in the motion (complex residues); empty: none", "1"
+    )
+    lag_time: list[Positive] = parameter([], "further first-order lags (real poles): time constant of each", "s")
+    lag_participation: list[float] = parameter([], "their parts in the motion, as of modes", "1")
     response_file: str = parameter(
         "",
         "measured frequency response of the drive, CSV as of lathe fit drive: checks and drive margin then hold for "
@@ -65,22 +70,36 @@ class ElectrodynamicActuatorParameters(PlantParameters):
             return {"coarse/command": MeasuredDrive(*read_points(resources.find(Path(self.response_file))), model)}
 
     def modes(self, node: str, prefix: str = "") -> Modes:
-        """Return the modes of a node; ``prefix`` precedes its parameters in a composed table."""
+        """Return the modes and lags of a node; ``prefix`` precedes its parameters in a composed table.
+
+        Raises:
+            InputError: they cannot be, or the gain is 0.
+        """
+        if not self.gain:
+            raise InputError(f"{node}.{prefix}gain = 0; allowed: of either sign, not 0")
         names = [f"{prefix}mode_{each}" for each in ("frequency", "damping", "participation", "edge")]
+        if self.mode_velocity or self.lag_time or self.lag_participation:
+            names += [f"{prefix}{each}" for each in ("mode_velocity", "lag_time", "lag_participation")]
         for frequency in self.mode_frequency:
             if frequency >= math.pi / self.step:
                 raise InputError(
                     f"{node}.{names[0]} = {frequency:g} rad/s; allowed: below half the sample rate, "
                     f"{math.pi / self.step:.6g} rad/s (a higher sample_rate, or without this mode)"
                 )
-        sensor, edge = self.mode_participation, self.mode_edge
         with about(node, *names):
-            return Modes(*map(tuple, (self.mode_frequency, self.mode_damping, sensor, edge or sensor)))
+            return self._modes()
+
+    def _modes(self) -> Modes:
+        sensor, edge = self.mode_participation, self.mode_edge
+        of_modes = (self.mode_frequency, self.mode_damping, sensor, edge or sensor, self.mode_velocity)
+        return Modes(*map(tuple, (*of_modes, self.lag_time, self.lag_participation)))
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of the drive that controllers may know, by command topic."""
-        known = {"natural_frequency": self.natural_frequency, "damping": self.damping, "delay": self.delay}
-        return {"coarse/command": known}
+        """Quantities of the second-order drive that controllers may know, by command topic."""
+        frequency, damping = self.natural_frequency, self.damping
+        if self.mode_velocity or self.lag_time:
+            frequency, damping = self._modes().model(frequency, damping)
+        return {"coarse/command": {"natural_frequency": frequency, "damping": damping, "delay": self.delay}}
 
 
 @kernel
@@ -110,6 +129,7 @@ class ElectrodynamicActuator(SingleDrive):
             ElectrodynamicDrive, parameters, method=parameters.discretisation, modes=parameters.modes(name)
         )
         super().__init__(name, parameters)
+        self._retraction = OwnRetraction(parameters, parameters.stroke, parameters.gain)
 
     @property
     def machine(self) -> CoarseTable:

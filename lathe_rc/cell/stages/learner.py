@@ -352,7 +352,8 @@ class Learner(Obedient):
 
 def lag(response: Response) -> float:
     """Return the lag of a drive at low frequencies [s]."""
-    return float(-np.angle(response(np.ones(1)))[0])  # at 1 rad/s
+    value = response(np.ones(1))[0]  # at 1 rad/s
+    return float(-np.angle(value if value.real >= 0.0 else -value))
 
 
 class Loop(NamedTuple):

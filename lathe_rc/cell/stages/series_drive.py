@@ -117,7 +117,7 @@ class CoupledDrive(Drive):
         """Set limits, retraction, commands and sensors from the tables of the drives."""
         name, seed, self._coarse = self.name, self.shared.seed, coarse
         self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
-        self._retraction = OwnRetraction(coarse, coarse.stroke)
+        self._retraction = OwnRetraction(coarse, coarse.stroke, coarse.gain)
         self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor only adds noise.
         self._sensors = [Sensor(coarse.noise_rms, 0.0, seed, f"{name}/coarse"), Sensor(0.0, 0.0, seed, f"{name}/fine")]

@@ -14,6 +14,7 @@ from lathe_rc.arrays import Integers
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell, cut
 from lathe_rc.cell.stages.drive import Drive
+from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
@@ -475,6 +476,9 @@ class Supervisor(Stage):
             if source is None:
                 continue
             reached = getattr(source.shared, name, None)
+            if reached is not None and isinstance(source, Learner):  # a command, to which the drive has its gain
+                learned = source.learned(cell.stages.values())
+                reached *= min((response(np.zeros(1))[0].real for response, _ in learned), default=1.0)
             counts = reached if name == "command_stroke" else getattr(source.shared, "reaction_delay", 0)
             if counts and reached is not None and reached <= clear:
                 raise InputError(
