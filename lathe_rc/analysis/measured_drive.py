@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.resonance_grid import poles_of
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 
@@ -25,6 +26,11 @@ class MeasuredDrive:
     frequency: Array
     value: Complex
     model: Response
+
+    @property
+    def poles(self) -> Complex:
+        """Poles of the model [rad/s]."""
+        return poles_of(self.model)
 
     def __call__(self, frequency: Array) -> Complex:
         """Return the response at frequencies [rad/s], shape (n,): linear between the measured points."""

@@ -12,8 +12,16 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.analysis import feedback
-from lathe_rc.analysis.learning import DriveMargin, Response, drive_margin, smallest_errors, supremum
+from lathe_rc.analysis.learning import (
+    DriveMargin,
+    Response,
+    drive_margin,
+    poles_in_waves,
+    smallest_errors,
+    supremum,
+)
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.analysis.resonance_grid import poles_of
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import (
     NonNegative,
@@ -112,7 +120,8 @@ class Learner(Obedient):
             size = np.abs(self._known(drive, waves, speed)).max(axis=0)
             worst = int(np.argmax(np.where(np.isnan(size), np.inf, size)))
             return float(size[worst]), float(waves[worst])
-        return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest)
+        poles = poles_in_waves(drive, highest, speed, self.shared.step)
+        return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest, poles)
 
     def drive_margin(self, drive: Response, speed: float) -> DriveMargin | None:
         """Return the smallest error of the drive's response with which the loop diverges; None if unknown.
@@ -123,7 +132,8 @@ class Learner(Obedient):
         if (highest := self._highest(drive, speed)) is None:
             return self._feedback_margin(drive, speed, measured)
         points = measured.waves(highest, speed) if measured else None
-        return drive_margin(partial(self.scaled_factors, drive, speed), highest, speed, points)
+        poles = poles_in_waves(drive, highest, speed, self.shared.step)
+        return drive_margin(partial(self.scaled_factors, drive, speed), highest, speed, points, poles)
 
     def smallest_errors(self, drive: Response, waves: Array, speed: float) -> Array:
         """Return the smallest errors of the drive at some waves per revolution above 0, shape (n,).
@@ -149,7 +159,7 @@ class Learner(Obedient):
                 return None
             if measured:
                 points = measured.waves(np.pi / (step * speed), speed) * speed
-            return feedback.feedback_margin(characteristic, speed, step, points)
+            return feedback.feedback_margin(characteristic, speed, step, points, poles_of(drive))
 
     def scaled_factors(self, drive: Response, speed: float, waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
         """Return the `factors` for the drive scaled by each of some numbers."""
