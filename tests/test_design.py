@@ -10,7 +10,8 @@ from cells import config
 from click.testing import CliRunner
 
 import lathe_rc
-from lathe_rc.analysis.frequency_response import FrequencyResponse
+from lathe_rc.analysis.frequency_response import FrequencyResponse, write_points
+from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.cell import design
 from lathe_rc.cell.design import Design
 from lathe_rc.cell.wiring import Cell
@@ -22,8 +23,9 @@ DRIVE = {
     "mode_frequency": [5654.9, 10053.1], "mode_damping": [0.02, 0.02], "mode_participation": [0.02, 0.01],
 }  # fmt: skip
 OTHER = {**DRIVE, "natural_frequency": 1080.0, "mode_frequency": [5400.0, 10300.0], "mode_participation": [0.03, 0.01]}
+LAWS = dict(design.LAWS)
 TURNS = "spindle_encoder.revolutions=30"
-FAST = [TURNS, "nominal_rpm=3000.0", "learning_controller.feedback_delay=640"]
+FAST = [TURNS, "nominal_rpm=3000.0", "learning_controller.feedback_delay=600"]
 FAST += ["spindle_encoder.deviation_amplitude=[0.0]", "electrodynamic_actuator.max_acceleration=1000.0"]
 FAST += ["electrodynamic_actuator.noise_rms=50e-9", "spindle_encoder.counts_per_revolution=4096"]
 
@@ -50,6 +52,7 @@ def test_the_best_law_keeps_the_margin_with_every_drive_and_its_runs_give_the_er
     assert (best.law, second.law, last.law) == ("disturbance", "lead, Gaussian Q", "inverse, Gaussian Q")
     assert best.worst.largest < second.worst.largest
     assert last.scenario is None
+    assert last.reason.startswith("drive margin at most ")
     for each in (best, second):
         found = []
         for drive in asked.drives:
@@ -89,14 +92,14 @@ def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, mon
     words = [word for each in drive for word in ("--set", f"electrodynamic_actuator.{each}")]
     done = CliRunner().invoke(main, ["design", "piston", "--margin", "1", "--revolutions", "2", *words])
     assert done.exit_code == 1
-    assert "lathe: no law keeps a drive margin of 1; allowed: a smaller --margin" in done.output
+    assert "lathe: no law is offered for a drive margin of 1; allowed: a smaller --margin" in done.output
     assert not list(tmp_path.iterdir())
 
 
 def test_an_fir_inverse_is_that_of_the_response_it_is_given():
     """Of the model or of the points; where these are known badly, and beyond them, it amplifies nothing."""
     asked = Design(config("piston", *FAST), [DRIVE, OTHER], 0.3)
-    nominal, other = asked._responses(asked.drives)
+    nominal, other = (drive for _, drive in asked._drives)
     frequency = np.linspace(100.0, 14_000.0, 1400)
     noise = np.where(frequency < 9000.0, 1e-4, 10.0)
     known = design.Known(nominal, 0.2e-3, FrequencyResponse(frequency, other(frequency), noise))
@@ -116,7 +119,7 @@ def test_an_fir_inverse_is_that_of_the_response_it_is_given():
 
 def test_notches_stop_the_resonances_without_a_phase_and_raise_the_margin():
     asked = Design(config("piston", *FAST), [DRIVE], 0.3)
-    (drive,) = asked._responses(asked.drives)
+    ((_, drive),) = asked._drives
     known, lead = design.Known(drive, 0.2e-3, None, DRIVE["mode_frequency"]), 1.5e-3
     found = known.notched(lead)
     leads = found["lead_time"] - found["correction_interval"] * np.arange(len(found["correction_taps"]))
@@ -127,7 +130,7 @@ def test_notches_stop_the_resonances_without_a_phase_and_raise_the_margin():
     wide = [replace(law, filters=[{"q_pass": 3433.0, "q_stop": 8582.0}]) for law in laws]
     settings = [next(law.settings(known)) for law in wide]
     without, notched = (
-        max(asked._margin_of(law, values, [drive]) for values in alike)
+        max(asked._setting(law, values, 0.0).error for values in alike)
         for law, alike in zip(wide, settings, strict=True)
     )
     assert notched > without + 0.2
@@ -143,22 +146,171 @@ def test_an_fir_inverse_that_the_cycle_is_too_short_for_is_refused():
 
 def test_the_inverse_laws_have_the_delay_of_a_drive_that_no_file_describes():
     asked = Design(config("piston"), [{}], 0.3)
-    (drive,) = asked._responses(asked.drives)
+    ((_, drive),) = asked._drives
     known = design.Known(drive, 0.36e-3, None)
     tried = [values for alike in design.LAWS["inverse, Gaussian Q"].settings(known) for values in alike]
-    assert max(asked._margin_of(design.LAWS["inverse, Gaussian Q"], values, [drive]) for values in tried[-40:]) > 0.9
-    assert asked._settings(design.LAWS["inverse, Gaussian Q"])
+    assert max(asked._setting(design.LAWS["inverse, Gaussian Q"], values, 0.0).error for values in tried[-40:]) > 0.9
+    assert asked._settings(design.LAWS["inverse, Gaussian Q"])[0]
 
 
-def test_a_cell_that_runs_with_no_law_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(design, "LAWS", {"lead, Gaussian Q": design.LAWS["lead, Gaussian Q"]})
-    monkeypatch.chdir(tmp_path)
-    late = "learning_controller.feedback_delay=4000"
-    done = CliRunner().invoke(main, ["design", "piston", "--margin", "0.01", "--revolutions", "3", "--set", late])
+def design_of(monkeypatch, folder, laws, *words):
+    """Run the command with some laws and settings; return its result."""
+    monkeypatch.setattr(design, "LAWS", laws)
+    monkeypatch.chdir(folder)
+    return CliRunner().invoke(main, ["design", *words])
+
+
+def only(name, *filters):
+    return {name: replace(LAWS[name], filters=filters or LAWS[name].filters)}
+
+
+def test_a_feedback_delay_that_is_too_long_for_a_law_is_shortened_and_told(tmp_path, monkeypatch):
+    """The longest with which the check before a start passes, in table, JSON and scenario; the other speed counts."""
+    late = ("--set", "learning_controller.feedback_delay=4000", "--revolutions", "6", "--margin", "0.01")
+    laws = only("lead, Gaussian Q", {"q_time": 2e-4})
+    done = design_of(monkeypatch, tmp_path, laws, "piston", *late, "--json")
+    (law,) = json.loads(done.stdout)["laws"]
+    text = (tmp_path / "piston-designed.yaml").read_text()
+    assert f"# feedback_delay {law['feedback_delay']} in place of 4000, which is too long for this law" in text
+    made = lathe_rc.load(tmp_path / "piston-designed.yaml")
+    assert (
+        made.nodes["learning_controller"].feedback_delay == law["feedback_delay"] == law["parameters"]["feedback_delay"]
+    )
+    Cell(made.nodes).check()
+    with pytest.raises(InputError, match=f"feedback_delay = {law['feedback_delay'] + 1} samples"):
+        Cell(made.varied({"learning_controller.feedback_delay": law["feedback_delay"] + 1}).nodes).check()
+    told = design_of(monkeypatch, tmp_path, laws, "piston", *late)
+    assert f"with feedback_delay = {law['feedback_delay']}; 4000 is too long for it" in told.output
+    wider = design_of(monkeypatch, tmp_path, laws, "piston", *late, "--swing", "0.2", "--json")
+    assert json.loads(wider.stdout)["laws"][0]["feedback_delay"] < law["feedback_delay"]
+
+
+def test_a_law_that_is_not_offered_says_why(tmp_path, monkeypatch):
+    """Its own reason each: a cycle without time for a feedback, or a margin with its drive and frequency."""
+    fast = [f"electrodynamic_actuator.max_{name}=1e9" for name in ("velocity", "acceleration")]
+    fast = [
+        word for each in ("nominal_rpm=48000", "learning_controller.q_time=2e-5", *fast) for word in ("--set", each)
+    ]
+    done = design_of(monkeypatch, tmp_path, only("lead, Gaussian Q"), "piston", "--revolutions", "3", *fast)
     assert done.exit_code == 1
-    assert "lathe: no law" in done.output
-    assert "feedback_delay = 4000 samples: at 115.2 rad/s the cycle leaves" in done.output
-    assert not list(tmp_path.iterdir())
+    assert "(lead, Gaussian Q: learning_controller.feedback_delay = 3200 samples: at " in done.output
+    laws = only("lead, Gaussian Q", {"q_time": 2e-4}) | only("lead, flat Q", {"q_pass": 2e4, "q_stop": 5e4})
+    done = design_of(monkeypatch, tmp_path, laws, "piston", "--revolutions", "4", "--json")
+    good, bad = json.loads(done.stdout)["laws"]
+    assert (good["offered"], bad["law"], bad["offered"]) == (True, "lead, flat Q", False)
+    assert bad["reason"].startswith("drive margin at most 0, with the nominal drive at ")
+    done = design_of(monkeypatch, tmp_path, laws, "piston", "--revolutions", "4")
+    assert f"not offered: lead, flat Q: {bad['reason']}" in done.output
+
+
+MODES = {
+    "two modes": ((900.0, 0.02, 0.015), (1600.0, 0.02, -0.01)),
+    "a low one": ((420.0, 0.03, 0.03),),
+    "against the drive": ((700.0, 0.02, -0.02),),
+    "a narrow one": ((1100.0, 0.008, 0.004),),
+    "a high one": ((2100.0, 0.02, 0.01),),
+    "three": ((600.0, 0.03, 0.01), (1000.0, 0.02, 0.01), (1500.0, 0.02, 0.01)),
+}
+FEW, MANY = np.geomspace(5.0, 2250.0, 60), np.linspace(5.0, 2250.0, 800)
+ZERO = {"zero phase, flat Q": ({"q_pass": 2879.0, "q_stop": 4894.0}, {"q_pass": 4884.0, "q_stop": 8303.0})}
+ROBUST = {"lead, Gaussian Q": ({"q_time": 4e-4}, {"q_time": 8e-4}, {"q_time": 2e-3})}
+
+
+def flexible(modes):
+    """The drive with modes by frequency [Hz], damping and participation."""
+    return ModalDrive(1036.7, 0.75, 0.2e-3).with_modes([(2 * np.pi * hertz, zeta, part) for hertz, zeta, part in modes])
+
+
+def rigid(path, hertz, modes):
+    """Write the parameters of the drive without its modes, and the points that show them."""
+    true = flexible(modes)
+    parameters = {"/electrodynamic_actuator": {"ros__parameters": flexible(()).parameters()}}
+    path.write_text(json.dumps(parameters))
+    frequency = 2.0 * np.pi * hertz
+    points = FrequencyResponse(frequency, true.response(frequency))
+    write_points(path.with_suffix(".points.csv"), points, np.full(frequency.size, 1e-3), "a test")
+    return {f"electrodynamic_actuator.{name}": value for name, value in true.parameters().items()}
+
+
+@pytest.mark.parametrize("hertz", [FEW, MANY], ids=["few", "many"])
+@pytest.mark.parametrize("modes", MODES.values(), ids=MODES)
+def test_no_setting_has_the_margin_that_the_true_drive_makes_diverge(modes, hertz):
+    """The model lacks the modes and only the points show them; between few of them a resonance is higher than there.
+
+    Without the points, the zero-phase law has its margin, and diverges on each of these drives.
+    """
+    true = flexible(modes).response
+    points = FrequencyResponse(2.0 * np.pi * hertz, true(2.0 * np.pi * hertz))
+    bare, known = (
+        Design(config("piston", *FAST), [flexible(()).parameters()], 0.3, measured) for measured in ((), [points])
+    )
+
+    def settings(asked, name, filters):
+        return asked._settings(replace(design.LAWS[name], filters=filters))
+
+    (zero,) = ZERO.items()
+    alone, _ = settings(bare, *zero)
+    assert any(each.loop.stage.drive_margin(true, 100.0 * np.pi).error == 0.0 for each in alone)
+    for name, filters in {**ZERO, **ROBUST}.items():
+        kept, reason = settings(known, name, filters)
+        assert kept or "points" in reason
+        for each in kept:
+            assert each.loop.stage.drive_margin(true, 100.0 * np.pi).error > 0.0
+
+
+def test_the_scenario_carries_the_points_and_is_checked_against_them_again(tmp_path, monkeypatch):
+    true = rigid(tmp_path / "drive.yaml", MANY, MODES["two modes"])
+    laws = only("lead, Gaussian Q", *ROBUST["lead, Gaussian Q"])
+    words = [word for each in FAST for word in ("--set", each)]
+    done = design_of(monkeypatch, tmp_path, laws, "piston", *words, "--drive", "drive.yaml", "--swing", "0", "--json")
+    assert done.exit_code == 0, done.output
+    (law,) = json.loads(done.stdout)["laws"]
+    assert law["checked"]["points"] == MANY.size
+    assert law["checked"]["points_hz"] == pytest.approx([5.0, 2250.0])
+    made = lathe_rc.load(tmp_path / "piston-designed.yaml")
+    assert made.nodes["electrodynamic_actuator"].response_file == str((tmp_path / "drive.points.csv").resolve())
+    cell = Cell(made.nodes)
+    cell.check()
+    assert cell.drive_margins["learning_controller"].error == pytest.approx(law["drive_margin"]["error"], rel=1e-6)
+    run = lathe_rc.run(made.with_models_given().varied({**true, "spindle_encoder.revolutions": 60.0}))
+    assert run.errors.largest[-10:].max() < 1.1 * run.errors.largest[20:30].max()
+
+
+def test_points_of_several_states_all_count(tmp_path, monkeypatch):
+    """A mode that only the second state shows rejects a law; the scenario has the points of both in one file."""
+    rigid(tmp_path / "other.yaml", MANY, MODES["two modes"])
+    rigid(tmp_path / "drive.yaml", MANY, ())
+    laws = only("zero phase, flat Q", {"q_pass": 6000.0, "q_stop": 9000.0})
+    laws |= only("lead, Gaussian Q", *ROBUST["lead, Gaussian Q"])
+    words = ["piston", "--drive", "drive.yaml", "--swing", "0", "--margin", "0.1", "--json"]
+    words += [word for each in FAST for word in ("--set", each)]
+    first = design_of(monkeypatch, tmp_path, laws, *words)
+    (tmp_path / "other.points.csv").rename(tmp_path / "drive.points-2.csv")
+    second = design_of(monkeypatch, tmp_path, laws, *words)
+    reasons = [{law["law"]: law.get("reason") for law in json.loads(each.stdout)["laws"]} for each in (first, second)]
+    assert reasons[0]["zero phase, flat Q"] is None
+    assert reasons[1]["zero phase, flat Q"].startswith(
+        "drive margin at most 0, with the measured points in state 2 at "
+    )
+    made = lathe_rc.load(tmp_path / "piston-designed.yaml")
+    assert made.nodes["electrodynamic_actuator"].response_file == str(tmp_path / "piston-designed.states.csv")
+    drive = Cell(made.nodes).stages["electrodynamic_actuator"]
+    states = drive.measured()["coarse/command"]
+    assert [state.frequency.size for state in states] == [MANY.size] * 2
+    assert np.abs(states[0].value - states[1].value).max() > 0.1
+
+
+def test_the_error_at_the_other_speed_is_that_of_its_run(tmp_path, monkeypatch):
+    words = [word for each in FAST for word in ("--set", each)]
+    done = design_of(
+        monkeypatch, tmp_path, only("lead, Gaussian Q", {"q_time": 3e-4}), "piston", *words, "--drift", "0.02", "--json"
+    )
+    found = json.loads(done.stdout)
+    assert found["speeds"] == ["constant", "swing of ±0 at 10.7 rad/s, drift of 0.02"]
+    made = design.with_swing(lathe_rc.load(tmp_path / "piston-designed.yaml"), 0.0, 0.02)
+    low, high = Cell(made.nodes).speed_range
+    assert high / low == pytest.approx(1.01 / 0.99, rel=1e-4)
+    assert lathe_rc.run(made).errors.largest[-10:].max() * 1e6 == found["laws"][0]["largest_um"]["other_speed"]
 
 
 @pytest.mark.parametrize(

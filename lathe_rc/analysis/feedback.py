@@ -17,13 +17,13 @@ from functools import lru_cache
 import numpy as np
 
 from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.analysis.resonance_grid import NO_POLES, Grid, with_images
 from lathe_rc.arrays import Array, Complex
 
 Characteristic = Callable[[Array], tuple[Complex, Complex]]  #: D and F at frequencies [rad/s]
 
 _LOW, _COARSE = 1e-4, 4001  # lowest frequency over the speed, and points from there on
 _ORDERS, _NEAR, _CLOSEST = 64, 24, 1e-5  # waves per revolution around each of which the grid is finer, on either side
-_FINE = 65
 _TURN, _ROUNDS = 0.5, 12  # [rad] largest turn of D + F between two frequencies, and rounds of halving to get there
 
 
@@ -33,7 +33,9 @@ def smallest_errors(own: Complex, fed: Complex) -> Array:
         return np.asarray(np.where(fed == 0.0, np.inf, np.abs(own + fed) / np.abs(fed)))
 
 
-def feedback_margin(characteristic: Characteristic, speed: float, step: float, points: Array) -> DriveMargin:
+def feedback_margin(
+    characteristic: Characteristic, speed: float, step: float, points: Array, poles: Complex = NO_POLES
+) -> DriveMargin:
     """Compute the smallest relative error of the drive with which a feedback loop is unstable; 0 if it is already.
 
     Args:
@@ -41,8 +43,10 @@ def feedback_margin(characteristic: Characteristic, speed: float, step: float, p
         speed: speed of the spindle [rad/s].
         step: sampling step [s].
         points: further frequencies to be evaluated, up to the Nyquist frequency [rad/s], shape (k,).
+        poles: those of the drive [rad/s].
     """
     frequency = np.union1d(_grid(speed, step), points)
+    frequency = Grid.uneven(frequency).resolving(with_images(poles, step, np.pi / step)).points
     own, fed = characteristic(frequency)
     for _ in range(_ROUNDS):
         whole = own + fed
@@ -54,13 +58,12 @@ def feedback_margin(characteristic: Characteristic, speed: float, step: float, p
         frequency = np.insert(frequency, coarse + 1, halves)
         own, fed = (np.insert(a, coarse + 1, b) for a, b in zip((own, fed), characteristic(halves), strict=True))
     found = smallest_errors(own, fed)
-    k = int(np.argmin(found))
     if not abs(turns.sum()) < 0.5 * np.pi:
-        return DriveMargin(0.0, float(frequency[k] / speed), speed)
-    near = np.linspace(frequency[max(k - 1, 0)], frequency[min(k + 1, frequency.size - 1)], _FINE)
+        return DriveMargin(0.0, float(frequency[np.argmin(found)] / speed), speed)
+    near = Grid.uneven(frequency).near_peaks(-found)
     fine = smallest_errors(*characteristic(near))
-    j = int(np.argmin(fine))
-    return DriveMargin(float(min(fine[j], found[k])), float(near[j] / speed), speed)
+    k = int(np.argmin(fine))
+    return DriveMargin(float(fine[k]), float(near[k] / speed), speed)
 
 
 @lru_cache(maxsize=16)

@@ -18,7 +18,7 @@ also adds the images of the model's response above the sampling frequency. Every
 correlated.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -390,7 +390,21 @@ def _held(cycles: Array, hold: Hold) -> Complex:
     return np.asarray(np.sinc(cycles) ** 2, np.complex128)
 
 
-def of_measurement(measurement: Measurement, averages: float | None = None) -> FrequencyResponse:
+def of_states(measurement: Measurement) -> list[FrequencyResponse]:
+    """Return the frequency responses in a file, one for each number in its column ``state``, if it has one.
+
+    Raises:
+        InputError: see `of_measurement`.
+    """
+    if "state" not in measurement:
+        return [of_measurement(measurement)]
+    _, states = measurement.read("frequency", "state")
+    return [of_measurement(measurement, rows=states == state) for state in np.unique(states)]
+
+
+def of_measurement(
+    measurement: Measurement, averages: float | None = None, rows: npt.NDArray[np.bool_] | None = None
+) -> FrequencyResponse:
     """Return the frequency response in a file.
 
     The file has ``frequency`` with ``magnitude`` and ``phase``, ``real`` and ``imaginary``, or a complex ``response``;
@@ -399,6 +413,7 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
     Args:
         measurement: columns of the file.
         averages: number of averages of the coherence; None: `AVERAGES`.
+        rows: whether each row is used, shape (n,); None: all are.
 
     Raises:
         InputError: a column is missing or out of range, or ``averages`` has no use.
@@ -407,6 +422,7 @@ def of_measurement(measurement: Measurement, averages: float | None = None) -> F
     coherence = _between(measurement, "coherence", 1.0)
     given = _between(measurement, "relative_uncertainty", np.inf)
     order = np.argsort(frequency, kind="stable")
+    order = order if rows is None else order[rows[order]]
     kept = order[frequency[order] > 0.0]  # the point at 0 Hz of an analyser has no phase
     if averages is not None and (coherence is None or given is not None):
         known = "no coherence" if coherence is None else "a relative_uncertainty"
@@ -485,3 +501,18 @@ def write_points(path: Path, response: FrequencyResponse, deviation: Array, comm
     if response.coherence is not None:
         columns["coherence"] = response.coherence
     write_table(path, ",".join(columns), np.stack(list(columns.values()), axis=1), comment, digits=12)
+
+
+def write_states(path: Path, responses: Sequence[FrequencyResponse], comment: str) -> None:
+    """Write the points of a drive in several states as one CSV file that `of_states` reads.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = [
+        np.stack(
+            (np.full(each.frequency.size, state), each.frequency / (2.0 * np.pi), each.value.real, each.value.imag)
+        )
+        for state, each in enumerate(responses, 1)
+    ]
+    write_table(path, "state,frequency_hz,real,imaginary", np.concatenate(rows, axis=1).T, comment, digits=12)

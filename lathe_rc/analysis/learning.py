@@ -13,29 +13,30 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lathe_rc.analysis.resonance_grid import NO_POLES, Grid, poles_of, with_images
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.interpolation import cubic_response, derivative_responses
 from lathe_rc.control.q_filter import QFilter
-from lathe_rc.jit import kernel
 from lathe_rc.plants.linear import Constant
 
 Response = Callable[[Array], Complex]
 
-_COARSE, _FINE, _PEAKS = 1025, 65, 3  # points over all waves, then around each of the worst peaks
+_COARSE = 1025  # points over all waves
 _SCALE = 0.5  # change of the drive from which its effect on the factors is computed
 _ROUNDING = 1e-9  # a smaller effect is none
 
 
-def supremum(operator: Callable[[Array], Complex], highest: float) -> tuple[float, float]:
+def supremum(operator: Callable[[Array], Complex], highest: float, poles: Complex = NO_POLES) -> tuple[float, float]:
     """Compute the supremum of a cycle factor's magnitude, and the waves per revolution at which it occurs.
 
     Args:
         operator: factor of a cycle as a function of the waves per revolution, shape (n,).
         highest: highest waves per revolution.
+        poles: those of the drive, see `poles_in_waves`.
     """
-    waves = _waves_up_to(highest)
-    near = _near_peaks(waves, np.abs(operator(waves)))
+    grid = _waves_up_to(highest).resolving(poles)
+    near = grid.near_peaks(np.abs(operator(grid.points)))
     if near.size == 1:
         return float("nan"), float(near[0])
     fine = np.abs(operator(near))
@@ -82,6 +83,7 @@ def drive_margin(
     highest: float,
     speed: float,
     points: Array | None = None,
+    poles: Complex = NO_POLES,
 ) -> DriveMargin:
     """Compute the smallest relative error Δ of the drive with which a factor of a cycle reaches the magnitude 1.
 
@@ -97,57 +99,33 @@ def drive_margin(
         highest: highest waves per revolution.
         speed: speed of the spindle [rad/s].
         points: waves per revolution that are evaluated, those of a measurement, shape (n,), n above 0; None: all.
+        poles: those of the drive, see `poles_in_waves`.
     """
     smallest = partial(smallest_errors, factors)
     if points is None:
-        waves = _waves_up_to(highest)
-        near = _near_peaks(waves, -smallest(waves))
-        # Once more around the least, since a resonance may be narrower than the fine grid.
-        least, apart = near[np.argmin(smallest(near))], 2.0 * waves[1] / (_FINE - 1)
-        near = np.clip(np.linspace(least - apart, least + apart, _FINE), 0.0, highest)
-    else:
-        near = points
-    found = smallest(near)
+        grid = _waves_up_to(highest).resolving(poles)
+        points = grid.near_peaks(-smallest(grid.points))
+    found = smallest(points)
     worst = int(np.argmin(found))
-    return DriveMargin(float(found[worst]), float(near[worst]), speed)
-
-
-@kernel
-def _near_peaks(waves: Array, size: Array) -> Array:
-    """Return a fine grid of waves around the highest peaks of ``size``, including peaks at the ends.
-
-    If ``size`` is not finite somewhere, only the first such wave is returned.
-    """
-    last = waves.size - 1
-    heights, places = np.full(_PEAKS, -np.inf), np.zeros(_PEAKS, np.int64)  # in rising order, by insertion
-    for k in range(last + 1):
-        if not size[k] < np.inf:
-            return np.array([waves[k]])
-        if k in (0, last) or (size[k] >= size[k - 1] and size[k] >= size[k + 1]):
-            below = 0
-            while below < _PEAKS and size[k] >= heights[below]:
-                if below:
-                    heights[below - 1], places[below - 1] = heights[below], places[below]
-                heights[below], places[below] = size[k], k
-                below += 1
-    near = np.empty(_PEAKS * _FINE)
-    for i in range(near.size):
-        wave = waves[places[i // _FINE]] + (2.0 * (i % _FINE) / (_FINE - 1) - 1.0) * waves[1]
-        near[i] = min(max(wave, 0.0), waves[last])
-    return near
+    return DriveMargin(float(found[worst]), float(points[worst]), speed)
 
 
 @lru_cache(maxsize=64)
-def _waves_up_to(highest: float) -> Array:
+def _waves_up_to(highest: float) -> Grid:
     """Return the waves per revolution of the coarse search for peaks."""
     waves = np.linspace(0.0, highest, _COARSE)
     waves.setflags(write=False)
-    return waves
+    return Grid.even(waves)
 
 
 def highest_waves(grid: int, step: float, speed: float) -> float:
     """Return the Nyquist limit of grid and sampling [waves per revolution], at ``speed`` [rad/s]."""
     return float(min(grid / 2, np.pi / (step * speed)))
+
+
+def poles_in_waves(drive: Response, highest: float, speed: float, step: float) -> Complex:
+    """Return the poles of a drive and their images up to ``highest``, in waves per revolution at a speed [rad/s]."""
+    return with_images(poles_of(drive), step, highest * speed) / speed
 
 
 @dataclass(frozen=True)
@@ -242,7 +220,10 @@ class LearningLoop:
 
 def _worst(loop: LearningLoop, speed: float) -> tuple[float, float]:
     """Compute the supremum of a loop at a speed, without a cache."""
-    return supremum(lambda waves: loop.operator(waves, speed), highest_waves(loop.grid, loop.step, speed))
+    highest = highest_waves(loop.grid, loop.step, speed)
+    return supremum(
+        lambda waves: loop.operator(waves, speed), highest, poles_in_waves(loop.drive, highest, speed, loop.step)
+    )
 
 
 _worst_of_alike = lru_cache(maxsize=256)(_worst)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.resonance_grid import poles_of
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 
@@ -25,6 +26,11 @@ class MeasuredDrive:
     frequency: Array
     value: Complex
     model: Response
+
+    @property
+    def poles(self) -> Complex:
+        """Poles of the model [rad/s]."""
+        return poles_of(self.model)
 
     def __call__(self, frequency: Array) -> Complex:
         """Return the response at frequencies [rad/s], shape (n,): linear between the measured points."""
@@ -47,8 +53,11 @@ class MeasuredDrive:
         return np.asarray(waves[waves <= highest])
 
 
-def read_points(path: Path) -> tuple[Array, Complex]:
-    """Read frequencies [rad/s] and values of a frequency response, CSV as of ``lathe fit drive``, whatever its name.
+def read_points(path: Path) -> list[tuple[Array, Complex]]:
+    """Read frequencies [rad/s] and values of frequency responses, CSV as of ``lathe fit drive``, whatever its name.
+
+    Returns:
+        The pair of each state in which the drive was measured, by the column ``state``; one pair without it.
 
     Raises:
         InputError: the file cannot be read, or is no frequency response.
@@ -58,9 +67,9 @@ def read_points(path: Path) -> tuple[Array, Complex]:
 
 
 @lru_cache(maxsize=16)
-def _read(path: Path, _: tuple[int, int] | None) -> tuple[Array, Complex]:
+def _read(path: Path, _: tuple[int, int] | None) -> list[tuple[Array, Complex]]:
     from lathe_rc.analysis import frequency_response  # with SciPy, which a cell without measurements need not import
     from lathe_rc.signals import measurement_file
 
-    found = frequency_response.of_measurement(measurement_file.read(path, {}, ".csv"))
-    return found.frequency, found.value
+    found = frequency_response.of_states(measurement_file.read(path, {}, ".csv"))
+    return [(each.frequency, each.value) for each in found]

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.analysis.learning import DriveMargin, poles_in_waves
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.analysis.resonance_grid import Grid
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.wiring import Cell
 
@@ -22,7 +23,8 @@ class LoopCurve:
         node: name of the controller.
         margin: its drive margin.
         measured: whether that is the margin of measured points, which are then the only ones.
-        waves: waves per revolution from `LEAST` on, increasing, with all harmonics up to 100, shape (n,).
+        waves: waves per revolution from `LEAST` on, increasing, with all harmonics up to 100, finer around
+            narrow resonances, shape (n,).
         error: smallest relative error of the drive's response with which the loop diverges, shape (n,).
         factor: factor of a cycle, Q - γZ or, of several factors, the largest, shape (n,); None for a loop without.
     """
@@ -56,6 +58,7 @@ def loop_curves(cell: Cell) -> list[LoopCurve]:
         else:
             waves = np.geomspace(LEAST, highest, _POINTS)
             waves = np.union1d(waves, np.arange(1.0, min(_WHOLE, highest) + 1.0))
+            waves = Grid.uneven(waves).resolving(poles_in_waves(drive, highest, speed, stage.shared.step)).points
         waves = np.union1d(waves, max(margin.waves, LEAST))
         factors = stage.factors(drive, waves, speed)
         largest = None if factors is None else factors[np.abs(factors).argmax(axis=0), np.arange(waves.size)]

@@ -16,6 +16,7 @@ the others.
 """
 
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from math import ceil
 
 import numpy as np
@@ -177,9 +178,17 @@ class Weights(QFilter):
 
     def response(self, radians: Array) -> Array:
         """Compute the real frequency response at ``radians`` per grid point, shape (n,)."""
-        # cos(jν) by Horner's rule for Chebyshev polynomials: memory does not grow with the kernel.
-        series = np.concatenate((self._weights[:1], 2.0 * self._weights[1:]))
-        return np.asarray(np.polynomial.chebyshev.chebval(np.cos(radians), series))
+        return _response(self._weights.tobytes(), radians.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _response(weights: bytes, radians: bytes) -> Array:
+    """Return the response of a symmetric kernel, cached: each speed and lead of a check asks for the same one."""
+    # cos(jν) by Horner's rule for Chebyshev polynomials: memory does not grow with the kernel.
+    series = np.frombuffer(weights) * np.append(1.0, np.full(len(weights) // 8 - 1, 2.0))
+    found = np.asarray(np.polynomial.chebyshev.chebval(np.cos(np.frombuffer(radians)), series))
+    found.setflags(write=False)
+    return found
 
 
 class Gaussian(Weights):

@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -40,10 +40,21 @@ class DiscretePlant(Constant):
     fraction: float
     step: float
 
+    @cached_property
+    def poles(self) -> Complex:
+        """Poles of the continuous equivalent [rad/s], shape (m,), without those at minus infinity."""
+        return continuous_poles(self.transition, self.step)
+
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Return the difference equation's frequency response from command to position at ``frequency`` [rad/s]."""
         wanted = np.asarray(frequency, dtype=np.float64)
         return _response(self, wanted.tobytes()).reshape(wanted.shape)
+
+
+def continuous_poles(transition: Array, step: float) -> Complex:
+    """Return the poles [rad/s] of which sampling at a ``step`` [s] makes a transition, without those at -inf."""
+    discrete = np.linalg.eigvals(transition).astype(np.complex128)
+    return np.asarray(np.log(discrete[discrete != 0.0]) / step)
 
 
 @inlined

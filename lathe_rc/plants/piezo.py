@@ -270,6 +270,11 @@ class LinearPiezo(Constant):
     stack: LinearStack
     plant: DiscretePlant
 
+    @property
+    def poles(self) -> Complex:
+        """Poles of the resonance [rad/s], shape (2,)."""
+        return self.plant.poles
+
     def response(self, frequency: npt.ArrayLike) -> Complex:
         """Return the frequency response from the set point to the position at ``frequency`` [rad/s]."""
         return np.asarray(self.stack.response(frequency) * self.plant.response(frequency))

@@ -36,6 +36,7 @@ on the mass ratio: the tool's inertia bends the piezo by -x1''/ω2² while the c
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +46,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import MADE, CuttingProcess
-from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
+from lathe_rc.plants.linear import DiscretePlant, Discretisation, continuous_poles, discretise
 from lathe_rc.plants.modes import NONE, Modes, carriage
 from lathe_rc.plants.piezo import Stack, StackTable
 from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
@@ -342,6 +343,11 @@ class ToolDrive:
             return alone
         reaction = self._piezo.stack.linear.response(frequency) * self._of(_CARRIAGE, frequency, command=False)
         return np.asarray(alone / (1.0 + reaction))
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Poles of carriage and tool, without direct compensation [rad/s], shape (m,)."""
+        return continuous_poles(self._closed()[0], self.step) if self.table.coil.on else self._coarse.poles
 
     def coarse_response(self, frequency: npt.ArrayLike) -> Complex:
         """Return the response, carriage over command, at ``frequency`` [rad/s], without limits or force."""

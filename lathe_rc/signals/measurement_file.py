@@ -44,6 +44,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "imaginary": _RATIO,
     "coherence": _RATIO,
     "relative_uncertainty": _RATIO,
+    "state": {"": 1.0, "1": 1.0},
     "angle": {"deg": _TURN / 360.0, "°": _TURN / 360.0, "rad": 1.0, "rev": _TURN},
     "radius": _LENGTHS,
     "height": _LENGTHS,

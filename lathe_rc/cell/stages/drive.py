@@ -91,8 +91,8 @@ class Drive(Stage):
     def responses(self) -> Mapping[str, Response]:
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
 
-    def measured(self) -> Mapping[str, MeasuredDrive]:
-        """Measured response of the displacement to a command, by topic before remapping; empty: none is given."""
+    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Response of the displacement to a command as measured in each state, by topic; empty: not measured."""
         return {}
 
     def limits(self) -> Mapping[str, Limits]:

@@ -2,7 +2,7 @@
 """Coarse electrodynamic tool drive."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -53,8 +53,8 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         path=True,
     )
 
-    def measured(self, node: str, model: Response, prefix: str = "") -> Mapping[str, MeasuredDrive]:
-        """Return the measured response by topic; ``prefix`` precedes the parameter in a composed table.
+    def measured(self, node: str, model: Response, prefix: str = "") -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Return the response measured in each state by topic; ``prefix`` precedes the parameter in a composed table.
 
         Args:
             node: name of the node.
@@ -67,7 +67,8 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         if not self.response_file:
             return {}
         with about(node, f"{prefix}response_file"):
-            return {"coarse/command": MeasuredDrive(*read_points(resources.find(Path(self.response_file))), model)}
+            states = read_points(resources.find(Path(self.response_file)))
+        return {"coarse/command": [MeasuredDrive(*points, model) for points in states]}
 
     def modes(self, node: str, prefix: str = "") -> Modes:
         """Return the modes and lags of a node; ``prefix`` precedes its parameters in a composed table.
@@ -140,6 +141,6 @@ class ElectrodynamicActuator(SingleDrive):
         """Response of the sensor's position to the command, by topic."""
         return {"coarse/command": self.drive.plant.response}
 
-    def measured(self) -> Mapping[str, MeasuredDrive]:
-        """Measured response of the sensor's position to the command, by topic."""
+    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Response of the sensor's position to the command as measured in each state, by topic."""
         return self.parameters.measured(self.name, self.drive.plant.response)

@@ -12,8 +12,16 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.analysis import feedback
-from lathe_rc.analysis.learning import DriveMargin, Response, drive_margin, smallest_errors, supremum
+from lathe_rc.analysis.learning import (
+    DriveMargin,
+    Response,
+    drive_margin,
+    poles_in_waves,
+    smallest_errors,
+    supremum,
+)
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.analysis.resonance_grid import poles_of
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import (
     NonNegative,
@@ -112,7 +120,8 @@ class Learner(Obedient):
             size = np.abs(self._known(drive, waves, speed)).max(axis=0)
             worst = int(np.argmax(np.where(np.isnan(size), np.inf, size)))
             return float(size[worst]), float(waves[worst])
-        return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest)
+        poles = poles_in_waves(drive, highest, speed, self.shared.step)
+        return supremum(lambda waves: np.abs(self._known(drive, waves, speed)).max(axis=0), highest, poles)
 
     def drive_margin(self, drive: Response, speed: float) -> DriveMargin | None:
         """Return the smallest error of the drive's response with which the loop diverges; None if unknown.
@@ -123,7 +132,8 @@ class Learner(Obedient):
         if (highest := self._highest(drive, speed)) is None:
             return self._feedback_margin(drive, speed, measured)
         points = measured.waves(highest, speed) if measured else None
-        return drive_margin(partial(self.scaled_factors, drive, speed), highest, speed, points)
+        poles = poles_in_waves(drive, highest, speed, self.shared.step)
+        return drive_margin(partial(self.scaled_factors, drive, speed), highest, speed, points, poles)
 
     def smallest_errors(self, drive: Response, waves: Array, speed: float) -> Array:
         """Return the smallest errors of the drive at some waves per revolution above 0, shape (n,).
@@ -149,7 +159,7 @@ class Learner(Obedient):
                 return None
             if measured:
                 points = measured.waves(np.pi / (step * speed), speed) * speed
-            return feedback.feedback_margin(characteristic, speed, step, points)
+            return feedback.feedback_margin(characteristic, speed, step, points, poles_of(drive))
 
     def scaled_factors(self, drive: Response, speed: float, waves: Array, scales: Sequence[float]) -> Sequence[Complex]:
         """Return the `factors` for the drive scaled by each of some numbers."""
@@ -226,34 +236,43 @@ class Learner(Obedient):
         """Check that the feedback is in time for the cycle and that learning converges."""
         super().check_cell(cell, cures=cures)
         low, high = cell.speed_range
-        self._check_delay(cell, high)
+        self.check_delay(cell)
         self._check_convergence(cell, cures=cures)
         encoder = cell.master.parameters
         cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
-        """Return the commanded drives and their responses, of a drive that is measured both the model and this."""
+        """Return the commanded drives and their responses: of a measured drive, the model and that of each state."""
         commands = {remapped(self.shared, output.topic) for output in self.outputs}
-        return [
-            (response, drive)
-            for drive in stages
-            if isinstance(drive, Drive)
-            for responses in (drive.responses(), drive.measured())
-            for topic, response in responses.items()
-            if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs)
-        ]
+        found: list[tuple[Response, Drive]] = []
+        for drive in stages:
+            if not isinstance(drive, Drive):
+                continue
+            for topic, model in drive.responses().items():
+                if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs):
+                    found.append((model, drive))
+                    found += [(measured, drive) for measured in drive.measured().get(topic, ())]
+        return found
 
     def checked_loop(self, cell: WiredCell) -> "Loop":
         """Return the controller with the drives that it commands, at the speeds that the checks evaluate."""
         responses = [response for response, _ in self.learned(cell.stages.values())]
         return Loop(self, responses, self.checked_speeds(*cell.speed_range))
 
-    def _check_delay(self, cell: WiredCell, speed: float) -> None:
+    def allowed_delay(self, cell: WiredCell) -> int | None:
+        """Return the longest feedback delay [sample] that the cycle allows in a cell; None if unknown."""
         encoder = cell.master.parameters
         count = 2 * np.pi / encoder.counts_per_revolution if encoder.counts_per_revolution else 0.0
         acceleration = cell.master.largest_acceleration()
-        largest = self.largest_delay(speed, acceleration, count, encoder.speed_window * encoder.step)
-        delay = self.parameters.feedback_delay
+        return self.largest_delay(cell.speed_range[1], acceleration, count, encoder.speed_window * encoder.step)
+
+    def check_delay(self, cell: WiredCell) -> None:
+        """Check that the feedback delay is not longer than the cycle allows.
+
+        Raises:
+            InputError: it is.
+        """
+        largest, delay = self.allowed_delay(cell), self.parameters.feedback_delay
         if largest is None:
             cell.unchecked.append(f"{self.name}: {self.kind} tells no longest feedback_delay")
         elif delay > largest:
@@ -264,7 +283,7 @@ class Learner(Obedient):
             if largest < 1:
                 allowed = "a longer cycle, a shorter lead, or a spindle that turns slower"
             raise InputError(
-                f"{self.name}.feedback_delay = {delay} samples: at {speed:.4g} rad/s the cycle leaves "
+                f"{self.name}.feedback_delay = {delay} samples: at {cell.speed_range[1]:.4g} rad/s the cycle leaves "
                 f"{max(largest, 0)}; allowed: {allowed}"
             )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.resonance_grid import NO_POLES
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
@@ -130,6 +131,8 @@ class Plant(Sampled, SingleDrive):
 
     Parameters = PlantParameters
     parameters: PlantParameters
+    #: poles of `response` [rad/s], shape (k,): checks resolve those that are narrower than their grids
+    poles: Complex = NO_POLES
     sample: ClassVar[Callable[[Any, float], Moved]]
     loop = staticmethod(_loop)
 

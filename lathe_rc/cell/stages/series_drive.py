@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Piezo and tool on the coarse carriage: both drives as one stage, since they are coupled within a block."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -131,8 +131,8 @@ class CoupledDrive(Drive):
         coarse = {"coarse/command": self.drive.coarse_response}
         return {**coarse, "fine/command": self.drive.fine_response} if self._set_point else coarse
 
-    def measured(self) -> Mapping[str, MeasuredDrive]:
-        """Measured response of the carriage to its command."""
+    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Response of the carriage to its command as measured in each state."""
         return self._coarse.measured(self.name, self.drive.coarse_response, "coarse_")
 
 
