@@ -63,53 +63,62 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
 
     For a damaged bag, or one that lacks samples, show the readable content and what is wrong; exit code 3.
     """
-    written_ns = max((file.stat().st_mtime_ns for file in files_of(path)), default=0)
     with Source(path, partial=True) as source:
-        span = (source.last_ns - source.first_ns) * 1e-9
-        types = {topic: entry.type for topic, entry in source.topics.items()}
-        topics: dict[str, dict[str, Any]] = {
-            topic: {
-                "type": entry.type,
-                "messages": entry.count,
-                "rate_hz": (entry.count - 1) / span if span > 0 and entry.count > 1 else None,
-            }
-            for topic, entry in sorted(source.topics.items())
+        summary = _info(path, source, metrics=metrics)
+        if as_json:
+            click.echo(json.dumps(summary))
+        else:
+            _print_info(source, summary, whole=whole)
+        ctx.exit(_LOSSY if source.damage or summary["lost"] else 0)
+
+
+def _info(path: Path, source: Source, *, metrics: bool) -> dict[str, Any]:
+    """Return what is shown of a bag; what cannot be read is added to the damage of its source."""
+    span = (source.last_ns - source.first_ns) * 1e-9
+    types = {topic: entry.type for topic, entry in source.topics.items()}
+    topics: dict[str, dict[str, Any]] = {
+        topic: {
+            "type": entry.type,
+            "messages": entry.count,
+            "rate_hz": (entry.count - 1) / span if span > 0 and entry.count > 1 else None,
         }
-        summary: dict[str, Any] = {
-            "bag": str(path),
-            "start_s": source.first_ns * 1e-9,
-            "start": _date(source.first_ns),
-            "span_s": span,
-            "written": _date(written_ns),
-            "topics": topics,
-            "unread": [asdict(each) for each in source.unread],
-            "about": dict(source.about),
-            "seal": source.seal.digest if source.seal else None,
-            "contradictions": source.contradictions,
-            "foreign": provenance.foreign(source.about),
-            "damage": source.damage,
-            "lost": None,
-            "events": [],
-            "first_sample": 0,
-            "error_um": None,
-            "not_measured": None,
-        }
-        try:
-            for _, _, data in source.messages({topic for topic, kind in types.items() if kind == messages.EVENT}):
-                event = messages.decode(messages.EVENT, data)
-                summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
-            summary["lost"] = str(source.loss) if source.loss else None
-            summary["first_sample"] = stream.first_of(source)
-            summary |= _metrics(path, types) if metrics and not source.damage else {}
-        except (LatheError, ValueError) as error:
-            source.damage.append(str(error))
-    code = _LOSSY if source.damage or summary["lost"] else 0
-    if as_json:
-        click.echo(json.dumps(summary))
-        ctx.exit(code)
+        for topic, entry in sorted(source.topics.items())
+    }
+    summary: dict[str, Any] = {
+        "bag": str(path),
+        "start_s": source.first_ns * 1e-9,
+        "start": _date(source.first_ns),
+        "span_s": span,
+        "written": _date(max((file.stat().st_mtime_ns for file in files_of(path)), default=0)),
+        "topics": topics,
+        "unread": [asdict(each) for each in source.unread],
+        "about": dict(source.about),
+        "seal": source.seal.digest if source.seal else None,
+        "contradictions": source.contradictions,
+        "foreign": provenance.foreign(source.about),
+        "damage": source.damage,
+        "lost": None,
+        "events": [],
+        "first_sample": 0,
+        "error_um": None,
+        "not_measured": None,
+    }
+    try:
+        for _, _, data in source.messages({topic for topic, kind in types.items() if kind == messages.EVENT}):
+            event = messages.decode(messages.EVENT, data)
+            summary["events"].append({"sample": event.sample_index, "node": event.source, "action": event.action})
+        summary["lost"] = str(source.loss) if source.loss else None
+        summary["first_sample"] = stream.first_of(source)
+        summary |= _metrics(path, types) if metrics and not source.damage else {}
+    except (LatheError, ValueError) as error:
+        source.damage.append(str(error))
+    return summary
+
+
+def _print_info(source: Source, summary: Mapping[str, Any], *, whole: bool | None) -> None:
     console = tables.console()
     table = tables.table("topic", "type", "messages", "rate [Hz]", left=2, no_wrap=True)
-    for topic, entry in topics.items():
+    for topic, entry in summary["topics"].items():
         rate = f"{entry['rate_hz']:.4g}" if entry["rate_hz"] else ""
         table.add_row(topic, entry["type"].rpartition("/")[2], str(entry["messages"]), rate)
     console.print(table)
@@ -119,7 +128,8 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
         click.echo(what, err=True)
     for what in summary["foreign"]:
         console.print(what)
-    console.print(f"span: {span:.6g} s from {summary['start'] or format(summary['start_s'], '.6g') + ' s'} on")
+    start = summary["start"] or format(summary["start_s"], ".6g") + " s"
+    console.print(f"span: {summary['span_s']:.6g} s from {start} on")
     console.print(f"written: {summary['written']}")
     if source.seal:
         console.print(f"seal: {source.seal}")
@@ -136,7 +146,6 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
     for event in summary["events"]:
         console.print(f"event: sample {event['sample']}, {event['node']}: {event['action']}")
     _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)
-    ctx.exit(code)
 
 
 def _print_about(console: Console, about: Mapping[str, str], *, whole: bool) -> None:
