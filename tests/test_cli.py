@@ -218,7 +218,7 @@ def test_a_command_that_memory_does_not_suffice_for_says_so(monkeypatch):
     def read(path):
         raise MemoryError("Unable to allocate 29.1 TiB")
 
-    monkeypatch.setattr("lathe_rc.bag.reader.read_bag", read)
+    monkeypatch.setattr("lathe_rc.commands.measured.tell_origin", read)
     failed = lathe("measure", "bag")
     assert (failed.exit_code, failed.stderr) == (1, "lathe: not enough memory (Unable to allocate 29.1 TiB)\n")
 
@@ -293,7 +293,7 @@ def test_commands_are_listed_without_being_imported():
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     *text, modules = listed.splitlines()
     ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
-    light = {"cli", "command_list", "errors", "extras", "allowed_code", "public"}
+    light = {"cli", "command_list", "errors", "extras", "allowed_code", "numba_settings", "public"}
     assert ours == {"lathe_rc", *(f"lathe_rc.{module}" for module in light)}
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 

@@ -218,7 +218,8 @@ ROBUST = {"lead, Gaussian Q": ({"q_time": 4e-4}, {"q_time": 8e-4}, {"q_time": 2e
 
 def flexible(modes):
     """The drive with modes by frequency [Hz], damping and participation."""
-    return ModalDrive(1036.7, 0.75, 0.2e-3).with_modes([(2 * np.pi * hertz, zeta, part) for hertz, zeta, part in modes])
+    sections = [(2.0 * np.pi * hertz, zeta, part, 0.0) for hertz, zeta, part in modes]
+    return ModalDrive(1036.7, 0.75, 0.2e-3).with_sections(sections, ())
 
 
 def rigid(path, hertz, modes):

@@ -177,6 +177,11 @@ def test_a_member_that_is_stopped_is_silent_whatever_dds_says_of_it(tool):
         child.kill()
 
 
+def status(signs):
+    with signs:
+        return signs.take_event()
+
+
 def test_a_member_of_another_machine_is_silent_when_its_lease_has_run_out(tool):
     """Its liveliness is polled, as an event of DDS can make a node stand still."""
     code = (
@@ -188,6 +193,7 @@ def test_a_member_of_another_machine_is_silent_when_its_lease_has_run_out(tool):
         try:
             inlet = next(each for each in tool.subscriptions if each.topic_name == f"/far/{ALIVE}")
             until(inlet.get_publisher_count)
+            until(lambda: status(tool.watch._signs["/far"]).alive_count)  # it has shown a sign of life
             for number, silent in ((signal.SIGSTOP, ["/far"]), (signal.SIGCONT, [])):
                 process.send_signal(number)
                 until(lambda silent=silent: list(tool.watch.silent) == silent, tool.watch.look)

@@ -13,6 +13,7 @@ from sealed_bags import retold
 import lathe_rc
 from lathe_rc import messages
 from lathe_rc.bag import provenance
+from lathe_rc.bag.loss import HELD
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.errors import InputError
@@ -68,9 +69,9 @@ def sealed_record(bag):
 
 def held(bag):
     """No word of a held range."""
-    retold(bag, lambda about: about.update({provenance.HELD: '{"/tool": 5}'}))
+    retold(bag, lambda about: about.update({HELD: '{"/tool": 5}'}))
     file = bag / "metadata.yaml"
-    file.write_text("".join(line for line in file.open() if provenance.HELD not in line))
+    file.write_text("".join(line for line in file.open() if HELD not in line))
 
 
 def digits(indent):

@@ -193,7 +193,7 @@ class Found(NamedTuple):
 
     Attributes:
         largest: largest magnitude of the form error in the last ten revolutions [m]; inf if a run failed.
-        settled: first revolution from which on the error is in tolerance; inf if never.
+        settled: first revolution from which on the error is in tolerance; inf if it is not in all of the last ten.
         effort: RMS of the effort of the drive [N, V or A].
         failure: why the run failed; empty: it did not.
     """
@@ -530,10 +530,11 @@ class Design:
                 found.append(_FAILED._replace(failure=str(outcome.error)))
                 continue
             errors, effort = outcome.kept
-            settled = float(judge(errors.largest, self._tolerance).since or np.inf)
+            largest = float(errors.largest[-LAST:].max())
+            since = judge(errors.largest, self._tolerance).since if largest <= self._tolerance else 0
             grown = growth(errors.largest)
             failure = grown.told() if grown and grown.diverges else ""
-            found.append(Found(float(errors.largest[-LAST:].max()), settled, effort, failure))
+            found.append(Found(largest, float(since or np.inf), effort, failure))
         return found
 
 
