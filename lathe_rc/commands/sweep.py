@@ -132,9 +132,7 @@ def run(
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
     """Return the cells with the smallest maximum error, and their varied parameters, errors and margins."""
-    from lathe_rc.sweep.page_data import default_goal
-
-    goal = default_goal(found.folder)
+    goal = found.folder.description.goal
     columns = ["cell", *found.folder.targets, goal, goal.replace("max_error", "rms_error")]
     columns.append("margin" if goal.startswith("tool.") else goal.replace("max_error", "settling"))
     table = found.table().select(columns).sort_by(goal)
@@ -143,11 +141,10 @@ def best(found: "Sweep") -> list[dict[str, Any]]:
 
 def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) -> None:
     from lathe_rc.commands.tables import broken, console, table
-    from lathe_rc.sweep import row
 
     statuses, top, folder = found.statuses(), best(found), found.folder
     if as_json:
-        summary = {"folder": str(folder.path), "scenario": folder.scenario.name, "statuses": statuses, "best": top}
+        summary = {"folder": str(folder.path), "scenario": folder.name, "statuses": statuses, "best": top}
         if written:
             summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
         click.echo(json.dumps(summary))
@@ -156,7 +153,7 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
     if top:
         lines = table(*broken(list(top[0]), out.width), title="smallest errors", overflow="fold")
         for each in top:
-            lines.add_row(*(_formatted(value, *row.unit(name, folder.scenario)) for name, value in each.items()))
+            lines.add_row(*(_formatted(value, *folder.description.unit(name)) for name, value in each.items()))
         out.print(lines, soft_wrap=False)
     out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
     out.print(f"rows:    {folder.path}/rows")

@@ -22,7 +22,7 @@ from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.page_data import PageData, default_goal, text_of
+from lathe_rc.sweep.page_data import PageData, text_of
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.view.charts import Charts, page_template
 
@@ -91,9 +91,9 @@ def _text(seen: PageData, drawn: Charts) -> str:
     if not sections["nothing"]:
         sections |= _sections(seen, done, drawn)
     return page_template(Path(__file__).with_name("page.html.j2")).render(
-        title=f"Sweep of {seen.folder.scenario.name}",
+        title=f"Sweep of {seen.folder.name}",
         goal=seen.goal,
-        default_goal=default_goal(seen.folder),
+        default_goal=seen.folder.description.goal,
         cells=len(seen.cells),
         facts=_facts(seen, done),
         asked=seen.asked(),

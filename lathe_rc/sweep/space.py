@@ -124,6 +124,7 @@ class Space:
         twice += [target for target in self.sampled if target in self.ties]
         if twice:
             raise InputError(f"{twice[0]}: varied, drawn or tied twice; allowed: once")
+        check_distinct(self.targets())
         if self.seeds < 1:
             raise InputError(f"seeds = {self.seeds}; allowed: from 1")
         for target in self.targets():
@@ -148,7 +149,9 @@ class Space:
         axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
-        for given in self.given or ({},):
+        rows = {target: scenario.parameter(target) for cell in self.given for target in cell}
+        for cell in self.given or ({},):
+            given = {target: _plain(rows[target], value) for target, value in cell.items()}
             for combination in itertools.product(*axes.values()):
                 fixed = {**given, **dict(zip(axes, combination, strict=True))}
                 for drawn in self._draws(scenario):
@@ -229,7 +232,7 @@ def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequen
         _check_type(target, row, value)
     if not found:
         raise InputError(f"{target}: no value; allowed: one or more")
-    return list({canonical({target: value}): value for value in found}.values())
+    return list({canonical({target: value}): value for value in (_plain(row, each) for each in found)}.values())
 
 
 def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
@@ -275,6 +278,25 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
         found = number(scenario, target, text)
         return found if row.type is float else round(found)
     return ros_yaml.parse_value(text, target)
+
+
+def check_distinct(targets: Sequence[str]) -> None:
+    """Reject two targets that set the same parameter: of a list and an element, or of all nodes and one node.
+
+    Raises:
+        InputError: there are two such targets.
+    """
+    for one, other in itertools.permutations(targets, 2):
+        whole = other.partition("[")[0].strip()
+        if one in (whole, whole.rpartition(".")[2]):
+            raise InputError(f"{one} and {other} set the same parameter; allowed: one of them")
+
+
+def _plain(row: Row, value: Value) -> Value:
+    """Return a value in its parameter's type: 1 for a real number is 1.0, so that both are the same cell."""
+    if row.type is not float:
+        return value
+    return [float(item) for item in value] if isinstance(value, list) else float(cast("float", value))
 
 
 def _check_type(target: str, row: Row, value: Value) -> None:

@@ -262,7 +262,7 @@ class Study:
         given = [{**values, **each} for each in self._asked.over.given or ({},)]
         cells = replace(self._asked.over, given=given).cells(self._folder.scenario)
         first = trial.number * self.count
-        return [Job(first + place, self._key.of(each), each) for place, each in enumerate(cells)]
+        return [self._key.job(first + place, each) for place, each in enumerate(cells)]
 
     def _tell(self, number: int, score: Score) -> None:
         trial = self._trial(number)

@@ -17,9 +17,9 @@ import pyarrow as pa
 from lathe_rc import allowed_code
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.scenario import Scenario, content
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.sweep import row
+from lathe_rc.sweep import inputs, row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space, canonical
 from lathe_rc.sweep.workers import Job, Order, client_of, rows
@@ -46,7 +46,7 @@ class Sweep:
     def __repr__(self) -> str:
         """Return the scenario and the numbers of cells by status as a string."""
         told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
-        return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
+        return f"<Sweep of {self.folder.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
     def table(self) -> pa.Table:
         """Return the table of rows in cell order (columns: `lathe_rc.sweep.row`)."""
@@ -68,7 +68,7 @@ class Sweep:
         """Return the scenario of a cell, for example to run it again.
 
         Raises:
-            InputError: the cell does not exist, is not computed yet, or was refused.
+            InputError: the cell does not exist, is not computed yet, or was refused; or its code or files are missing.
         """
         return self.folder.scenario.varied(self.folder.values(number))
 
@@ -152,7 +152,14 @@ def order_of(folder: Folder) -> Order:
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
-        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, allowed_code.arguments()
+        scenario.name,
+        text,
+        scenario.identity,
+        folder.targets,
+        folder.measures,
+        folder.schema,
+        allowed_code.arguments(),
+        folder.inputs,
     )
 
 
@@ -192,33 +199,46 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
     # A single space has no duplicate cells, so no table of keys is needed, which could have millions of entries.
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
-            yield Job(number, key.of(values), values)
+            yield key.job(number, values)
         return
     numbers: dict[str, int] = {}
     for each in folder.spaces:
         for values in each.cells(folder.scenario):
-            found = key.of(values)
-            number = numbers.setdefault(found, len(numbers))
+            found = key.job(len(numbers), values)
+            number = numbers.setdefault(found.key, len(numbers))
             if each == space:
-                yield Job(number, found, values)
+                yield found._replace(number=number)
 
 
 class Key:
-    """Hash function for cells, over the scenario, the measures, and the values that differ from the scenario's own."""
+    """Keys of cells: hashes of the scenario, the measures, and the values that differ from the scenario's own.
+
+    A hash covers the content of the third-party classes and the files that the cell names.
+    """
 
     def __init__(self, folder: Folder) -> None:
-        scenario = folder.scenario
+        self._scenario = scenario = folder.scenario
         self._base = {target: scenario.value(target) for target in [*folder.targets, "seed"]}
-        self._files = {target for target in folder.targets if scenario.parameter(target).is_path}
-        measured = [each.name for each in folder.measures]
-        self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())
+        # Such a parameter has the scenario's value in a cell only if it is given: otherwise it follows a varied drive.
+        for target in [target for target in folder.targets if scenario.follows(target)]:
+            del self._base[target]
+        self._naming = [target for target in folder.targets if inputs.names_inputs(scenario, target)]
+        self._named: dict[str, dict[str, str]] = {}
+        self._inputs = inputs.of_cell(scenario)
+        self._code = inputs.code(self._inputs)
+        measured = sorted(each.name for each in folder.measures)
+        self._start = hashlib.sha256("\n".join([scenario.identity, *measured, *filter(None, [self._code])]).encode())
 
-    def of(self, values: Mapping[str, Value]) -> str:
-        """Return the hash of a cell in hexadecimal digits."""
-        own = {target: value for target, value in values.items() if value != self._base[target]}
-        # A file is identified by its content, not by its path.
-        for target in self._files & own.keys():
-            own[target] = content(Path(str(own[target])))
+    def job(self, number: int, values: dict[str, Value]) -> Job:
+        """Return the job of a cell, with its key in hexadecimal digits."""
+        own: dict[str, Any] = {target: value for target, value in values.items() if value != self._base.get(target)}
+        code = self._code
+        if naming := {target: own[target] for target in self._naming if target in own}:
+            text = canonical(naming)
+            if text not in self._named:
+                self._named[text] = inputs.of_values(self._scenario, naming)
+            own["inputs"] = sorted(self._named[text].values())
+            code = inputs.code(self._inputs | self._named[text])
         found = self._start.copy()
         found.update(canonical(own).encode())
-        return found.hexdigest()[:32]
+        return Job(number, found.hexdigest()[:32], values, code)

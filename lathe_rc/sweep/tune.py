@@ -25,7 +25,7 @@ from lathe_rc.sweep import BATCH, SAMPLERS
 from lathe_rc.sweep.folder import Folder, Request, writing
 from lathe_rc.sweep.objectives import Objectives, objectives
 from lathe_rc.sweep.search_space import Dimension, search_space
-from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.space import Space, check_distinct
 from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuning import Tuning
@@ -96,6 +96,7 @@ def tune(
     if twice := [target for target in found if target in over.targets()]:
         raise InputError(f"{twice[0]}: free, and what the goal is over as well; allowed: one of both")
     over.check(scenario)
+    check_distinct([*found, *over.targets()])
     _check_sampler(sampler, wanted, found)
     for name, number in (("trials", trials), ("batch", batch)):
         if number < 1:

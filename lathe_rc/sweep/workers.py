@@ -30,6 +30,7 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.sweep import row
+from lathe_rc.sweep.inputs import Inputs, check_here
 from lathe_rc.sweep.row import Measure
 
 TASK = 2.0  #: target duration of a task [s]
@@ -57,11 +58,13 @@ class Job(NamedTuple):
         number: number within the sweep.
         key: hash that identifies the cell.
         values: values of the varied parameters, by target.
+        code: hash of the third-party classes of the cell; None if there are none.
     """
 
     number: int
     key: str
     values: dict[str, Value]
+    code: str | None
 
 
 class Order(NamedTuple):
@@ -74,7 +77,8 @@ class Order(NamedTuple):
         targets: columns of the varied parameters.
         measures: further columns.
         schema: schema of the rows.
-        code: options that allow a worker to import packages, see `lathe_rc.allowed_code`.
+        allowed: options that allow a worker to import packages, see `lathe_rc.allowed_code`.
+        inputs: third-party classes and files, which the worker verifies.
     """
 
     name: str
@@ -83,7 +87,8 @@ class Order(NamedTuple):
     targets: Sequence[str]
     measures: Sequence[Measure]
     schema: pa.Schema
-    code: Sequence[str]
+    allowed: Sequence[str]
+    inputs: Inputs
 
 
 @dataclass(frozen=True)
@@ -115,12 +120,14 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 def compute(share: Share) -> pa.Table:
     """Compute the rows of several cells (task function for Dask)."""
     order = share.order
-    allowed_code.taken_from(order.code)
+    allowed_code.taken_from(order.allowed)
     base, bench = _scenario(order.name, order.text, order.identity), CellRunner()
     rows = [
-        {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
+        {"cell": job.number, "key": job.key, "code": job.code}
+        | row.compute(base, job.values, order.targets, order.measures, bench)
         for job in share.jobs
     ]
+    check_here(order.inputs)  # not earlier: a cell imports the classes that its values name
     return pa.Table.from_pylist(rows, order.schema)
 
 
