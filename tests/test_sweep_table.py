@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of a sweep over a history of commands: one schema, values with which cells ran, and the code of each row."""
+"""The table of a sweep over several commands: one schema, the values with which cells ran, and the code of rows."""
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -12,11 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 import lathe_rc
-from lathe_rc import allowed_code, extensions, files, harness
+from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.stages import STAGES
 from lathe_rc.cli import main
-from lathe_rc.errors import InputError, LatheError
-from lathe_rc.sweep import row
+from lathe_rc.errors import InputError
+from lathe_rc.sweep import inputs, row
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space
 
@@ -74,7 +74,10 @@ def test_whole_numbers_are_the_same_cells_as_real_ones(piston, client, tmp_path)
 
 
 def test_targets_that_set_the_same_parameter_are_refused(piston):
-    for one, other in (("nominal_rpm", RPM), ("spindle_encoder.deviation_amplitude", "spindle_encoder.deviation_amplitude[0]")):
+    for one, other in (
+        ("nominal_rpm", RPM),
+        ("spindle_encoder.deviation_amplitude", "spindle_encoder.deviation_amplitude[0]"),
+    ):
         with pytest.raises(InputError, match="set the same parameter; allowed: one of them"):
             Space(grid={other: "1", one: "1"}).check(piston)
 
@@ -121,3 +124,104 @@ def test_a_further_axis_survives_an_end_at_any_write(call, piston, tmp_path, mon
     assert found.table()["nominal_rpm"].to_pylist() == [1000.0, 1000.0]
     assert len(schemas(place)) == 1
     assert sorted(path.name for path in place.iterdir() if path.is_dir()) == ["rows"]
+
+
+# ---- the code of a row -------------------------------------------------------------------------------------------
+
+
+LAW = '''
+from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+import my_gain
+
+class Drive(ElectrodynamicActuator):
+    """A drive of one's own."""
+'''
+
+
+@pytest.fixture
+def own_drive(tmp_path, monkeypatch):
+    """A scenario with a drive in the current folder, and a function that edits a module beside it."""
+    (tmp_path / "my_gain.py").write_text("GAIN = 1.0\n")
+    (tmp_path / "my_drive.py").write_text(LAW)
+    monkeypatch.chdir(tmp_path)
+    registries = [STAGES._found]
+
+    def forget():
+        for name in ("my_drive", "my_gain"):
+            sys.modules.pop(name, None)
+        for found in registries:
+            found.pop("my_drive:Drive", None)
+        extensions.source_hash.cache_clear()
+        inputs._hash_here.cache_clear()
+
+    def edit(text):
+        (tmp_path / "my_gain.py").write_text(text)
+        forget()
+
+    def load():
+        return scenarios.load(
+            CONFIG / "piston.yaml", ["spindle_encoder.revolutions=2", "electrodynamic_actuator.stage=my_drive:Drive"]
+        )
+
+    with allowed_code.call(own=True):
+        allowed_code.allow("my_drive")
+        yield load, edit
+    forget()
+
+
+def test_rows_of_other_code_are_not_mixed(own_drive, client, tmp_path):
+    """A module that an own class imports is edited: the folder refuses further cells, and shows the old rows."""
+    load, edit = own_drive
+    place, space = tmp_path / "rows", Space(grid={LEAD: [1.3e-3]})
+    found = lathe_rc.run_sweep(load(), space, place, client=client)
+    (before,) = found.table().to_pylist()
+    assert before["code"].startswith("xxh3:")
+    edit("GAIN = 2.0\n")
+    with pytest.raises(
+        InputError, match=r"my_drive:Drive has the hash \w{12} here, and \w{12} in the rows; allowed: as "
+    ):
+        lathe_rc.run_sweep(load(), space, place, client=client)
+    (other,) = lathe_rc.run_sweep(load(), space, tmp_path / "other", client=client).table().to_pylist()
+    assert other["code"] != before["code"]
+    assert other["key"] != before["key"]
+    edit("GAIN = 1.0\n")
+    assert lathe_rc.run_sweep(load(), space, place, client=client).table().to_pylist() == [before]
+
+
+def test_results_are_shown_without_the_files_and_code_of_the_cell(own_drive, client, tmp_path):
+    load, _ = own_drive
+    place = tmp_path / "rows"
+    lathe_rc.run_sweep(load(), Space(grid={LEAD: [1.3e-3, 1.4e-3]}), place, client=client)
+    (tmp_path / "my_drive.py").unlink()
+    sys.modules.pop("my_drive")
+    STAGES._found.pop("my_drive:Drive")
+    done = CliRunner().invoke(main, ["sweep", "show", str(place)])
+    assert (done.exit_code, "2 done" in done.stdout) == (0, True)
+    again = CliRunner().invoke(main, ["sweep", "show", str(place), "--cell", "0"])
+    assert (again.exit_code, "my_drive" in again.stderr) == (2, True)
+
+
+def test_another_digest_than_in_the_row_is_a_failure(piston, client, tmp_path):
+    place = tmp_path / "rows"
+    found = lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client)
+    (path,) = (place / "rows").iterdir()
+    rows = found.table().to_pylist()
+    rows[0] |= {"digest": "xxh3:0", "version": "0.0.1"}
+    path.unlink()
+    found.folder.write([pyarrow.Table.from_pylist(rows, found.folder.schema)])
+    for words in ([], ["--json"]):
+        done = CliRunner().invoke(main, ["sweep", "show", str(place), "--cell", "0", *words])
+        assert done.exit_code == 1
+    events = []
+    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client, watch=events.append)
+    assert events[0]["others"] == {"0.0.1": 1}
+
+
+def test_a_sweep_of_another_cell_says_what_differs(piston, tmp_path):
+    Folder.begin(tmp_path / "rows", piston, Space(seeds=2), [])
+    for changed, said in (
+        ({"nominal_rpm": 900.0}, "nominal_rpm = 1000.0 there, and 900.0 here; allowed: a new folder"),
+        ({LEAD: 1e-3}, f"{LEAD} = 0.001425 there"),
+    ):
+        with pytest.raises(InputError, match=f"holds a sweep of another cell: .*{said}"):
+            Folder.begin(tmp_path / "rows", piston.varied(changed), Space(seeds=2), [])

@@ -322,7 +322,7 @@ def differences(one: Scenario, other: Scenario) -> list[str]:
     trees = [yaml.safe_load(each.to_yaml(given=True)) for each in (one, other)]
     there, here = (
         {
-            f"{node.removeprefix('/**/')}.{name}": value
+            name if name in SharedParameters.model_fields else f"{node.removeprefix('/**/')}.{name}": value
             for node, table in tree.items()
             for name, value in table[_ROS].items()
         }

@@ -210,9 +210,10 @@ class Folder:
         """Arrow schema of the rows."""
         return row.schema(self.description.targets, self.measures)
 
-    def keys(self) -> set[str]:
-        """Return the keys of all computed cells."""
-        return set(self._read(["key"]).column("key").to_pylist())
+    def versions(self) -> dict[str, str]:
+        """Return the version of lathe_rc that computed each cell, by key."""
+        found = self._read(["key", "version"])
+        return dict(zip(found.column("key").to_pylist(), found.column("version").to_pylist(), strict=True))
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the table of rows in cell order.

@@ -102,9 +102,9 @@ def run_sweep(
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.
-        watch: called with the events ``began`` (cells; computed: number of existing rows), ``compiling``
-            (nodes), ``ready`` (dashboard: address of Dask's dashboard) and ``rows`` (statuses: numbers of cells by
-            status).
+        watch: called with the events ``began`` (cells; computed: number of existing rows; others: their numbers by
+            other version of lathe_rc), ``compiling`` (nodes), ``ready`` (dashboard: address of Dask's dashboard) and
+            ``rows`` (statuses: numbers of cells by status).
 
     Raises:
         InputError: the space is invalid, the folder has other contents, or there is no scheduler at the address.
@@ -124,9 +124,17 @@ def run_sweep(
     space.check(scenario)
     kept = Folder.begin(Path(folder), scenario, space, asked)
     with kept.locked():
-        there, total = kept.keys(), space.count(scenario)
-        left = total - sum(1 for job in _jobs(kept, space) if job.key in there) if there else total
-        watch({"event": "began", "cells": total, "computed": total - left})
+        there, total = kept.versions(), space.count(scenario)
+        versions = Counter(there[job.key] for job in _jobs(kept, space) if job.key in there) if there else Counter()
+        left = total - versions.total()
+        watch(
+            {
+                "event": "began",
+                "cells": total,
+                "computed": total - left,
+                "others": versions - Counter({row.revision(): total}),
+            }
+        )
         if left:
             with crew_for(scenario, client, scheduler, workers, watch) as crew:
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
