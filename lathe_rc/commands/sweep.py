@@ -11,13 +11,14 @@ from click.shell_completion import CompletionItem
 
 import lathe_rc
 from lathe_rc.commands import completers, options
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
     from lathe_rc.sweep.page import Written
     from lathe_rc.sweep.sweep import Sweep
 
 _BEST = 5  # number of displayed cells
+_REASONS = 6  # number of displayed reasons
 
 
 def check_crew(scheduler: str | None, workers: int | None) -> None:
@@ -96,6 +97,7 @@ def space_of(
     show_default=True,
     help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
 )
+@click.option("--retry", is_flag=True, help="compute failed cells again")
 @options.many_cells("sweep-SCENARIO")
 def run(
     scenario: str,
@@ -128,6 +130,11 @@ def run(
     with SweepWatch(place, quiet=as_json) as watch:
         found = lathe_rc.run_sweep(loaded, space, place, scheduler=scheduler, workers=workers, watch=watch, **how)
     _show(found, as_json=as_json)
+    statuses = found.statuses()
+    if not statuses.get("done"):
+        raise LatheError(f"no cell of {place} came to a result")
+    if failed := statuses.get("failed"):
+        raise LatheError(f"{failed} cells of {place} failed; --retry computes them again")
 
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
@@ -145,6 +152,7 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
     statuses, top, folder = found.statuses(), best(found), found.folder
     if as_json:
         summary = {"folder": str(folder.path), "scenario": folder.name, "statuses": statuses, "best": top}
+        summary["reasons"] = [each._asdict() for each in found.outcomes() if each.reason]
         if written:
             summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
         click.echo(json.dumps(summary))
@@ -156,6 +164,11 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
             lines.add_row(*(_formatted(value, *folder.description.unit(name)) for name, value in each.items()))
         out.print(lines, soft_wrap=False)
     out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
+    reasons = [each for each in found.outcomes() if each.reason]
+    for outcome in reasons[:_REASONS]:
+        out.print(f"{outcome.cells} {outcome.status}, such as {outcome.example}", soft_wrap=True, highlight=False)
+    if more := reasons[_REASONS:]:
+        out.print(f"{sum(outcome.cells for outcome in more)} for {len(more)} more reasons, which are on the page")
     out.print(f"rows:    {folder.path}/rows")
     out.print(f"page:    {written.page if written else f'lathe sweep show {folder.path}'}")
     if written and written.figures:

@@ -16,7 +16,7 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -227,7 +227,7 @@ class Folder:
     def _read(self, columns: Sequence[str] | None) -> pa.Table:
         whole = self.schema.empty_table()
         whole = whole if columns is None else whole.select(list(columns))
-        return pa.concat_tables([whole, *(self._rows(path, columns)[0] for path in self._paths())])
+        return pa.concat_tables([whole, *(self._rows(path, columns) for path in self._paths())])
 
     def _paths(self) -> list[Path]:
         """Return the files of rows; a process killed between the two renames of `_conform` leaves only the new ones."""
@@ -235,8 +235,8 @@ class Folder:
         with _reading(self.path):
             return sorted(path for path in place.iterdir() if path.suffix == ".parquet") if place else []
 
-    def _rows(self, path: Path, columns: Sequence[str] | None) -> tuple[pa.Table, bool]:
-        """Return the rows of one Parquet file, and whether the file has all columns."""
+    def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
+        """Return the rows of one Parquet file."""
         content = pa.BufferReader(_read(path))
         try:
             names = pyarrow.parquet.read_schema(content).names
@@ -245,11 +245,11 @@ class Folder:
             content.seek(0)
             if set(names) >= set(self.schema.names):
                 names = columns and list(columns)
-                return pyarrow.parquet.read_table(content, columns=names, schema=self.schema), True
+                return pyarrow.parquet.read_table(content, columns=names, schema=self.schema)
             found = self._completed(pyarrow.parquet.read_table(content, schema=self.schema))
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: no rows of a sweep ({shown(error)}); allowed: without it") from None
-        return found if columns is None else found.select(list(columns)), False
+        return found if columns is None else found.select(list(columns))
 
     def _completed(self, found: pa.Table) -> pa.Table:
         """Return rows with the values of the parameters that were not varied when these cells were computed."""
@@ -266,21 +266,32 @@ class Folder:
             found = found.set_column(self.schema.names.index(name), self.schema.field(name), values.column(name))
         return found
 
-    def _conform(self) -> None:
-        """Write all rows anew if some have not all columns; call it with the folder's lock held."""
+    def forget(self, keys: Collection[str]) -> None:
+        """Remove the rows with these keys.
+
+        Raises:
+            LatheError: the files cannot be written; existing rows are preserved.
+        """
+        if keys:
+            with locked(self.path / _WRITING), writing(self.path):
+                self._conform(keys)
+
+    def _conform(self, without: Collection[str] = ()) -> None:
+        """Write all rows anew if some have not all columns, or some are to be left out; call it with the lock held."""
         place, new, old = (self.path / name for name in (_ROWS, _NEW, _OLD))
         if not place.exists() and new.exists():  # between the two renames below
             new.rename(place)
         place.mkdir(exist_ok=True)
         for left in (new, old):
             shutil.rmtree(left, ignore_errors=True)
-        if all(_columns(path) == self.schema.names for path in self._paths()):
+        if not without and all(_columns(path) == self.schema.names for path in self._paths()):
             return
+        kept = ~pyarrow.compute.field("key").isin(pa.array(list(without), pa.string()))
         try:
             new.mkdir()
             for path in self._paths():
                 with files.replacing(new / path.name) as stream:
-                    stream.write(_parquet(self._rows(path, None)[0]))
+                    stream.write(_parquet(self._rows(path, None).filter(kept)))
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)  # a full disk gets its room back
             raise

@@ -5,7 +5,6 @@
 """
 
 import math
-import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -22,6 +21,7 @@ from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.outcomes import outcomes
 from lathe_rc.sweep.page_data import PageData, text_of
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.view.charts import Charts, page_template
@@ -37,7 +37,6 @@ _FIELD = 10  # mean number of cells per field where values are binned
 _BEST = 10  # listed cells
 _MOST_REASONS = 12
 _SCALE = 2.0  # scale of the PNGs
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
 
 
@@ -138,18 +137,10 @@ def _facts(seen: PageData, done: Yield) -> Iterator[tuple[str, str, str]]:
 
 def _outcomes(seen: PageData) -> list[list[str]]:
     """Return one row per outcome of the cells: status, number, share, and the reason of one cell as an example."""
-    # Reasons that differ only in numbers count as one outcome.
-    groups: dict[tuple[str, str], list[int]] = {}
-    statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
-    for place, (status, reason) in enumerate(zip(statuses, reasons, strict=True)):
-        groups.setdefault((status, _NUMBER.sub("…", reason or "")), []).append(place)
-    largest = sorted(groups.items(), key=lambda item: -len(item[1]))
-    found = [
-        (status, len(places), f"cell {seen.cells[places[0]]}: {reasons[places[0]]}" if pattern else "")
-        for (status, pattern), places in largest[:_MOST_REASONS]
-    ]
+    largest = outcomes(seen.table)
+    found = [(each.status, each.cells, each.example) for each in largest[:_MOST_REASONS]]
     if rest := largest[_MOST_REASONS:]:
-        found.append(("others", sum(len(places) for _, places in rest), f"{len(rest)} more reasons"))
+        found.append(("others", sum(each.cells for each in rest), f"{len(rest)} more reasons"))
     return [[status, str(count), f"{count / len(seen.cells):.1%}", told] for status, count, told in found]
 
 

@@ -17,6 +17,7 @@
 | TOPIC.FIELD:STATISTIC | a measure of the last revolution |
 | NODE.FIGURE | a figure of a force or position loop: always without a tool, otherwise if it is asked for |
 | revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
+| time_limit | time limit that ended a failed cell [s] |
 | seed, version, code, digest | random seed; version of lathe_rc; hash of third-party classes; see `digest` |
 """
 
@@ -24,6 +25,7 @@ import contextlib
 import math
 import subprocess
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -47,7 +49,7 @@ from lathe_rc.cell.stages.command_limits import LIMITED
 from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
@@ -76,6 +78,7 @@ _TAIL = {
     "revolutions": pa.int64(),
     "samples": pa.int64(),
     "seconds": pa.float64(),
+    "time_limit": pa.float64(),
     "seed": pa.int64(),
     "version": pa.string(),
     "code": pa.string(),
@@ -295,6 +298,10 @@ def compute(
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
         row["reason"] = str(error)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - third-party code can raise anything
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        row["status"] = FAILED
+        row["reason"] = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}: {shown(error)}"
     if cell is not None and cell.factors:
         row["margin"] = 1.0 - max(cell.factors.values())
     if cell is not None and (margins := cell.drive_margins):

@@ -2,6 +2,7 @@
 """Execution of a sweep, from its space to the table of results."""
 
 import hashlib
+import math
 import os
 import time
 from collections import Counter
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import distributed
 import pyarrow as pa
+import pyarrow.compute
 
 from lathe_rc import allowed_code
 from lathe_rc.cell.ahead import compile_ahead
@@ -20,7 +22,9 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.sweep import inputs, row
+from lathe_rc.sweep.alone import KILLED
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.outcomes import Outcome, outcomes
 from lathe_rc.sweep.space import Space, canonical
 from lathe_rc.sweep.workers import Job, Order, client_of, rows
 
@@ -60,6 +64,10 @@ class Sweep:
         """Return the numbers of cells by status, most frequent first."""
         return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
 
+    def outcomes(self) -> list[Outcome]:
+        """Return the statuses and reasons of the cells, most frequent first."""
+        return outcomes(self.folder.table(["cell", "status", "reason"]))
+
     def row(self, number: int) -> dict[str, Any]:
         """Return the row of a cell, by column; raises the same errors as `scenario`."""
         return self.folder.row(number)
@@ -87,6 +95,8 @@ def run_sweep(
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
+    cell_time: float | None = None,
+    retry: bool = False,
     watch: Watch = ignore,
 ) -> Sweep:
     """Compute all cells of a space that are not in the folder yet.
@@ -102,6 +112,9 @@ def run_sweep(
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.
+        cell_time: time limit of a cell [s]; None: 20 times the slowest cell so far, at least 60 s.
+        retry: whether to compute all failed cells again; otherwise only those that another version of lathe_rc has
+            computed, that reached a shorter time limit, or whose process was killed.
         watch: called with the events ``began`` (cells; computed: number of existing rows; others: their numbers by
             other version of lathe_rc), ``compiling`` (nodes), ``ready`` (dashboard: address of Dask's dashboard) and
             ``rows`` (statuses: numbers of cells by status).
@@ -124,6 +137,8 @@ def run_sweep(
     space.check(scenario)
     kept = Folder.begin(Path(folder), scenario, space, asked)
     with kept.locked():
+        if again := _failures(kept, cell_time, retry=retry):
+            kept.forget({job.key for job in _jobs(kept, space) if job.key in again})
         there, total = kept.versions(), space.count(scenario)
         versions = Counter(there[job.key] for job in _jobs(kept, space) if job.key in there) if there else Counter()
         left = total - versions.total()
@@ -138,8 +153,21 @@ def run_sweep(
         if left:
             with crew_for(scenario, client, scheduler, workers, watch) as crew:
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                keep(kept, rows(crew, order_of(kept), jobs, left), watch)
+                keep(kept, rows(crew, order_of(kept), jobs, left, cell_time), watch)
     return Sweep(kept)
+
+
+def _failures(folder: Folder, cell_time: float | None, *, retry: bool) -> set[str]:
+    """Return the keys of failed cells of which another try may help (arguments as of `run_sweep`)."""
+    found = folder.table(["key", "status", "reason", "version", "time_limit"])
+    return {
+        each["key"]
+        for each in found.filter(pyarrow.compute.field("status") == row.FAILED).to_pylist()
+        if retry
+        or each["version"] != row.revision()
+        or (each["time_limit"] or math.inf) < (cell_time or 0.0)
+        or KILLED in each["reason"]
+    }
 
 
 @contextmanager

@@ -51,6 +51,7 @@ def tune(
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
+    cell_time: float | None = None,
     watch: Watch = ignore,
 ) -> Tuning:
     """Search for parameters of a cell; existing trials in the folder are not computed again.
@@ -73,6 +74,7 @@ def tune(
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.
+        cell_time: time limit of a cell [s]; None: 20 times the slowest cell so far, at least 60 s.
         watch: called with the events of `lathe_rc.run_sweep` (``began`` gives the number of existing trials), with
             ``told`` (tuning: all trials so far) after each batch, and repeatedly with ``waiting`` while other
             processes compute the remaining trials.
@@ -124,7 +126,7 @@ def tune(
             while asked or state.count_trials(TrialState.RUNNING, trials):
                 if asked:
                     crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
-                    state.compute(crew, asked, watch)
+                    state.compute(crew, asked, watch, cell_time)
                 else:  # the best trial is known only when all are, including those of other processes
                     watch({"event": "waiting"})
                     time.sleep(_PAUSE)
