@@ -251,7 +251,9 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
     assert found.row(first["cell"]) == first
     told.clear()
     more = sweep(f"1.1e-3,{leads}")
-    assert [each for each in told if each["event"] == "began"] == [{"event": "began", "cells": 4, "computed": 3, "others": {}}]
+    assert [each for each in told if each["event"] == "began"] == [
+        {"event": "began", "cells": 4, "computed": 3, "others": {}}
+    ]
     assert more.table().column(LEAD).to_pylist() == [1.2e-3, 1.3e-3, 3e-3, 1.1e-3]
     assert more.table().column("cell").to_pylist() == [0, 1, 2, 3]
     # A further parameter: the rows so far have the scenario's own value of it.

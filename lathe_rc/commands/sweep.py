@@ -85,7 +85,7 @@ def space_of(
     "--sample",
     default="",
     metavar="SAMPLER:N",
-    help="points of ranges LOW:HIGH and of laws: sobol, halton, latin, random",
+    help="points of ranges LOW:HIGH and of laws: sobol, halton, latin, random, saltelli",
 )
 @options.seeds
 @click.option("--cells", type=options.PATH, help="CSV or YAML file with a cell a row")

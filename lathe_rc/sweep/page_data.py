@@ -120,6 +120,13 @@ class PageData:
         return len(set(self.table.column("seed").to_pylist()) - {None})
 
     @property
+    def lot(self) -> int:
+        """Number of cells that depend on the same drawn point: more than one in a Saltelli sample."""
+        spaces = self.folder.spaces
+        is_saltelli = len(spaces) == 1 and spaces[0].sample.startswith("saltelli") and spaces[0].seeds == 1
+        return len(spaces[0].sampled) + 2 if is_saltelli else 1
+
+    @property
     def is_sampled(self) -> bool:
         """Whether all cells are sample points, so that their shares are estimates for the population."""
         return all(space.sample and not space.grid and not space.given for space in self.folder.spaces)

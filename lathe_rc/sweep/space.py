@@ -35,9 +35,9 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
 from lathe_rc.sweep.derived_parameters import Formulas, ordered
 
-SAMPLERS = ("sobol", "halton", "latin", "random")
+SAMPLERS = ("sobol", "halton", "latin", "random", "saltelli")
 _MOST_POINTS = 2**24
-_SAMPLES = f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
+_SAMPLES = f"sobol:N, halton:N, latin:N, random:N or saltelli:N, N from 1 up to {_MOST_POINTS}"
 _PIECE = 2**12  # number of sample points drawn at a time
 _LONG = 40  # number of characters of an axis that a message quotes
 
@@ -78,7 +78,8 @@ class Space:
             ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, or ``normal:DEVIATION`` about the scenario's value.
         ties: formulas of derived parameters by target, such as ``fine_controller.q_time * 1.1``: targets with
             + - * / **, brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
-        sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; empty if nothing is sampled.
+        sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; ``saltelli:N`` for N (d + 2) points of d
+            parameters, of which pairs differ in one parameter alone; empty if nothing is sampled.
         seeds: number of seeds per combination of the other values, starting at the scenario's seed.
         given: individual cells, each as values by target.
         sample_seed: random seed of the sample.
@@ -169,7 +170,7 @@ class Space:
         count = int(number) if number.isascii() and number.isdigit() else 0
         if name not in SAMPLERS or not 0 < count <= _MOST_POINTS:
             raise InputError(f"sample {self.sample!r}; allowed: {_SAMPLES}")
-        return count
+        return count * (len(self.sampled) + 2) if name == "saltelli" else count
 
     def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
         """Yield the sampled values of each point, by target."""
@@ -185,6 +186,12 @@ class Space:
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
     """Yield points in the unit cube, shape (n, dimensions); a larger sample starts with the points of a smaller one."""
+    if name == "saltelli":  # Saltelli et al. 2010: A, B, and A with one column of B; a larger sample adds such groups
+        for pairs in _sample("sobol", count // (dimensions + 2), 2 * dimensions, seed):
+            one, other = pairs[:, None, :dimensions], pairs[:, None, dimensions:]
+            mixed = np.where(np.eye(dimensions, dtype=bool), other, one)
+            yield np.concatenate([one, other, mixed], axis=1).reshape(-1, dimensions)
+        return
     if name == "latin":  # all points at once, because they depend on the count
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
