@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.plants.modes import own_velocity
 
 MILLI = 1e-3  #: unit of the delay among the searched parameters [s]
 BASE = 4  #: searched parameters without modes and lags
@@ -68,6 +69,11 @@ class ModalDrive:
     lag_participation: tuple[float, ...] = ()
 
     @property
+    def normal(self) -> bool:
+        """Whether the modes have real residues, and there are no lags."""
+        return not self.mode_velocity and not self.lag_time
+
+    @property
     def modes(self) -> list[tuple[float, float, float, float]]:
         """Frequency [rad/s], damping, participation and participation of the velocity of each mode."""
         velocity = self.mode_velocity or (0.0,) * len(self.mode_frequency)
@@ -82,8 +88,9 @@ class ModalDrive:
     def sections(self) -> list[tuple[float, float, float, float]]:
         """The drive itself and its modes, as `modes`."""
         share = 1.0 - sum(self.mode_participation) - sum(self.lag_participation)
-        velocity = sum(v * w for w, _, _, v in self.modes) + sum(r / t for t, r in self.lags)
-        return [(self.natural_frequency, self.damping, share, -velocity / self.natural_frequency), *self.modes]
+        others = self.mode_velocity or (0.0,) * len(self.mode_frequency)
+        own = own_velocity(self.natural_frequency, self.mode_frequency, others, self.lag_time, self.lag_participation)
+        return [(self.natural_frequency, self.damping, share, own), *self.modes]
 
     def response(self, frequency: Array) -> Complex:
         """Return W(jω) at frequencies [rad/s], shape (n,)."""

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from lathe_rc.analysis import vector_fitting
@@ -346,7 +347,7 @@ class ModalFit:
         spread = np.sqrt(np.diag(self.covariance))
         root = spread[:, None] * scipy.linalg.cholesky(self.covariance / np.outer(spread, spread), lower=True)
         offsets = np.stack((directions, -directions), axis=1).reshape(-1, size)[:count] @ root.T
-        if not drive.mode_velocity and not drive.lag_time:
+        if drive.normal:
             most = (1.0 - _LEAST_PART) * (1.0 - sum(drive.mode_participation))
             offsets *= (most / np.maximum(offsets[:, BASE + 2 :: drive.each].sum(axis=1), most))[:, None]
         places = drive.searched() + offsets
@@ -377,6 +378,11 @@ def _bounds(data: Data, drive: ModalDrive) -> Array:
     lag = [np.log([0.1 / high, 3.0 / low]), share]
     rows = [*own, *(mode * len(drive.mode_frequency)), *(lag * len(drive.lag_time))]
     return np.array(rows, dtype=np.float64)
+
+
+def _at_bounds(data: Data, drive: ModalDrive) -> npt.NDArray[np.bool_]:
+    """Return which of the searched parameters lie at a bound, shape (k,)."""
+    return np.asarray(np.abs(drive.searched()[:, None] - _bounds(data, drive)).min(axis=1) < 1e-3)
 
 
 def _search(data: Data, start: ModalDrive, deviation: Array, tolerance: float) -> ModalDrive:
@@ -658,12 +664,12 @@ def _refusals(data: Data, fit: ModalFit) -> list[str]:
                 f"{name} = {value:.4g} ± {error:.2g} {unit}".rstrip()
                 + f"; allowed: known to {100.0 * UNKNOWN:g} % (a wider band, more points or averages, other --modes)"
             )
-    edge = np.abs(drive.searched()[:, None] - _bounds(data, drive)).min(axis=1) < 1e-3
+    edge = _at_bounds(data, drive)
     edge[2] &= drive.delay > MILLI
     if edge.any():
         found.append("a parameter lies at its bound; allowed: a drive of second order or more, with modes and lags")
     whole = sum(drive.mode_participation)
-    if whole >= 1.0 and not drive.mode_velocity and not drive.lag_time:
+    if whole >= 1.0 and drive.normal:
         found.append(
             f"the participations of the modes sum up to {whole:.4g}; allowed: below 1 (give fewer --modes, or "
             "measure lower frequencies too)"
@@ -673,14 +679,14 @@ def _refusals(data: Data, fit: ModalFit) -> list[str]:
 
 def _unsure(data: Data, drive: ModalDrive, model_error: float) -> bool:
     """Return whether the points leave a parameter of the model open, so that it stands for something else."""
-    if sum(drive.mode_participation) >= 1.0 and not drive.mode_velocity and not drive.lag_time:
+    if sum(drive.mode_participation) >= 1.0 and drive.normal:
         return True
     try:
         spread = np.sqrt(np.diag(_covariance(data, drive, model_error)))
     except InputError:
         return True
-    x, own, count = drive.searched(), BASE, len(drive.mode_frequency)
-    modes, lags = np.split(np.stack((x, spread)[:], axis=1)[own:], [drive.each * count])
+    count = len(drive.mode_frequency)
+    modes, lags = np.split(np.stack((drive.searched(), spread), axis=1)[BASE:], [drive.each * count])
     for mode in modes.reshape(count, drive.each, 2):
         size = np.hypot(*mode[2:, 0]) if drive.each == 4 else abs(mode[2, 0])
         if not (mode[0, 1] < UNKNOWN and mode[1, 1] < UNKNOWN and np.max(mode[2:, 1]) < size / 3.0):
@@ -688,7 +694,7 @@ def _unsure(data: Data, drive: ModalDrive, model_error: float) -> bool:
     for lag in lags.reshape(-1, 2, 2):
         if not (lag[0, 1] < UNKNOWN and lag[1, 1] < abs(lag[1, 0]) / 3.0):
             return True
-    edge = np.abs(x[:, None] - _bounds(data, drive)).min(axis=1) < 1e-3
+    edge = _at_bounds(data, drive)
     edge[2] = False
     return bool(edge.any() or np.any(spread[:2] > UNKNOWN))
 

@@ -25,7 +25,7 @@ from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
@@ -177,7 +177,7 @@ class Errors:
         read = {self._encoder: "angle_true", self._tool: "error"}
         self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read.items() if topic]
         types = {topic: source.type for topic, source in cell.dense.items()}
-        self.soundness = Soundness(fields_of(types, FORM))
+        self.soundness = Soundness.of_form(types)
         if any(stage.shared.faults for stage in cell.stages.values()):
             self.heard = [*self.heard, *(t for t, source in cell.sparse.items() if source.type == messages.EVENT)]
         self._errors, self._first, self._before = RunningErrors(), cell.first, 0

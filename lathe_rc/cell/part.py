@@ -15,7 +15,7 @@ from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.tool import ToolParameters
@@ -151,7 +151,7 @@ class ErrorsByRevolution:
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
-        self._topics, self.soundness = _encoder_and_tool(types), Soundness(fields_of(types, FORM))
+        self._topics, self.soundness = _encoder_and_tool(types), Soundness.of_form(types)
         self._errors: RunningErrors | None = None
         self.turns_before = 0
 
@@ -187,7 +187,7 @@ class FirstAndLast:
         encoder, tool = _encoder_and_tool(types)
         assert encoder is not None, "its caller has looked"
         assert tool is not None, "its caller has looked"
-        self._encoder, self._tool, self.soundness = encoder, tool, Soundness(fields_of(types, FORM))
+        self._encoder, self._tool, self.soundness = encoder, tool, Soundness.of_form(types)
         self._head = self._tail = np.empty((2, 0))  # angle and error
         self._start = 0.0  # angle at the start of the first revolution [rad]
         self._before = 0  # revolutions before the tail

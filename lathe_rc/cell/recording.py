@@ -13,7 +13,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end, turns_before
 from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
-from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
@@ -140,7 +140,7 @@ class Recording:
 
         The reason is a fault of a signal that the form error is made of, or the loss of a member (`lost`).
         """
-        soundness = Soundness(fields_of(self.types, FORM))
+        soundness = Soundness.of_form(self.types)
         sound = soundness.sound(self.first, self.samples, self.events)
         return sound, soundness.why or self.lost
 

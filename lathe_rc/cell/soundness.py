@@ -55,6 +55,11 @@ class Soundness:
         self.end: int | None = None
         self.why = ""
 
+    @classmethod
+    def of_form(cls, types: Mapping[str, str]) -> "Soundness":
+        """Return the end of the samples on which the form error may rest; ``types``: message types by topic."""
+        return cls(fields_of(types, FORM))
+
     def sound(self, first: int, samples: int, sparse: Mapping[str, Sequence[Sparse]]) -> int:
         """Return how many samples of a chunk, from its beginning on, are sound; ``sparse``: its messages by topic."""
         for found in sparse.values():

@@ -10,21 +10,15 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.errors import LossyRunError
 
 
-def losses(bags: Iterable[Path]) -> list[str]:
-    """Return the losses of members in the runs of bags, one line each."""
-    found = []
+def tell(bags: Iterable[Path]) -> bool:
+    """Print the losses of members in the runs of bags on the error stream; return whether there are any."""
+    found = False
     for path in bags:
         with Source(path, partial=True) as source:
-            found += [f"{path}: {loss}" for loss in [source.loss] if loss]
+            if loss := source.loss:
+                click.echo(f"{path}: {loss}", err=True)
+                found = True
     return found
-
-
-def tell(bags: Iterable[Path]) -> bool:
-    """Print the losses on the error stream; return whether there are any."""
-    found = losses(bags)
-    for line in found:
-        click.echo(line, err=True)
-    return bool(found)
 
 
 def end(*bags: Path) -> None:

@@ -22,6 +22,7 @@ share of the loop's own velocity is v0 = -(Σ vj·ωj + Σ rk/Tk)/ω1 (relative 
 force does not follow from its response to the command.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -142,12 +143,24 @@ def carriage(natural_frequency: float, damping: float, modes: Modes = NONE) -> C
     return Carriage(a, command, force, place)
 
 
+def own_velocity(
+    natural_frequency: float,
+    frequency: Iterable[float],
+    velocity: Iterable[float],
+    lag_time: Iterable[float],
+    lag: Iterable[float],
+) -> float:
+    """Return v0, the share of the loop's own velocity: with it the command does not act on the velocity at once."""
+    rates = sum(share / time for share, time in zip(lag, lag_time, strict=True))
+    return -(sum(v * w for v, w in zip(velocity, frequency, strict=True)) + rates) / natural_frequency
+
+
 def _sections(natural_frequency: float, damping: float, modes: Modes) -> tuple[Array, Array, Array, Array, Array]:
     """Return ω, ζ, p, v and e of the loop itself and the modes, shape (n,) each."""
     frequency, zeta = np.array([natural_frequency, *modes.frequency]), np.array([damping, *modes.damping])
-    velocity = np.array([0.0, *(modes.velocity or np.zeros(len(modes.frequency)))])
-    rates = sum(share / time for share, time in zip(modes.lag, modes.lag_time, strict=True))
-    velocity[0] = -(velocity @ frequency + rates) / natural_frequency
+    others = modes.velocity or (0.0,) * len(modes.frequency)
+    own = own_velocity(natural_frequency, modes.frequency, others, modes.lag_time, modes.lag)
+    velocity = np.array([own, *others])
     sensor, edge = (np.array([1.0 - sum(parts) - sum(modes.lag), *parts]) for parts in (modes.sensor, modes.edge))
     return frequency, zeta, sensor, velocity, edge
 

@@ -19,11 +19,11 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
+from lathe_rc.protocol.messages import Phase
 from lathe_rc.view.rerun_pieces import Pieces
 from lathe_rc.view.rerun_signals import drawn_fields
 
 Message = tuple[str, str, bytes]  # fully qualified topic, message type, encoded message
-_SAFE = 4  # CellState.SAFE
 #: types of the topics whose figures rest on the samples of other nodes
 _RESULTS = {messages.TOOL, messages.SERVO, messages.LEARNING, messages.PERIODIC, messages.MARGIN}
 
@@ -262,7 +262,7 @@ class LiveRuns:
                     self._block(topic, msgtype, block)
             elif msgtype == messages.CELL_STATE:
                 state = messages.decode(msgtype, data)
-                if self._run and state.state == _SAFE and state.run_id == self._run.shown.run_id:
+                if self._run and state.state == Phase.SAFE and state.run_id == self._run.shown.run_id:
                     self._run.lose(int(state.first_index), str(state.message))
             else:
                 message = messages.decode(msgtype, data)

@@ -14,7 +14,7 @@ from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
 from lathe_rc.cell import part
-from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
@@ -74,7 +74,7 @@ class Form:
         doubt: float = 0.0,
         types: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self._soundness = Soundness(fields_of(types, FORM))
+        self._soundness = Soundness.of_form(types)
         self._encoder, self.tool, self.tolerance, self._doubt = encoder, tool, tolerance, doubt
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions

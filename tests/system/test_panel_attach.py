@@ -99,7 +99,7 @@ def test_a_panel_that_attaches_to_a_retracted_machine_shows_state_alarm_and_faul
 
     When the cell is killed, the lamp is late and keeps its state.
     """
-    given = ["revolutions=400", "speed_factor=0.1", "faults=['revolution 5: encoder missed_index']"]
+    given = ["revolutions=4000", "speed_factor=0.1", "faults=['revolution 5: encoder missed_index']"]
     loaded = load(SUPERVISED, [f"spindle_encoder.{each}" for each in given])
     cell = harness.with_recorder(loaded, tmp_path / "bag", keep=True)
     with (

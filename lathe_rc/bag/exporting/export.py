@@ -195,21 +195,19 @@ def export_bag(
         types, step_ns = _selected(source, topics), _step_ns(source)
         signals = {topic: kind for topic, kind in types.items() if step_ns and kind in messages.signal_types()}
         others = [] if topics else sorted(source.topics.keys() - types.keys())
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.absolute().parent) as workshop:
-            result = Path(workshop) / "result"
-            target = FORMATS[kind](result)
-            if target.folder:
-                result.mkdir()
-            exporter = Exporter(signals, step_ns, target)
-            with Source(bag) as source:
+        try:
+            with tempfile.TemporaryDirectory(prefix=f".{place.name}.", dir=place.absolute().parent) as workshop:
+                result = Path(workshop) / "result"
+                target = FORMATS[kind](result)
+                if target.folder:
+                    result.mkdir()
+                exporter = Exporter(signals, step_ns, target)
                 rows = {topic: message_rows.export(source, topic, target) for topic in types if topic not in signals}
-            header = feed(bag, [exporter]) if signals else None
-            rows |= exporter.close()
-            with Source(bag) as source:
+                header = feed(bag, [exporter]) if signals else None
+                rows |= exporter.close()
                 left_out = exporter.left_out(source, header) if header else []
-            _refuse_existing(place)  # another process may have created it meanwhile; the rename would replace it
-            result.rename(place)
-    except OSError as error:
-        raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None
+                _refuse_existing(place)  # another process may have created it meanwhile; the rename would replace it
+                result.rename(place)
+        except OSError as error:
+            raise LatheError(f"{place}: cannot be written ({error.strerror or error})") from None
     return Exported(place, {topic: rows[topic] for topic in types}, left_out, others)

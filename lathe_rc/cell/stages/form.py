@@ -112,14 +112,14 @@ class FormParameters(NodeParameters):
         with about(node, "harmonic_order", "harmonic_amplitude", "harmonic_phase"):
             return Harmonics(np.array(order, dtype=float), np.array(amplitude), np.array(phase))
 
-    def doubt(self, node: str) -> Doubt:
+    def doubt(self, node: str, form: Profile) -> Doubt:
         """Return how far the form of a node may be off between the points or rows of its table.
 
         Raises:
-            InputError: as for `form`.
+            InputError: the code of a third-party profile fails.
         """
         with code_of_others(f"{node}.profile = {self.profile!r}"):
-            return doubt(self.form(node))
+            return doubt(form)
 
     def programmed_form(self, node: str) -> Measured | None:
         """Return the programmed form of the controllers of a node; None: the form itself.
@@ -136,7 +136,10 @@ class FormParameters(NodeParameters):
 def form_doubt(nodes: Mapping[str, NodeParameters]) -> float:
     """Return how far the form of a scenario may be off between the points of its table [m]; 0 without a form."""
     owner = next(((n, t) for n, t in nodes.items() if isinstance(t, FormParameters) and t.known()), None)
-    return owner[1].doubt(owner[0]).whole if owner else 0.0
+    if not owner:
+        return 0.0
+    node, table = owner
+    return table.doubt(node, table.form(node)).whole
 
 
 FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters
@@ -245,7 +248,7 @@ class Form:
             if isinstance(read, Measured)
             for doubt in doubts(read)
         ]
-        self.doubt = parameters.doubt(node)
+        self.doubt = parameters.doubt(node, form)
         file = parameters.profile_file if parameters.profile == "csv" else ""
         self._named = f"profile_file = {file}" if file else f"profile = {parameters.profile}"
         self.surface = path = tabulated(form)
