@@ -308,11 +308,18 @@ def test_a_job_that_ends_or_blocks_its_process_has_a_reason_and_the_others_a_res
     assert found == [1, 2]
     exits = list(alone.alone(os._exit, [3, 4], 10.0, None))
     assert exits == ["its process ended with exit code 3", "its process ended with exit code 4"]
-    killed, slow = (
-        next(alone.alone(*job, None, first=0.0)) for job in ((signal.raise_signal, [9], 10.0), (time.sleep, [1e3], 0.1))
-    )
+    killed, *faults = alone.alone(signal.raise_signal, [signal.SIGKILL, signal.SIGSEGV], 10.0, None)
     assert killed == "its process was ended by SIGKILL, perhaps for lack of memory"
-    assert slow.startswith("no end within 0.1 s, in alone.py, line ")
+    assert [reason[:49] for reason in faults] == ["its process was ended by SIGSEGV, in alone.py, li"]
+
+
+def test_a_job_that_blocks_has_a_time_limit_whatever_it_does(monkeypatch):
+    """A job that sleeps right after a short one, and one that stops its process."""
+    monkeypatch.setattr(alone, "_END", 0.5)
+    short, sleeping = alone.alone(time.sleep, [0.0, 1e3], 0.5, None, first=0.0)
+    assert (short, sleeping[:28]) == (None, "no end within 0.5 s, in alon")
+    (stopped,) = alone.alone(signal.raise_signal, [signal.SIGSTOP], 0.1, None, first=0.0)
+    assert stopped == "no end within 0.1 s"
 
 
 @pytest.mark.parametrize(

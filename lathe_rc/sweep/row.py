@@ -303,7 +303,8 @@ def compute(
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
         row["reason"] = str(error)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - third-party code can raise anything
-        last = traceback.extract_tb(error.__traceback__)[-1]
+        frames = traceback.extract_tb(error.__traceback__)
+        last = next((frame for frame in reversed(frames) if "site-packages" not in frame.filename), frames[-1])
         row["status"] = FAILED
         row["reason"] = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}: {shown(error)}"
     if cell is not None and cell.factors:
