@@ -10,6 +10,7 @@ import ast
 import hashlib
 import importlib
 import importlib.metadata
+import importlib.util
 import os
 import pkgutil
 import sys
@@ -239,13 +240,11 @@ def is_ours(module: str) -> bool:
 
 
 @cache
-def source_hash(module: str, *, imports: bool = False) -> str:
-    """Hash the source of a module: all files of its package, or its single file.
+def source_hash(module: str) -> str:
+    """Hash the source of a module and of what it imports.
 
-    Args:
-        module: the module.
-        imports: whether to include imported packages, except lathe_rc and the dependencies of kernels. The imports of
-            installed packages other than the module's own are not followed further.
+    The hash covers all files of the module's package, or its single file, and likewise the packages that these import,
+    except lathe_rc and the dependencies of kernels; of other installed packages it covers the version.
 
     Raises:
         InputError: the module is ``__main__``, which other processes cannot import.
@@ -256,32 +255,41 @@ def source_hash(module: str, *, imports: bool = False) -> str:
     waiting = [module.partition(".")[0]]
     while waiting:
         top = waiting.pop()
-        if top in seen or top in COMMON or top not in sys.modules:
+        if top in seen or top in COMMON:
             continue
         seen.add(top)
-        for path in _files(top):
+        with allowed_code.importing(module):  # for a module beside it that it imports later
+            paths = _files(top)
+        if len(seen) > 1 and paths and paths[0].is_relative_to(_INSTALLED):
+            versions = [f"{name} {importlib.metadata.version(name)}" for name in sorted(set(_packages().get(top, [])))]
+            digest.update(" ".join(versions).encode())
+            continue
+        for path in paths:
             text = path.read_bytes()
             digest.update(path.name.encode() + text)
-            if imports and (len(seen) == 1 or not path.is_relative_to(_INSTALLED)):
-                waiting += sorted(_imports(text))
+            waiting += sorted(_imports(text))
     return digest.hexdigest()
 
 
 _INSTALLED = sysconfig.get_path("purelib")
-#: packages whose versions do not change within an installation; the first two have a separate hash
+#: packages whose versions do not change within an installation, the first two with a separate hash, or which only draw
 COMMON = {
-    *("lathe_rc", "lathe_papers", "numpy", "scipy", "numba", "annotated_types", "pydantic"),
+    *("lathe_rc", "lathe_papers", "numpy", "scipy", "numba", "annotated_types", "pydantic", "matplotlib", "rich"),
     *sys.stdlib_module_names,
 }
 
 
 def _files(top: str) -> list[Path]:
-    """Return the source files of a package or module."""
-    module = sys.modules[top]
-    if paths := [Path(each) for each in getattr(module, "__path__", ())]:
+    """Return the source files of a package or module, whether it is imported or not."""
+    if module := sys.modules.get(top):
+        folders, file = getattr(module, "__path__", ()), getattr(module, "__file__", None)
+    elif spec := importlib.util.find_spec(top):
+        folders, file = spec.submodule_search_locations or (), spec.origin
+    else:
+        return []
+    if paths := [Path(each) for each in folders]:
         return sorted(path for folder in paths for path in folder.rglob("*.py"))
-    file = getattr(module, "__file__", None) or ""
-    return [Path(file)] if file.endswith(".py") else []
+    return [Path(file)] if file and file.endswith(".py") else []
 
 
 def _imports(text: bytes) -> set[str]:

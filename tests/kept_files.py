@@ -55,7 +55,7 @@ def swept(path: Path) -> Folder:
     return folder
 
 
-def computed(_crew: object, order: Any, jobs: Any, _count: int) -> Any:
+def computed(_crew: object, order: Any, jobs: Any, *_: object) -> Any:
     """Rows for the jobs of a tuning, in place of `lathe_rc.sweep.workers.rows`."""
     yield pa.Table.from_pylist([made_up(job.number, job.key, job.values[LEAD]) for job in jobs], order.schema)
 

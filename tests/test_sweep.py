@@ -3,9 +3,13 @@
 
 import contextlib
 import math
+import os
+import signal
+import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
@@ -17,7 +21,7 @@ from lathe_rc import harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import LOOP_FIGURES, NUMBERS, row, space, workers
+from lathe_rc.sweep import LOOP_FIGURES, NUMBERS, alone, row, space, workers
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.sweep import Sweep
@@ -76,7 +80,7 @@ def test_models_follow_the_drives_or_stay(client, tmp_path):
     kept = Folder(tmp_path / "follow").scenario
     assert kept == two
     assert kept.varied({DAMPING: 0.7}) == two.varied({DAMPING: 0.7})
-    with pytest.raises(InputError, match="another cell"):
+    with pytest.raises(InputError, match=r"another cell: learning_controller.model_\w+ = .* there, and default here"):
         lathe_rc.run_sweep(two, space_, tmp_path / "nominal", client=client)
 
 
@@ -185,7 +189,7 @@ def test_a_row_says_what_the_run_says(piston):
     assert found["tool.in_tolerance_from"] == result.verdict.since > 1
 
 
-def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston):
+def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston, monkeypatch):
     refused = row.compute(piston, {LEAD: 3e-3}, [LEAD], [])
     assert refused["status"] == row.REFUSED
     assert "learning diverges" in refused["reason"]
@@ -194,6 +198,15 @@ def test_what_goes_wrong_with_a_cell_stands_in_its_row(piston):
     assert row.compute(unstable, {LEAD: 3e-3}, [LEAD], [])["status"] == row.DIVERGED
     wrong = row.compute(piston, {LEAD: -1.0}, [LEAD], [])
     assert (wrong["status"], wrong["reason"][:32]) == (row.REFUSED, "learning_controller.lead_time = ")
+
+    def fail(*_):
+        raise RuntimeError("nothing works")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(row, "_Keeper", fail)
+        failed = row.compute(piston, {}, [], [])
+    assert (failed["status"], failed["reason"][-15:]) == (row.FAILED, ": nothing works")
+    assert failed["reason"].startswith("RuntimeError in test_sweep.py, line ")
 
     limited = row.compute(piston, {"electrodynamic_actuator.command_stroke": 50e-6}, [], [])
     assert limited["limits"] == "electrodynamic_actuator"
@@ -238,7 +251,9 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
     assert found.row(first["cell"]) == first
     told.clear()
     more = sweep(f"1.1e-3,{leads}")
-    assert [each for each in told if each["event"] == "began"] == [{"event": "began", "cells": 4, "computed": 3}]
+    assert [each for each in told if each["event"] == "began"] == [
+        {"event": "began", "cells": 4, "computed": 3, "others": {}}
+    ]
     assert more.table().column(LEAD).to_pylist() == [1.2e-3, 1.3e-3, 3e-3, 1.1e-3]
     assert more.table().column("cell").to_pylist() == [0, 1, 2, 3]
     # A further parameter: the rows so far have the scenario's own value of it.
@@ -285,6 +300,59 @@ def test_the_command_of_a_finished_sweep(piston, client, tmp_path):
 def test_help_lists_what_a_row_has(words, listed):
     shown = CliRunner(env={"COLUMNS": "400"}).invoke(main, [*words.split(), "--help"]).stdout
     assert [name for name in listed if name not in shown] == []
+
+
+def test_a_job_that_ends_or_blocks_its_process_has_a_reason_and_the_others_a_result():
+    """A job that exits, one that is killed, and one that takes longer than its time limit."""
+    found = list(alone.alone(abs, [-1, -2], 10.0, None))
+    assert found == [1, 2]
+    exits = list(alone.alone(os._exit, [3, 4], 10.0, None))
+    assert exits == ["its process ended with exit code 3", "its process ended with exit code 4"]
+    killed, *faults = alone.alone(signal.raise_signal, [signal.SIGKILL, signal.SIGSEGV], 10.0, None)
+    assert killed == "its process was ended by SIGKILL, perhaps for lack of memory"
+    assert [reason[:49] for reason in faults] == ["its process was ended by SIGSEGV, in alone.py, li"]
+
+
+def test_a_job_that_blocks_has_a_time_limit_whatever_it_does(monkeypatch):
+    """A job that sleeps right after a short one, and one that stops its process."""
+    monkeypatch.setattr(alone, "_END", 0.5)
+    short, sleeping = alone.alone(time.sleep, [0.0, 1e3], 0.5, None, first=0.0)
+    assert (short, sleeping[:28]) == (None, "no end within 0.5 s, in alon")
+    (stopped,) = alone.alone(signal.raise_signal, [signal.SIGSTOP], 0.1, None, first=0.0)
+    assert stopped == "no end within 0.1 s"
+
+
+@pytest.mark.parametrize(
+    ("failed", "options", "again"),
+    [
+        ({"reason": "RuntimeError in my_law.py, line 3"}, {}, False),
+        ({"reason": "RuntimeError in my_law.py, line 3"}, {"retry": True}, True),
+        ({"reason": "RuntimeError in my_law.py, line 3", "version": "0.0.1"}, {}, True),
+        ({"reason": "its process was ended by SIGKILL"}, {}, True),
+        ({"reason": "no end within 2 s", "time_limit": 2.0}, {"cell_time": 2.0}, False),
+        ({"reason": "no end within 2 s", "time_limit": 2.0}, {"cell_time": 3.0}, True),
+    ],
+)
+def test_a_failed_cell_is_computed_again_where_that_may_help(failed, options, again, piston, client, tmp_path):
+    space_ = Space(grid={LEAD: [1.3e-3]})
+    found = lathe_rc.run_sweep(piston, space_, tmp_path / "rows", client=client)
+    (done,) = found.table().to_pylist()
+    (path,) = (tmp_path / "rows" / "rows").iterdir()
+    path.unlink()
+    found.folder.write([pa.Table.from_pylist([done | {"status": row.FAILED} | failed], found.folder.schema)])
+    repeated = lathe_rc.run_sweep(piston, space_, tmp_path / "rows", client=client, **options)
+    assert repeated.statuses() == {row.DONE if again else row.FAILED: 1}
+
+
+def test_reasons_stand_in_the_terminal_and_no_result_is_a_failure(client, monkeypatch, tmp_path):
+    monkeypatch.setattr("lathe_rc.sweep.sweep.client_of", lambda *_: contextlib.nullcontext(client))
+    words = ["sweep", str(PISTON), "--revolutions", "2", "--vary", f"{LEAD}=3e-3,4e-3", "--out", str(tmp_path / "rows")]
+    done = CliRunner().invoke(main, words)
+    assert "2 refused, such as cell 0: learning_controller: learning diverges" in done.stdout
+    assert (done.exit_code, done.stderr.splitlines()[-1]) == (
+        1,
+        f"lathe: no cell of {tmp_path / 'rows'} came to a result",
+    )
 
 
 # ---- studies that are sweeps -------------------------------------------------------------------------------------

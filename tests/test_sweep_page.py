@@ -19,8 +19,8 @@ from shown_page import ShownPage
 from lathe_rc import cli, resources
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
-from lathe_rc.sweep import page, row
-from lathe_rc.sweep.effects import Axis, Yield, bins, effect, is_grid
+from lathe_rc.sweep import page, row, space
+from lathe_rc.sweep.effects import Axis, Yield, bins, effect, groups, is_grid, total_effect
 from lathe_rc.sweep.folder import Folder
 from lathe_rc.sweep.page_data import PageData
 from lathe_rc.sweep.space import Space
@@ -119,6 +119,46 @@ class TestEffects:
         assert_allclose([effect(axis, y, exact=True).share for axis in axes], [4 / 14, 1 / 14], rtol=1e-12)
         assert not is_grid(axes, np.where(np.arange(12) == 5, np.nan, y))
         assert not is_grid([Axis("a", "a", a[:11]), Axis("b", "b", b[:11])], y[:11])
+
+    @pytest.mark.parametrize("refused", [0.0, 0.3, 0.6])
+    def test_intervals_of_total_effects_have_the_true_ones(self, refused):
+        """Of a Saltelli sample from which a dependent part is refused, the 95 % intervals have 95 % of the effects."""
+        limit = 2.0 - np.sqrt(2.0 * refused) if refused < 0.5 else np.sqrt(2.0 * (1.0 - refused))
+
+        def ishigami(u):
+            x = (2.0 * u - 1.0) * np.pi
+            y = np.sin(x[:, 0]) + 7.0 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+            return np.where(u[:, 0] + u[:, 1] <= limit, y, np.nan)
+
+        def product(u):
+            a = np.array([0.0, 1.0, 1e9])
+            y = np.prod((np.abs(4.0 * u - 2.0) + a) / (1.0 + a), axis=1)
+            return np.where(u[:, 0] + u[:, 1] <= limit, y, np.nan)
+
+        one, other = np.random.default_rng(1).random((2, 100_000, 3))
+        covered = []
+        for function in (ishigami, product):
+            mixed = [function(np.where(np.arange(3) == place, other, one)) for place in range(3)]
+            y = function(one)
+            expected = [np.nanmean((y - changed) ** 2) / 2.0 / np.nanvar(y) for changed in mixed]
+            for seed in range(20):
+                points = np.concatenate(list(space._sample("saltelli", 5 * 128, 3, seed)))
+                axes = [Axis(f"x{place}", f"x{place}", column) for place, column in enumerate(points.T)]
+                for group, true in zip(groups(axes, np.zeros(len(points))), expected, strict=True):
+                    found, error = total_effect(group, function(points), lot=5)
+                    covered.append(abs(found - true) <= error + 1e-6)
+        assert np.mean(covered) >= 0.95
+
+    def test_a_parameter_without_effect_has_none_where_cells_are_refused(self):
+        """On a grid of which a corner is refused, b predicts a and so explains y = a; its total effect is 0."""
+        a, b = (side.ravel() for side in np.meshgrid(np.arange(8.0), np.arange(8.0), indexing="ij"))
+        axes, y = [Axis("a", "a", a), Axis("b", "b", b)], np.where(a + b > 8.0, np.nan, a)
+        assert effect(axes[1], y, exact=True).share > 0.2
+        one, other = groups(axes, np.zeros(64))
+        assert total_effect(other, y, exact=True)[0] == pytest.approx(0.0, abs=1e-15)
+        full = [total_effect(group, 2.0 * a + b, exact=True)[0] for group in (one, other)]
+        assert_allclose(full, [0.8, 0.2], rtol=1e-12)
+        assert total_effect(np.arange(64), y) is None
 
     def test_too_few_cells_say_nothing(self):
         assert effect(Axis("x", "x", np.arange(7.0)), np.arange(7.0)).share is None
@@ -268,7 +308,7 @@ class TestPage:
     def test_what_matters_most_comes_first(self, grid):
         rows = grid[1].rows("What matters")
         assert [row[0] for row in rows] == [LEAD, Q, LAW]
-        assert float(rows[2][1].split()[0]) == pytest.approx(0.0, abs=0.02)
+        assert float(rows[2][1].split(";")[0]) == pytest.approx(0.0, abs=0.02)
 
     def test_another_goal(self, tmp_path, no_pictures):
         """A margin should be large: the best cells have the largest, and the yield counts from above."""
@@ -284,7 +324,7 @@ class TestPage:
         shown = shown_page(folder)
         assert set(shown.specs) == {"lines", "sensitivity", "parallel-coordinates", "yield"}
         assert len(shown.data["one-0"]) == 11
-        assert shown.rows("What matters")[0][1].startswith("1.000 (+")
+        assert shown.rows("What matters")[0][1].startswith("1.000; 1.000 (+")
 
     def test_texts_and_truth_values_are_parameters(self, tmp_path, no_pictures):
         start, amplitude = "electrodynamic_actuator.autostart", "spindle_encoder.deviation_amplitude"
@@ -297,8 +337,8 @@ class TestPage:
         assert axes[start].texts == ["false", "true"]
         assert_allclose(axes[amplitude].distinct, [0.05, 0.1, 0.2])
         rows = {row[0]: row[1] for row in shown_page(folder).rows("What matters")}
-        assert rows[LAW] == "1.000"
-        assert rows[start] == "0.000 (+0.00)"
+        assert rows[LAW] == "1.000; 1.000"
+        assert rows[start] == "0.000; 0.000 (+0.00)"
 
     def test_texts_of_a_sweep_cannot_harm_the_page(self, tmp_path, no_pictures):
         """Neither names nor reasons can end the script or begin an element."""
@@ -367,7 +407,7 @@ class TestPage:
 
 def test_the_docs_name_every_column():
     text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
-    columns = row.schema(PISTON, [], []).names
+    columns = row.schema({}, []).names
     assert [name for name in columns if f"`{name}`" not in text] == []
 
 

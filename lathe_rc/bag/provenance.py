@@ -75,12 +75,12 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         VERSIONS: json.dumps(_versions()),
         SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
         **({FORM_DOUBT: f"{off:.3g}"} if (off := form_doubt(nodes)) > _LEAST_DOUBT else {}),
-        **({ORIGINS: json.dumps(found)} if (found := _origins(nodes)) else {}),
+        **({ORIGINS: json.dumps(found)} if (found := origins_of(nodes)) else {}),
         **files,
     }
 
 
-def _origins(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
+def origins_of(nodes: Mapping[str, NodeParameters]) -> dict[str, dict[str, object]]:
     """Return the origin of each third-party class (see `Registry.origin`), and the parameters that name the class."""
     named: list[tuple[str, Mapping[str, str] | None]] = []
     for node, table in nodes.items():
@@ -156,7 +156,7 @@ def _check_installed(about: Mapping[str, str]) -> None:
 
 def changes(about: Mapping[str, str], scenario: Scenario) -> list[str]:
     """Return the changes of third-party classes since a bag was made, one line per class."""
-    made, here = {origin.name: origin for origin in origins(about)}, _origins(scenario.nodes)
+    made, here = {origin.name: origin for origin in origins(about)}, origins_of(scenario.nodes)
     found = []
     for name, now in here.items():
         if (origin := made.get(name)) is None:

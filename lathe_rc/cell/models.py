@@ -77,6 +77,13 @@ def _known(node: str, table: NodeParameters, tables: Mapping[str, NodeParameters
     return values
 
 
+def follows(table: NodeParameters, name: str) -> bool:
+    """Return whether a parameter that the scenario does not give can take its value from other nodes."""
+    return name in _not_given(table) or any(
+        name in names and not names & table.model_fields_set for names in table.asks
+    )
+
+
 def given(table: NodeParameters) -> NodeParameters:
     """Return a copy of a table, in which the models count as given."""
     made = table.model_copy()

@@ -60,6 +60,7 @@ class _Tables(Mapping[str, type[NodeParameters]]):
 TABLES = _Tables()
 
 _EVERYONE = "/**"
+_ROS = "ros__parameters"
 _ELEMENT = re.compile(r"(.*\S)\[(\d+)\]")
 # Parameters that affect neither the samples nor the messages of a run, and therefore not its identity.
 HOST_PARAMETERS = {
@@ -229,6 +230,11 @@ class Scenario:
         found = getattr(self.nodes[node] if node else self.shared, name)
         return cast("Value", found if element is None else found[element])
 
+    def follows(self, target: str) -> bool:
+        """Return whether a parameter takes its value from other nodes (``target`` as in `parameter`)."""
+        node, _, name = _element(target)[0].rpartition(".")
+        return bool(node) and models.follows(self.nodes[node], name)
+
     def named(self) -> "Scenario":
         """Return the same cell with a fixed run ID, which its variations keep."""
         return self.varied({"run_id": f"{self.shared.run_id} varied"})
@@ -307,8 +313,26 @@ class Scenario:
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
             values = {key: _quoted(value) for key, value in kept.items() if value != []}
-            tree[f"/**/{name}"] = {"ros__parameters": values}
+            tree[f"/**/{name}"] = {_ROS: values}
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
+
+
+def differences(one: Scenario, other: Scenario) -> list[str]:
+    """Return the differences between two cells, as given, in words."""
+    trees = [yaml.safe_load(each.to_yaml(given=True)) for each in (one, other)]
+    there, here = (
+        {
+            name if name in SharedParameters.model_fields else f"{node.removeprefix('/**/')}.{name}": value
+            for node, table in tree.items()
+            for name, value in table[_ROS].items()
+        }
+        for tree in trees
+    )
+    return [
+        f"{name} = {shown(there.get(name, 'default'))} there, and {shown(here.get(name, 'default'))} here"
+        for name in dict.fromkeys([*there, *here])
+        if there.get(name) != here.get(name)
+    ]
 
 
 def _element(target: str) -> tuple[str, int | None]:

@@ -121,6 +121,12 @@ def many_cells(folder: str) -> Callable[[F], F]:
         click.option("--out", type=PATH, help=f"folder of the results; default: {folder}"),
         click.option("--scheduler", metavar="ADDRESS", help="of Dask; default: workers on this machine"),
         click.option("--workers", type=click.IntRange(1), help="processes on this machine; default: one for each core"),
+        click.option(
+            "--cell-time",
+            type=click.FloatRange(0.0, min_open=True),
+            metavar="SECONDS",
+            help="time limit of a cell; default: 20 times the slowest so far, at least 60 s",
+        ),
     ]
 
     def added(command: F) -> F:

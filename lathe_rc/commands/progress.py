@@ -160,6 +160,9 @@ class SweepWatch:
             self._trials_done = event.get("trials", 0)
             there = f", {self._done} of them are there already" if self._done else ""
             self._console.print(f"{self._cells} cells{there}")
+            for version, count in event.get("others", {}).items():
+                digest = f"lathe sweep show {self._place} --cell N compares a digest"
+                self._console.print(f"{count} cells are of lathe_rc {version}, not of this one; {digest}")
             update(self._task, total=self._cells, completed=self._done)
         elif event["event"] == "compiling":
             update(self._task, description="compiling, once on this machine")

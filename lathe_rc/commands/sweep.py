@@ -11,13 +11,14 @@ from click.shell_completion import CompletionItem
 
 import lathe_rc
 from lathe_rc.commands import completers, options
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
     from lathe_rc.sweep.page import Written
     from lathe_rc.sweep.sweep import Sweep
 
 _BEST = 5  # number of displayed cells
+_REASONS = 6  # number of displayed reasons
 
 
 def check_crew(scheduler: str | None, workers: int | None) -> None:
@@ -84,7 +85,7 @@ def space_of(
     "--sample",
     default="",
     metavar="SAMPLER:N",
-    help="points of ranges LOW:HIGH and of laws: sobol, halton, latin, random",
+    help="points of ranges LOW:HIGH and of laws: sobol, halton, latin, random, saltelli",
 )
 @options.seeds
 @click.option("--cells", type=options.PATH, help="CSV or YAML file with a cell a row")
@@ -96,6 +97,7 @@ def space_of(
     show_default=True,
     help="what controllers take for a drive that is varied: as it is, or as the scenario has it",
 )
+@click.option("--retry", is_flag=True, help="compute failed cells again")
 @options.many_cells("sweep-SCENARIO")
 def run(
     scenario: str,
@@ -128,13 +130,16 @@ def run(
     with SweepWatch(place, quiet=as_json) as watch:
         found = lathe_rc.run_sweep(loaded, space, place, scheduler=scheduler, workers=workers, watch=watch, **how)
     _show(found, as_json=as_json)
+    statuses = found.statuses()
+    if not statuses.get("done"):
+        raise LatheError(f"no cell of {place} came to a result")
+    if failed := statuses.get("failed"):
+        raise LatheError(f"{failed} cells of {place} failed; --retry computes them again")
 
 
 def best(found: "Sweep") -> list[dict[str, Any]]:
     """Return the cells with the smallest maximum error, and their varied parameters, errors and margins."""
-    from lathe_rc.sweep.page_data import default_goal
-
-    goal = default_goal(found.folder)
+    goal = found.folder.description.goal
     columns = ["cell", *found.folder.targets, goal, goal.replace("max_error", "rms_error")]
     columns.append("margin" if goal.startswith("tool.") else goal.replace("max_error", "settling"))
     table = found.table().select(columns).sort_by(goal)
@@ -143,11 +148,11 @@ def best(found: "Sweep") -> list[dict[str, Any]]:
 
 def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) -> None:
     from lathe_rc.commands.tables import broken, console, table
-    from lathe_rc.sweep import row
 
     statuses, top, folder = found.statuses(), best(found), found.folder
     if as_json:
-        summary = {"folder": str(folder.path), "scenario": folder.scenario.name, "statuses": statuses, "best": top}
+        summary = {"folder": str(folder.path), "scenario": folder.name, "statuses": statuses, "best": top}
+        summary["reasons"] = [each._asdict() for each in found.outcomes() if each.reason]
         if written:
             summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
         click.echo(json.dumps(summary))
@@ -156,9 +161,14 @@ def _show(found: "Sweep", written: "Written | None" = None, *, as_json: bool) ->
     if top:
         lines = table(*broken(list(top[0]), out.width), title="smallest errors", overflow="fold")
         for each in top:
-            lines.add_row(*(_formatted(value, *row.unit(name, folder.scenario)) for name, value in each.items()))
+            lines.add_row(*(_formatted(value, *folder.description.unit(name)) for name, value in each.items()))
         out.print(lines, soft_wrap=False)
     out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
+    reasons = [each for each in found.outcomes() if each.reason]
+    for outcome in reasons[:_REASONS]:
+        out.print(f"{outcome.cells} {outcome.status}, such as {outcome.example}", soft_wrap=True, highlight=False)
+    if more := reasons[_REASONS:]:
+        out.print(f"{sum(outcome.cells for outcome in more)} for {len(more)} more reasons, which are on the page")
     out.print(f"rows:    {folder.path}/rows")
     out.print(f"page:    {written.page if written else f'lathe sweep show {folder.path}'}")
     if written and written.figures:

@@ -242,7 +242,7 @@ def step_of(stage: type, loop: Step, sample: object) -> Step:
 
 def _source(module: str) -> str:
     """Return the text that distinguishes versions of a step; each version of the built-in steps has its own cache."""
-    return "that of lathe_rc" if is_ours(module) else source_hash(module, imports=True)
+    return "that of lathe_rc" if is_ours(module) else source_hash(module)
 
 
 def is_kept(name: str) -> bool:

@@ -74,11 +74,13 @@ def said(value: float) -> str:
     return f"{value:.4g}"
 
 
-def effect_said(effect: Effect) -> tuple[str, str]:
-    """Format the share and the rank correlation of an effect; empty strings for missing values."""
+def effect_said(effect: Effect) -> tuple[str, str, str]:
+    """Format the total effect, the share and the rank correlation of an effect; empty strings for missing values."""
     # Adding 0.0 turns -0.0 into 0.0: a value that rounds to 0 is shown without a sign.
     share = "" if effect.share is None else f"{round(effect.share, 3) + 0.0:.3f}"
-    return share, "" if effect.rank is None else f"{round(effect.rank, 2) + 0.0:+.2f}"
+    total = "" if effect.total is None else f"{round(effect.total, 3) + 0.0:.3f}"
+    total += f" ± {effect.error:.3f}" if total and effect.error else ""
+    return total, share, "" if effect.rank is None else f"{round(effect.rank, 2) + 0.0:+.2f}"
 
 
 # --- data sets
@@ -241,14 +243,16 @@ def lines(axes: Sequence[tuple[Axis, Bins]], across: int, third: int | None, goa
 
 
 def sensitivity(names: Sequence[str], effects: Sequence[Effect]) -> Spec:
-    """Return the bar chart of the share of the goal's variance that each parameter explains."""
-    texts = []
+    """Return the bar chart of the total effects, or without these of the shares that parameters explain alone."""
+    texts, is_total = [], any(effect.total is not None for effect in effects)
     for name, effect in zip(names, effects, strict=True):
-        share, rank = effect_said(effect)
-        texts.append(f"{name}: {share or 'none'}" + (f", rank {rank}" if rank else ""))
-    shares = [effect.share or 0.0 for effect in effects]
+        total, share, rank = effect_said(effect)
+        texts.append(f"{name}: {(total if is_total else share) or 'none'}" + (f", rank {rank}" if rank else ""))
+    shares = [(effect.total if is_total else effect.share) or 0.0 for effect in effects]
     scale = {"domain": [min(0.0, *shares), max(1.0, *shares)], "nice": False}
-    across = quantity("s", "share of the goal's variance (first order)", scale=scale)
+    across = quantity(
+        "s", f"share of the goal's variance ({'total effect' if is_total else 'first order'})", scale=scale
+    )
     text = {"x": {"value": 2}, "text": {"field": "t"}}
     return chart(
         _BAR * len(texts),

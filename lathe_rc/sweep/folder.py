@@ -3,17 +3,23 @@
 
 DIR/scenario.yaml    the cell, as given
 DIR/sweep.json       identity of the cell, measures, and the spaces or the request of a tuning
-DIR/rows/*.parquet   one row per cell, see `lathe_rc.sweep.row`
+DIR/rows/*.parquet   one row per cell, see `lathe_rc.sweep.row`; all files have the same columns
 
 Each of these files has a checksum, which is verified on reading; files of older versions have none.
+
+A further varied parameter adds a column to all rows. Its request is written first; then all files of rows are written
+anew beside the old ones, and replace them at once. A process that is killed in between leaves the old rows, and the
+next command continues.
 """
 
 import io
 import json
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, replace
+import shutil
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,12 +34,15 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.sweep import row
+from lathe_rc.sweep import inputs, row
+from lathe_rc.sweep.description import Description, describe
 from lathe_rc.sweep.row import Measure
 from lathe_rc.sweep.space import Space
 
 _FORMAT = 1
 _WRITING = "write.lock"  # held while one of the files is written
+_COMPUTING = "lock"  # held by a sweep that computes into the folder
+_ROWS, _NEW, _OLD = "rows", "rows.new", "rows.old"
 _MOST = 2**30  # largest size of a file of rows [B]
 
 
@@ -63,6 +72,8 @@ class _Contents:
     measures: list[Measure]
     spaces: list[Space]
     tuning: Request | None = None
+    description: Description | None = None  # files of older versions have none, nor inputs
+    inputs: dict[str, str] = field(default_factory=dict)
 
 
 class Folder:
@@ -73,10 +84,11 @@ class Folder:
 
     Attributes:
         path: see the argument.
-        scenario: the varied cell.
+        name: name of the varied cell.
         measures: further columns of the rows.
         spaces: requested spaces, in order.
         tuning: request of a tuning; None for a plain sweep.
+        inputs: third-party classes and files that the rows were computed with, see `lathe_rc.sweep.inputs`.
 
     Raises:
         InputError: the folder is not a sweep folder.
@@ -90,12 +102,33 @@ class Folder:
         if told.format != _FORMAT:
             raise InputError(f"{path}: format {told.format} of another lathe_rc; allowed: {_FORMAT}")
         _read(path / "scenario.yaml")
-        self.scenario = replace(scenarios.load(path / "scenario.yaml"), name=told.name)
-        if self.scenario.identity != told.identity:
-            raise InputError(
-                f"{path}: its scenario has changed, or a file that it names; allowed: as it was, or a new folder"
-            )
+        self._told, self.name, self.inputs = told, told.name, told.inputs
         self.measures, self.spaces, self.tuning = told.measures, told.spaces, told.tuning
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The varied cell; in contrast to the rest it needs the files and the code that the cell names.
+
+        Raises:
+            InputError: the cell is not the one that the rows were computed with, or its code or files are missing.
+        """
+        found = replace(scenarios.load(self.path / "scenario.yaml"), name=self.name)
+        if changed := self.changes(found):
+            raise InputError(f"{self.path}: {changed[0]}; allowed: as it was, or a new folder")
+        if found.identity != self._told.identity:
+            raise InputError(
+                f"{self.path}: its scenario has changed, or a file that it names; allowed: as it was, or a new folder"
+            )
+        return found
+
+    @cached_property
+    def description(self) -> Description:
+        """Description of the varied cell."""
+        return self._told.description or describe(self.scenario, self.targets, self.measures)
+
+    def changes(self, scenario: Scenario) -> list[str]:
+        """Return the third-party classes and files of a cell that have changed since the rows were computed."""
+        return inputs.changes(self.inputs, inputs.of_cell(scenario))
 
     @staticmethod
     def begin(
@@ -115,7 +148,8 @@ class Folder:
             _refuse_others(path)
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        with locked(path / _WRITING):
+        # A sweep that computes into the folder has a fixed set of columns; the processes of a tuning have the same set.
+        with locked(path / _WRITING), nullcontext() if tuning else locked(path / _COMPUTING, wait=False):
             _refuse_others(path)
             return Folder._with(path, scenario, space, measures, tuning)
 
@@ -128,8 +162,9 @@ class Folder:
         if not new:
             there = Folder(path)
             spaces = there.spaces
-            if there.scenario.to_yaml(given=True) != scenario.to_yaml(given=True):
-                raise InputError(f"{path} holds a sweep of another cell ({there.scenario.name}); allowed: a new folder")
+            if changed := scenarios.differences(there.scenario, scenario):
+                more = f", and {len(changed) - 1} more" if len(changed) > 1 else ""
+                raise InputError(f"{path} holds a sweep of another cell: {changed[0]}{more}; allowed: a new folder")
             if there.measures != list(measures):
                 named = ", ".join(each.name for each in there.measures) or "nothing"
                 raise InputError(f"{path}: measures {named} beside the rest; allowed: the same, or a new folder")
@@ -137,16 +172,22 @@ class Folder:
                 raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
         if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
+        used = inputs.of_spaces(scenario, [*spaces, *([tuning.over] if tuning else [])], tuning.free if tuning else {})
+        if not new and (differing := inputs.changes(there.inputs, used)):
+            raise InputError(f"{path}: {differing[0]}; allowed: as it was, or a new folder")
         # scenario.yaml is written first: a folder with a sweep.json is complete.
-        told = asdict(_Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning))
+        contents = _Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning)
+        about = describe(scenario, _targets(spaces, tuning), measures)
+        told = asdict(replace(contents, description=about, inputs=used))
         with writing(path):
-            (path / "rows").mkdir(parents=True, exist_ok=True)
             if new:
                 with files.replacing(path / "scenario.yaml") as stream:
                     stream.write(files.sealed(scenario.to_yaml(given=True).encode() + b"# " + files.ROOM + b"\n"))
             with files.replacing(path / "sweep.json") as stream:
                 stream.write(files.sealed(json.dumps(told | {"checksum": files.ROOM.decode()}, indent=1).encode()))
-        return Folder(path)
+            found = Folder(path)
+            found._conform()
+        return found
 
     def locked(self, *, wait: bool = False) -> AbstractContextManager[None]:
         """Lock the folder, so that no other process computes into it.
@@ -157,23 +198,22 @@ class Folder:
         Raises:
             InputError: another process holds the lock, and ``wait`` is false.
         """
-        return locked(self.path / "lock", wait=wait)
+        return locked(self.path / _COMPUTING, wait=wait)
 
     @property
     def targets(self) -> list[str]:
         """Parameters that differ between the cells."""
-        tuned = self.tuning.targets if self.tuning else ()
-        named = [*tuned, *(target for space in self.spaces for target in space.targets())]
-        return [target for target in dict.fromkeys(named) if target != "seed"]
+        return _targets(self.spaces, self.tuning)
 
-    @property
+    @cached_property
     def schema(self) -> pa.Schema:
         """Arrow schema of the rows."""
-        return row.schema(self.scenario, self.targets, self.measures)
+        return row.schema(self.description.targets, self.measures)
 
-    def keys(self) -> set[str]:
-        """Return the keys of all computed cells."""
-        return set(self._read(["key"]).column("key").to_pylist())
+    def versions(self) -> dict[str, str]:
+        """Return the version of lathe_rc that computed each cell, by key."""
+        found = self._read(["key", "version"])
+        return dict(zip(found.column("key").to_pylist(), found.column("version").to_pylist(), strict=True))
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the table of rows in cell order.
@@ -181,24 +221,19 @@ class Folder:
         Args:
             columns: columns to read; None: all columns.
         """
-        found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns])))
-        for target in self.targets:
-            # Cells computed before a target was first varied have the scenario's value of that target.
-            if target in found.column_names and found.column(target).null_count:
-                field = found.schema.field(target)
-                filled = pyarrow.compute.coalesce(
-                    found.column(target), pa.scalar(self.scenario.value(target), field.type)
-                )
-                found = found.set_column(found.column_names.index(target), field, filled)
-        found = found.sort_by("cell")
+        found = self._read(None if columns is None else list(dict.fromkeys(["cell", *columns]))).sort_by("cell")
         return found if columns is None else found.select(list(columns))
 
     def _read(self, columns: Sequence[str] | None) -> pa.Table:
-        place, whole = self.path / "rows", self.schema.empty_table()
+        whole = self.schema.empty_table()
         whole = whole if columns is None else whole.select(list(columns))
-        with _reading(place):
-            paths = sorted(path for path in place.iterdir() if path.suffix == ".parquet") if place.exists() else []
-        return pa.concat_tables([whole, *(self._rows(path, columns) for path in paths)])
+        return pa.concat_tables([whole, *(self._rows(path, columns) for path in self._paths())])
+
+    def _paths(self) -> list[Path]:
+        """Return the files of rows; a process killed between the two renames of `_conform` leaves only the new ones."""
+        place = next((path for name in (_ROWS, _NEW) if (path := self.path / name).exists()), None)
+        with _reading(self.path):
+            return sorted(path for path in place.iterdir() if path.suffix == ".parquet") if place else []
 
     def _rows(self, path: Path, columns: Sequence[str] | None) -> pa.Table:
         """Return the rows of one Parquet file."""
@@ -208,9 +243,61 @@ class Folder:
             if missing := [name for name in row.HEAD if name not in names]:
                 raise InputError(f"{path}: no rows of a sweep: without the column {missing[0]}; allowed: without it")
             content.seek(0)
-            return pyarrow.parquet.read_table(content, columns=columns and list(columns), schema=self.schema)
+            if set(names) >= set(self.schema.names):
+                names = columns and list(columns)
+                return pyarrow.parquet.read_table(content, columns=names, schema=self.schema)
+            found = self._completed(pyarrow.parquet.read_table(content, schema=self.schema))
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: no rows of a sweep ({shown(error)}); allowed: without it") from None
+        return found if columns is None else found.select(list(columns))
+
+    def _completed(self, found: pa.Table) -> pa.Table:
+        """Return rows with the values of the parameters that were not varied when these cells were computed."""
+        if not self.targets:
+            return found
+        rows = []
+        for each in found.select([*self.targets, "seed"]).to_pylist():
+            known = each
+            with suppress(InputError):  # a cell that the scenario does not accept has only the values of its request
+                known = each | row.effective(self.scenario.varied(_given(each)), self.targets)
+            rows.append(known)
+        values = pa.Table.from_pylist(rows, pa.schema([self.schema.field(name) for name in (*self.targets, "seed")]))
+        for name in self.targets:
+            found = found.set_column(self.schema.names.index(name), self.schema.field(name), values.column(name))
+        return found
+
+    def forget(self, keys: Collection[str]) -> None:
+        """Remove the rows with these keys.
+
+        Raises:
+            LatheError: the files cannot be written; existing rows are preserved.
+        """
+        if keys:
+            with locked(self.path / _WRITING), writing(self.path):
+                self._conform(keys)
+
+    def _conform(self, without: Collection[str] = ()) -> None:
+        """Write all rows anew if some have not all columns, or some are to be left out; call it with the lock held."""
+        place, new, old = (self.path / name for name in (_ROWS, _NEW, _OLD))
+        if not place.exists() and new.exists():  # between the two renames below
+            new.rename(place)
+        place.mkdir(exist_ok=True)
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+        if not without and all(_columns(path) == self.schema.names for path in self._paths()):
+            return
+        kept = ~pyarrow.compute.field("key").isin(pa.array(list(without), pa.string()))
+        try:
+            new.mkdir()
+            for path in self._paths():
+                with files.replacing(new / path.name) as stream:
+                    stream.write(_parquet(self._rows(path, None).filter(kept)))
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)  # a full disk gets its room back
+            raise
+        place.rename(old)
+        new.rename(place)
+        shutil.rmtree(old, ignore_errors=True)
 
     def row(self, number: int) -> dict[str, Any]:
         """Return the row of a cell, by column.
@@ -232,8 +319,7 @@ class Folder:
             InputError: the cell does not exist, or is not computed yet.
         """
         found = self.row(number)
-        values = {target: found[target] for target in self.targets}
-        return values if found["seed"] in (None, self.scenario.shared.seed) else {**values, "seed": found["seed"]}
+        return _given({name: found[name] for name in [*self.targets, "seed"]})
 
     def write(self, rows: Sequence[pa.Table]) -> None:
         """Write rows as one additional Parquet file.
@@ -241,12 +327,31 @@ class Folder:
         Raises:
             LatheError: the file cannot be written; existing rows are preserved.
         """
-        place = self.path / "rows"
+        place = self.path / _ROWS
         # Several processes may compute a tuning, so without the lock two files could get the same number.
         with locked(self.path / _WRITING), writing(self.path):
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
                 stream.write(_parquet(pa.concat_tables(rows)))
+
+
+def _targets(spaces: Sequence[Space], tuning: Request | None) -> list[str]:
+    tuned = tuning.targets if tuning else ()
+    named = [*tuned, *(target for space in spaces for target in space.targets())]
+    return [target for target in dict.fromkeys(named) if target != "seed"]
+
+
+def _given(values: dict[str, Any]) -> dict[str, Value]:
+    """Return the values that a row has."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _columns(path: Path) -> list[str]:
+    try:
+        with _reading(path):
+            return list(pyarrow.parquet.read_schema(path).names)
+    except pa.ArrowException as error:
+        raise InputError(f"{path}: no rows of a sweep ({shown(error)}); allowed: without it") from None
 
 
 def _parquet(rows: pa.Table) -> bytes:

@@ -5,11 +5,10 @@
 """
 
 import math
-import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,11 @@ from lathe_rc import __version__, files
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.sweep import figures, row
 from lathe_rc.sweep.best_cell import Surroundings, surroundings
-from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, is_grid
+from lathe_rc.sweep.effects import LEAST, Axis, Bins, Effect, Yield, bins, effect, groups, is_grid, total_effect
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.page_data import PageData, default_goal, text_of
+from lathe_rc.sweep.outcomes import outcomes
+from lathe_rc.sweep.page_data import PageData, text_of
 from lathe_rc.sweep.parallel import parallel
 from lathe_rc.view.charts import Charts, page_template
 
@@ -37,8 +37,8 @@ _MOST_ALONE = 200  # values of a sole parameter that are shown individually
 _FIELD = 10  # mean number of cells per field where values are binned
 _BEST = 10  # listed cells
 _MOST_REASONS = 12
+_NONE = "no result"  # column of effects: whether a cell has no value of the goal
 _SCALE = 2.0  # scale of the PNGs
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _NAMES = ("heat-map", "lines", "sensitivity", "parallel-coordinates", "yield")
 
 
@@ -93,9 +93,9 @@ def _text(seen: PageData, drawn: Charts) -> str:
     if not sections["nothing"]:
         sections |= _sections(seen, done, drawn)
     return page_template(Path(__file__).with_name("page.html.j2")).render(
-        title=f"Sweep of {seen.folder.scenario.name}",
+        title=f"Sweep of {seen.folder.name}",
         goal=seen.goal,
-        default_goal=default_goal(seen.folder),
+        default_goal=seen.folder.description.goal,
         cells=len(seen.cells),
         facts=_facts(seen, done, place),
         surroundings=place.sentences,
@@ -141,18 +141,10 @@ def _facts(seen: PageData, done: Yield, place: Surroundings) -> Iterator[tuple[s
 
 def _outcomes(seen: PageData) -> list[list[str]]:
     """Return one row per outcome of the cells: status, number, share, and the reason of one cell as an example."""
-    # Reasons that differ only in numbers count as one outcome.
-    groups: dict[tuple[str, str], list[int]] = {}
-    statuses, reasons = (seen.table.column(name).to_pylist() for name in ("status", "reason"))
-    for place, (status, reason) in enumerate(zip(statuses, reasons, strict=True)):
-        groups.setdefault((status, _NUMBER.sub("…", reason or "")), []).append(place)
-    largest = sorted(groups.items(), key=lambda item: -len(item[1]))
-    found = [
-        (status, len(places), f"cell {seen.cells[places[0]]}: {reasons[places[0]]}" if pattern else "")
-        for (status, pattern), places in largest[:_MOST_REASONS]
-    ]
+    largest = outcomes(seen.table)
+    found = [(each.status, each.cells, each.example) for each in largest[:_MOST_REASONS]]
     if rest := largest[_MOST_REASONS:]:
-        found.append(("others", sum(len(places) for _, places in rest), f"{len(rest)} more reasons"))
+        found.append(("others", sum(each.cells for each in rest), f"{len(rest)} more reasons"))
     return [[status, str(count), f"{count / len(seen.cells):.1%}", told] for status, count, told in found]
 
 
@@ -164,9 +156,11 @@ def _limits(seen: PageData) -> str:
 
 def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
     """Return the template's sections for cells with a goal value, and add their figures."""
-    weighed = zip(seen.axes, _effects_on(seen.goal, seen.axes), strict=True)
+    weighed = zip(seen.axes, _effects(seen, [seen.goal], seen.axes)[seen.goal.name], strict=True)
     axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
-    effects = {goal.name: _effects_on(goal, axes) for goal in seen.goals}
+    none = Goal(_NONE, _NONE, "", np.isnan(seen.goal.values).astype(np.float64))
+    goals = [*seen.goals, *([none] if none.values.any() else [])]
+    effects = _effects(seen, goals, axes)
     mine = effects[seen.goal.name]
     told = parallel_note = ""
     if axes:
@@ -175,7 +169,7 @@ def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
         parallel_note = _parallel(seen, axes, drawn)
     drawn.add("yield", {"": figures.cumulative(done, seen.goal, seen.tolerance)})
     shares = [each.share for axis, each in zip(axes, mine, strict=True) if not axis.tied and each.share is not None]
-    goals = [goal for goal in seen.goals if any(found.share is not None for found in effects[goal.name])]
+    goals = [goal for goal in goals if any(found.share is not None for found in effects[goal.name])]
     return {
         "best": _best(seen),
         "choices": [axis.label for axis in axes[:_MOST_AXES]],
@@ -192,26 +186,41 @@ def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
                 for place, axis in enumerate(axes)
             ],
         },
-        "exact": is_grid(seen.axes, seen.goal.values),
+        "exact": is_grid(seen.axes, np.zeros(len(seen.cells))),
+        "total": any(found.total is not None for found in mine),
+        "missing": bool(none.values.any()),
         "rest": f"{round(1.0 - sum(shares), 3) + 0.0:.3f}" if shares else "",
         "yields": list(_yields(seen, done)),
     }
 
 
-def _effects_on(goal: Goal, axes: Sequence[Axis]) -> list[Effect]:
-    exact = is_grid(axes, goal.values)
-    return [effect(axis, np.log10(goal.values) if goal.log else goal.values, exact=exact) for axis in axes]
+def _effects(seen: PageData, goals: Sequence[Goal], axes: Sequence[Axis]) -> dict[str, list[Effect]]:
+    """Return the effects of the parameters on goals, by goal."""
+    exact, lot = is_grid(axes, np.zeros(len(seen.cells))), seen.lot
+    alike = groups(axes, seen.table.column("seed").to_numpy(zero_copy_only=False).astype(np.float64))
+    drawn = (seen.cells % lot < 2) | (lot == 1)  # in a Saltelli sample only these cells are independent of each other
+    found: dict[str, list[Effect]] = {}
+    for goal in goals:
+        values = np.log10(goal.values) if goal.log else goal.values
+        for axis, group in zip(axes, alike, strict=True):
+            each = effect(axis, np.where(drawn, values, np.nan), exact=exact)
+            total = None if axis.tied else total_effect(group, values, exact=exact, lot=lot)
+            if total is not None:
+                each = replace(each, total=total[0], error=total[1])
+            found.setdefault(goal.name, []).append(each)
+    return found
 
 
 def _weight(axis: Axis, found: Effect) -> tuple[bool, float, float]:
     """Return the sort key of a parameter: largest effect first, derived parameters last."""
-    share = -math.inf if found.share is None else found.share
-    return axis.tied, -share, -abs(found.rank or 0.0)
+    weight = found.share if found.total is None else found.total
+    return axis.tied, math.inf if weight is None else -weight, -abs(found.rank or 0.0)
 
 
 def _told(found: Effect) -> str:
-    share, rank = figures.effect_said(found)
-    return f"{share} ({rank})" if rank else share or "–"
+    total, share, rank = figures.effect_said(found)
+    alone = f"{share} ({rank})" if rank else share or "–"
+    return f"{total}; {alone}" if total else alone
 
 
 def _choices(seen: PageData, axes: Sequence[Axis], drawn: Charts) -> str:

@@ -3,30 +3,20 @@
 
 from collections import Counter
 from functools import cached_property
-from typing import cast
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from lathe_rc.cell.loops import loops
-from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.sweep import NUMBERS, OF_LEARNING, row
+from lathe_rc.sweep import NUMBERS, OF_LEARNING
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
 
-GOAL = "tool.max_error"  #: default goal; without a tool the largest error of the first loop
 _LARGE = OF_LEARNING  # goals that are better the larger they are
 _MOST_TEXTS = 24  # strings of an axis with separate colours; the others share one
-
-
-def default_goal(folder: Folder) -> str:
-    """Return the column by which cells are ranked if none is asked for."""
-    loops = (each.name for each in folder.measures if each.node and each.statistic == "max_error")
-    return GOAL if row.has_tool(folder.scenario) else next(loops, GOAL)
 
 
 class PageData:
@@ -50,7 +40,7 @@ class PageData:
 
     def __init__(self, folder: Folder, goal: str = "") -> None:
         known = [*NUMBERS, *(each.name for each in folder.measures)]
-        goal = goal or default_goal(folder)
+        goal = goal or folder.description.goal
         if goal not in known:
             raise InputError(
                 f"--goal {shown(goal)!r}: no such number in a row of {folder.path}; {instead(goal, known)}"
@@ -66,7 +56,7 @@ class PageData:
 
     def _goal(self, name: str) -> Goal:
         values = self.table.column(name).to_numpy().astype(np.float64)
-        factor, unit = row.unit(name, self.folder.scenario)
+        factor, unit = self.folder.description.unit(name)
         values = np.where(np.isfinite(values), values * factor, np.nan)
         return Goal(name, f"{name} [{unit}]" if unit else name, unit, values, name in _LARGE)
 
@@ -76,7 +66,7 @@ class PageData:
         if pa.types.is_list(column.type) and all(value is None or len(value) == 1 for value in found):
             found = [None if value is None else value[0] for value in found]  # lists of one number are numbers
         tied = any(target in space.ties for space in self.folder.spaces)
-        unit = self.folder.scenario.parameter(target).unit
+        unit = self.folder.description.targets[target].unit
         label = target if unit in ("", "1") else f"{target} [{unit}]"
         if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in found):
             values = np.array([np.nan if value is None else value for value in found], dtype=np.float64)
@@ -110,7 +100,7 @@ class PageData:
         found = []
         axes = {axis.name: axis for axis in self.axes}
         for target in self.folder.targets:
-            told, own = "; ".join(self._told(target)), text_of(self.folder.scenario.value(target))
+            told, own = "; ".join(self._told(target)), text_of(self.folder.description.targets[target].value)
             axis = axes.get(target)
             if axis is None:
                 found.append([target, told, "", "", "1", own])
@@ -130,6 +120,13 @@ class PageData:
         return len(set(self.table.column("seed").to_pylist()) - {None})
 
     @property
+    def lot(self) -> int:
+        """Number of cells that depend on the same drawn point: more than one in a Saltelli sample."""
+        spaces = self.folder.spaces
+        is_saltelli = len(spaces) == 1 and spaces[0].sample.startswith("saltelli") and spaces[0].seeds == 1
+        return len(spaces[0].sampled) + 2 if is_saltelli else 1
+
+    @property
     def is_sampled(self) -> bool:
         """Whether all cells are sample points, so that their shares are estimates for the population."""
         return all(space.sample and not space.grid and not space.given for space in self.folder.spaces)
@@ -137,13 +134,10 @@ class PageData:
     @property
     def tolerance(self) -> float | None:
         """Tolerance of the goal's error, in the unit of the goal; None: not set, varied, or of another goal."""
-        scenario, name = self.folder.scenario, self.goal.name
         if any(target.endswith(".tolerance") for target in self.folder.targets):
             return None
-        tools = [cast("ToolParameters", scenario.nodes[node]) for node in scenario.of_kind("tool")]
-        allowed = {GOAL: tools[0].tolerance} if tools else {}
-        allowed |= {f"{loop.node}.max_error": loop.tolerance for loop in loops(scenario.nodes)}
-        return allowed[name] * row.unit(name, scenario)[0] if allowed.get(name) else None
+        about, name = self.folder.description, self.goal.name
+        return about.tolerances[name] * about.unit(name)[0] if name in about.tolerances else None
 
 
 def text_of(value: object) -> str:

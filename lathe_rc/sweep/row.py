@@ -6,7 +6,7 @@
 | cell | number within the sweep |
 | key | identity of the cell: a hash of the scenario and of the measures |
 | status, reason | done; refused by the check before the start; diverged; failed during the run; and the reason |
-| NODE.PARAM | parameters that differ between the cells |
+| NODE.PARAM | parameters that differ between the cells; the value with which the cell ran |
 | tool.max_error, tool.rms_error | largest and RMS form error of the last revolution [m] |
 | tool.first_max_error, tool.first_rms_error | largest and RMS form error of the first revolution [m] |
 | tool.max_errors, tool.rms_errors | largest and RMS form error of each revolution [m] |
@@ -17,17 +17,19 @@
 | TOPIC.FIELD:STATISTIC | a measure of the last revolution |
 | NODE.FIGURE | a figure of a force or position loop: always without a tool, otherwise if it is asked for |
 | revolutions, samples, seconds | numbers of revolutions and samples of the run, and its computing time [s] |
-| seed, version, digest | seed of the random parts; version of lathe_rc; see `digest` |
+| time_limit | time limit that ended a failed cell [s] |
+| seed, version, code, digest | random seed; version of lathe_rc; hash of third-party classes; see `digest` |
 """
 
 import contextlib
 import math
 import subprocess
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -48,10 +50,13 @@ from lathe_rc.cell.stages.form import form_doubt
 from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
+
+if TYPE_CHECKING:
+    from lathe_rc.sweep.description import Target
 
 DONE, REFUSED, DIVERGED, FAILED = "done", "refused", "diverged", "failed"
 LIMITS = (LIMITED, OUT_OF_REACH)  # beginnings of the events of a limit
@@ -65,7 +70,7 @@ STATISTICS: Mapping[str, Callable[[Samples], float]] = {
     "peak_to_valley": lambda samples: float(np.ptp(samples)),
 }  #: of a signal in the last revolution
 
-_ARROW = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+_ARROW = {"bool": pa.bool_(), "int": pa.int64(), "float": pa.float64(), "str": pa.string()}
 HEAD = {"cell": pa.int64(), "key": pa.string(), "status": pa.string(), "reason": pa.string()}  #: columns of each row
 _FOUND = dict.fromkeys(NUMBERS, pa.float64()) | {"tool.in_tolerance_from": pa.int64(), "limits": pa.string()}
 _TAIL = {
@@ -74,8 +79,10 @@ _TAIL = {
     "revolutions": pa.int64(),
     "samples": pa.int64(),
     "seconds": pa.float64(),
+    "time_limit": pa.float64(),
     "seed": pa.int64(),
     "version": pa.string(),
+    "code": pa.string(),
     "digest": pa.string(),
 }
 
@@ -148,14 +155,22 @@ def measure(text: str, scenario: Scenario) -> Measure:
     return Measure(topic, field, statistic)
 
 
-def schema(scenario: Scenario, targets: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
+def schema(targets: Mapping[str, "Target"], measures: Sequence[Measure]) -> pa.Schema:
     """Return the Arrow schema of the rows of a sweep."""
     columns = dict(HEAD)
-    for target in targets:
-        row = scenario.parameter(target)
-        columns[target] = pa.list_(_ARROW[row.type]) if row.is_list else _ARROW[row.type]
+    for name, target in targets.items():
+        columns[name] = pa.list_(_ARROW[target.type]) if target.is_list else _ARROW[target.type]
     columns |= _FOUND | {each.name: pa.float64() for each in measures} | _TAIL
     return pa.schema(list(columns.items()))
+
+
+def effective(scenario: Scenario, targets: Sequence[str]) -> dict[str, Value]:
+    """Return the values of a cell's parameters, by target; none for an element that its list does not have."""
+    found = {}
+    for target in targets:
+        with contextlib.suppress(IndexError):
+            found[target] = scenario.value(target)
+    return found
 
 
 class _Keeper(Errors):
@@ -276,6 +291,7 @@ def compute(
     started = False
     try:
         scenario = base.varied(values)
+        row |= effective(scenario, targets)
         row["seed"] = scenario.shared.seed
         cell = bench.cell(scenario)
         cell.check(cures=False)
@@ -286,6 +302,11 @@ def compute(
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
         row["reason"] = str(error)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - third-party code can raise anything
+        frames = traceback.extract_tb(error.__traceback__)
+        last = next((frame for frame in reversed(frames) if "site-packages" not in frame.filename), frames[-1])
+        row["status"] = FAILED
+        row["reason"] = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}: {shown(error)}"
     if cell is not None and cell.factors:
         row["margin"] = 1.0 - max(cell.factors.values())
     if cell is not None and (margins := cell.drive_margins):

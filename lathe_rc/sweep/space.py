@@ -35,9 +35,9 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
 from lathe_rc.sweep.derived_parameters import Formulas, ordered
 
-SAMPLERS = ("sobol", "halton", "latin", "random")
+SAMPLERS = ("sobol", "halton", "latin", "random", "saltelli")
 _MOST_POINTS = 2**24
-_SAMPLES = f"sobol:N, halton:N, latin:N or random:N, N from 1 up to {_MOST_POINTS}"
+_SAMPLES = f"sobol:N, halton:N, latin:N, random:N or saltelli:N, N from 1 up to {_MOST_POINTS}"
 _PIECE = 2**12  # number of sample points drawn at a time
 _LONG = 40  # number of characters of an axis that a message quotes
 
@@ -78,7 +78,8 @@ class Space:
             ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, or ``normal:DEVIATION`` about the scenario's value.
         ties: formulas of derived parameters by target, such as ``fine_controller.q_time * 1.1``: targets with
             + - * / **, brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
-        sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; empty if nothing is sampled.
+        sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; ``saltelli:N`` for N (d + 2) points of d
+            parameters, of which pairs differ in one parameter alone; empty if nothing is sampled.
         seeds: number of seeds per combination of the other values, starting at the scenario's seed.
         given: individual cells, each as values by target.
         sample_seed: random seed of the sample.
@@ -124,6 +125,7 @@ class Space:
         twice += [target for target in self.sampled if target in self.ties]
         if twice:
             raise InputError(f"{twice[0]}: varied, drawn or tied twice; allowed: once")
+        check_distinct(self.targets())
         if self.seeds < 1:
             raise InputError(f"seeds = {self.seeds}; allowed: from 1")
         for target in self.targets():
@@ -148,7 +150,9 @@ class Space:
         axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
-        for given in self.given or ({},):
+        rows = {target: scenario.parameter(target) for cell in self.given for target in cell}
+        for cell in self.given or ({},):
+            given = {target: _plain(rows[target], value) for target, value in cell.items()}
             for combination in itertools.product(*axes.values()):
                 fixed = {**given, **dict(zip(axes, combination, strict=True))}
                 for drawn in self._draws(scenario):
@@ -166,7 +170,7 @@ class Space:
         count = int(number) if number.isascii() and number.isdigit() else 0
         if name not in SAMPLERS or not 0 < count <= _MOST_POINTS:
             raise InputError(f"sample {self.sample!r}; allowed: {_SAMPLES}")
-        return count
+        return count * (len(self.sampled) + 2) if name == "saltelli" else count
 
     def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
         """Yield the sampled values of each point, by target."""
@@ -182,6 +186,12 @@ class Space:
 
 def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArray[np.float64]]:
     """Yield points in the unit cube, shape (n, dimensions); a larger sample starts with the points of a smaller one."""
+    if name == "saltelli":  # Saltelli et al. 2010: A, B, and A with one column of B; a larger sample adds such groups
+        for pairs in _sample("sobol", count // (dimensions + 2), 2 * dimensions, seed):
+            one, other = pairs[:, None, :dimensions], pairs[:, None, dimensions:]
+            mixed = np.where(np.eye(dimensions, dtype=bool), other, one)
+            yield np.concatenate([one, other, mixed], axis=1).reshape(-1, dimensions)
+        return
     if name == "latin":  # all points at once, because they depend on the count
         yield scipy.stats.qmc.LatinHypercube(dimensions, rng=seed).random(count)
         return
@@ -229,7 +239,7 @@ def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequen
         _check_type(target, row, value)
     if not found:
         raise InputError(f"{target}: no value; allowed: one or more")
-    return list({canonical({target: value}): value for value in found}.values())
+    return list({canonical({target: value}): value for value in (_plain(row, each) for each in found)}.values())
 
 
 def _told(scenario: Scenario, target: str, told: str) -> Sequence[Value]:
@@ -275,6 +285,25 @@ def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
         found = number(scenario, target, text)
         return found if row.type is float else round(found)
     return ros_yaml.parse_value(text, target)
+
+
+def check_distinct(targets: Sequence[str]) -> None:
+    """Reject two targets that set the same parameter: of a list and an element, or of all nodes and one node.
+
+    Raises:
+        InputError: there are two such targets.
+    """
+    for one, other in itertools.permutations(targets, 2):
+        whole = other.partition("[")[0].strip()
+        if one in (whole, whole.rpartition(".")[2]):
+            raise InputError(f"{one} and {other} set the same parameter; allowed: one of them")
+
+
+def _plain(row: Row, value: Value) -> Value:
+    """Return a value in its parameter's type: 1 for a real number is 1.0, so that both are the same cell."""
+    if row.type is not float:
+        return value
+    return [float(item) for item in value] if isinstance(value, list) else float(cast("float", value))
 
 
 def _check_type(target: str, row: Row, value: Value) -> None:

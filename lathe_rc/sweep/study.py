@@ -236,11 +236,14 @@ class Study:
             return optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed)
         return optuna.samplers.TPESampler(multivariate=True, seed=seed)
 
-    def compute(self, crew: distributed.Client, asked: Sequence[FrozenTrial], watch: Watch) -> None:
+    def compute(
+        self, crew: distributed.Client, asked: Sequence[FrozenTrial], watch: Watch, cell_time: float | None = None
+    ) -> None:
         """Compute the cells of a batch and report the scores to Optuna."""
         jobs = {trial.number: self._jobs(trial) for trial in asked}
         missing = {job.key: job for each in jobs.values() for job in each if job.key not in self._known}
-        keep(self._folder, rows(crew, order_of(self._folder), missing.values(), len(missing)), watch, self._take)
+        found = rows(crew, order_of(self._folder), missing.values(), len(missing), cell_time)
+        keep(self._folder, found, watch, self._take)
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             for number, each in jobs.items():
                 self._tell(number, self._objectives.score(self._known[job.key] for job in each))
@@ -262,7 +265,7 @@ class Study:
         given = [{**values, **each} for each in self._asked.over.given or ({},)]
         cells = replace(self._asked.over, given=given).cells(self._folder.scenario)
         first = trial.number * self.count
-        return [Job(first + place, self._key.of(each), each) for place, each in enumerate(cells)]
+        return [self._key.job(first + place, each) for place, each in enumerate(cells)]
 
     def _tell(self, number: int, score: Score) -> None:
         trial = self._trial(number)

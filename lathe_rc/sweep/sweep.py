@@ -2,6 +2,7 @@
 """Execution of a sweep, from its space to the table of results."""
 
 import hashlib
+import math
 import os
 import time
 from collections import Counter
@@ -13,14 +14,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import distributed
 import pyarrow as pa
+import pyarrow.compute
 
 from lathe_rc import allowed_code
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.scenario import Scenario, content
+from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.sweep import row
+from lathe_rc.sweep import inputs, row
+from lathe_rc.sweep.alone import KILLED
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.outcomes import Outcome, outcomes
 from lathe_rc.sweep.space import Space, canonical
 from lathe_rc.sweep.workers import Job, Order, client_of, rows
 
@@ -46,7 +50,7 @@ class Sweep:
     def __repr__(self) -> str:
         """Return the scenario and the numbers of cells by status as a string."""
         told = ", ".join(f"{count} {status}" for status, count in self.statuses().items())
-        return f"<Sweep of {self.folder.scenario.name} in {self.folder.path}: {told or 'nothing computed'}>"
+        return f"<Sweep of {self.folder.name} in {self.folder.path}: {told or 'nothing computed'}>"
 
     def table(self) -> pa.Table:
         """Return the table of rows in cell order (columns: `lathe_rc.sweep.row`)."""
@@ -60,6 +64,10 @@ class Sweep:
         """Return the numbers of cells by status, most frequent first."""
         return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
 
+    def outcomes(self) -> list[Outcome]:
+        """Return the statuses and reasons of the cells, most frequent first."""
+        return outcomes(self.folder.table(["cell", "status", "reason"]))
+
     def row(self, number: int) -> dict[str, Any]:
         """Return the row of a cell, by column; raises the same errors as `scenario`."""
         return self.folder.row(number)
@@ -68,7 +76,7 @@ class Sweep:
         """Return the scenario of a cell, for example to run it again.
 
         Raises:
-            InputError: the cell does not exist, is not computed yet, or was refused.
+            InputError: the cell does not exist, is not computed yet, or was refused; or its code or files are missing.
         """
         return self.folder.scenario.varied(self.folder.values(number))
 
@@ -87,6 +95,8 @@ def run_sweep(
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
+    cell_time: float | None = None,
+    retry: bool = False,
     watch: Watch = ignore,
 ) -> Sweep:
     """Compute all cells of a space that are not in the folder yet.
@@ -102,9 +112,12 @@ def run_sweep(
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.
-        watch: called with the events ``began`` (cells; computed: number of existing rows), ``compiling``
-            (nodes), ``ready`` (dashboard: address of Dask's dashboard) and ``rows`` (statuses: numbers of cells by
-            status).
+        cell_time: time limit of a cell [s]; None: 20 times the slowest cell so far, at least 60 s.
+        retry: whether to compute all failed cells again; otherwise only those that another version of lathe_rc has
+            computed, that reached a shorter time limit, or whose process was killed.
+        watch: called with the events ``began`` (cells; computed: number of existing rows; others: their numbers by
+            other version of lathe_rc), ``compiling`` (nodes), ``ready`` (dashboard: address of Dask's dashboard) and
+            ``rows`` (statuses: numbers of cells by status).
 
     Raises:
         InputError: the space is invalid, the folder has other contents, or there is no scheduler at the address.
@@ -124,14 +137,37 @@ def run_sweep(
     space.check(scenario)
     kept = Folder.begin(Path(folder), scenario, space, asked)
     with kept.locked():
-        there, total = kept.keys(), space.count(scenario)
-        left = total - sum(1 for job in _jobs(kept, space) if job.key in there) if there else total
-        watch({"event": "began", "cells": total, "computed": total - left})
+        if again := _failures(kept, cell_time, retry=retry):
+            kept.forget({job.key for job in _jobs(kept, space) if job.key in again})
+        there, total = kept.versions(), space.count(scenario)
+        versions = Counter(there[job.key] for job in _jobs(kept, space) if job.key in there) if there else Counter()
+        left = total - versions.total()
+        watch(
+            {
+                "event": "began",
+                "cells": total,
+                "computed": total - left,
+                "others": versions - Counter({row.revision(): total}),
+            }
+        )
         if left:
             with crew_for(scenario, client, scheduler, workers, watch) as crew:
                 jobs = (job for job in _jobs(kept, space) if job.key not in there)
-                keep(kept, rows(crew, order_of(kept), jobs, left), watch)
+                keep(kept, rows(crew, order_of(kept), jobs, left, cell_time), watch)
     return Sweep(kept)
+
+
+def _failures(folder: Folder, cell_time: float | None, *, retry: bool) -> set[str]:
+    """Return the keys of failed cells of which another try may help (arguments as of `run_sweep`)."""
+    found = folder.table(["key", "status", "reason", "version", "time_limit"])
+    return {
+        each["key"]
+        for each in found.filter(pyarrow.compute.field("status") == row.FAILED).to_pylist()
+        if retry
+        or each["version"] != row.revision()
+        or (each["time_limit"] or math.inf) < (cell_time or 0.0)
+        or KILLED in each["reason"]
+    }
 
 
 @contextmanager
@@ -152,7 +188,14 @@ def order_of(folder: Folder) -> Order:
     scenario = folder.scenario
     text = scenario.to_yaml(given=True)
     return Order(
-        scenario.name, text, scenario.identity, folder.targets, folder.measures, folder.schema, allowed_code.arguments()
+        scenario.name,
+        text,
+        scenario.identity,
+        folder.targets,
+        folder.measures,
+        folder.schema,
+        allowed_code.arguments(),
+        folder.inputs,
     )
 
 
@@ -192,33 +235,46 @@ def _jobs(folder: Folder, space: Space) -> Iterator[Job]:
     # A single space has no duplicate cells, so no table of keys is needed, which could have millions of entries.
     if folder.spaces == [space]:
         for number, values in enumerate(space.cells(folder.scenario)):
-            yield Job(number, key.of(values), values)
+            yield key.job(number, values)
         return
     numbers: dict[str, int] = {}
     for each in folder.spaces:
         for values in each.cells(folder.scenario):
-            found = key.of(values)
-            number = numbers.setdefault(found, len(numbers))
+            found = key.job(len(numbers), values)
+            number = numbers.setdefault(found.key, len(numbers))
             if each == space:
-                yield Job(number, found, values)
+                yield found._replace(number=number)
 
 
 class Key:
-    """Hash function for cells, over the scenario, the measures, and the values that differ from the scenario's own."""
+    """Keys of cells: hashes of the scenario, the measures, and the values that differ from the scenario's own.
+
+    A hash covers the content of the third-party classes and the files that the cell names.
+    """
 
     def __init__(self, folder: Folder) -> None:
-        scenario = folder.scenario
+        self._scenario = scenario = folder.scenario
         self._base = {target: scenario.value(target) for target in [*folder.targets, "seed"]}
-        self._files = {target for target in folder.targets if scenario.parameter(target).is_path}
-        measured = [each.name for each in folder.measures]
-        self._start = hashlib.sha256("\n".join([scenario.identity, *sorted(measured)]).encode())
+        # Such a parameter has the scenario's value in a cell only if it is given: otherwise it follows a varied drive.
+        for target in [target for target in folder.targets if scenario.follows(target)]:
+            del self._base[target]
+        self._naming = [target for target in folder.targets if inputs.names_inputs(scenario, target)]
+        self._named: dict[str, dict[str, str]] = {}
+        self._inputs = inputs.of_cell(scenario)
+        self._code = inputs.code(self._inputs)
+        measured = sorted(each.name for each in folder.measures)
+        self._start = hashlib.sha256("\n".join([scenario.identity, *measured, *filter(None, [self._code])]).encode())
 
-    def of(self, values: Mapping[str, Value]) -> str:
-        """Return the hash of a cell in hexadecimal digits."""
-        own = {target: value for target, value in values.items() if value != self._base[target]}
-        # A file is identified by its content, not by its path.
-        for target in self._files & own.keys():
-            own[target] = content(Path(str(own[target])))
+    def job(self, number: int, values: dict[str, Value]) -> Job:
+        """Return the job of a cell, with its key in hexadecimal digits."""
+        own: dict[str, Any] = {target: value for target, value in values.items() if value != self._base.get(target)}
+        code = self._code
+        if naming := {target: own[target] for target in self._naming if target in own}:
+            text = canonical(naming)
+            if text not in self._named:
+                self._named[text] = inputs.of_values(self._scenario, naming)
+            own["inputs"] = sorted(self._named[text].values())
+            code = inputs.code(self._inputs | self._named[text])
         found = self._start.copy()
         found.update(canonical(own).encode())
-        return found.hexdigest()[:32]
+        return Job(number, found.hexdigest()[:32], values, code)

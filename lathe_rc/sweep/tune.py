@@ -25,7 +25,7 @@ from lathe_rc.sweep import BATCH, SAMPLERS
 from lathe_rc.sweep.folder import Folder, Request, writing
 from lathe_rc.sweep.objectives import Objectives, objectives
 from lathe_rc.sweep.search_space import Dimension, search_space
-from lathe_rc.sweep.space import Space
+from lathe_rc.sweep.space import Space, check_distinct
 from lathe_rc.sweep.study import Study
 from lathe_rc.sweep.sweep import Watch, crew_for, ignore
 from lathe_rc.sweep.tuning import Tuning
@@ -51,6 +51,7 @@ def tune(
     scheduler: str | None = None,
     workers: int | None = None,
     client: distributed.Client | None = None,
+    cell_time: float | None = None,
     watch: Watch = ignore,
 ) -> Tuning:
     """Search for parameters of a cell; existing trials in the folder are not computed again.
@@ -73,6 +74,7 @@ def tune(
         scheduler: address of a Dask scheduler; None: workers on this machine.
         workers: number of worker processes on this machine; None: one per core.
         client: Dask client, used instead of ``scheduler`` and ``workers``.
+        cell_time: time limit of a cell [s]; None: 20 times the slowest cell so far, at least 60 s.
         watch: called with the events of `lathe_rc.run_sweep` (``began`` gives the number of existing trials), with
             ``told`` (tuning: all trials so far) after each batch, and repeatedly with ``waiting`` while other
             processes compute the remaining trials.
@@ -96,6 +98,7 @@ def tune(
     if twice := [target for target in found if target in over.targets()]:
         raise InputError(f"{twice[0]}: free, and what the goal is over as well; allowed: one of both")
     over.check(scenario)
+    check_distinct([*found, *over.targets()])
     _check_sampler(sampler, wanted, found)
     for name, number in (("trials", trials), ("batch", batch)):
         if number < 1:
@@ -123,7 +126,7 @@ def tune(
             while asked or state.count_trials(TrialState.RUNNING, trials):
                 if asked:
                     crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
-                    state.compute(crew, asked, watch)
+                    state.compute(crew, asked, watch, cell_time)
                 else:  # the best trial is known only when all are, including those of other processes
                     watch({"event": "waiting"})
                     time.sleep(_PAUSE)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Computation of a sweep's cells on Dask workers, in tasks of a few seconds.
 
-Dask schedules, retries and moves data. This module sets the number of cells per task: the first tasks, which compile
-missing kernels, are small, and later ones are sized to take `TASK` seconds.
+Dask schedules and moves data. This module sets the number of cells per task: the first tasks, which compile missing
+kernels, are small, and later ones are sized to take `TASK` seconds. If a worker dies, its cells are computed once more,
+each such that it cannot end the worker (`lathe_rc.sweep.alone`).
 """
 
 import logging
@@ -10,13 +11,14 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import dask
 import distributed
@@ -30,6 +32,8 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.sweep import row
+from lathe_rc.sweep.alone import NO_END, Watchdog, alone, limit_memory
+from lathe_rc.sweep.inputs import Inputs, check_here
 from lathe_rc.sweep.row import Measure
 
 TASK = 2.0  #: target duration of a task [s]
@@ -38,9 +42,17 @@ _MOST = 4096  # most cells of a task
 _LEAST = 8  # towards the end, tasks get shorter, down to 1/8 of the others
 _AHEAD = 2  # tasks per worker thread: one is running, and the next is ready at the scheduler
 _CONNECT = 5  # [s] allowed for reaching a scheduler
+_UNKNOWN, _SHORTEST, _SLOWER = (
+    600.0,
+    60.0,
+    20.0,
+)  # time limit of cells [s]: of the first, of all, and to the slowest one
+_DEATHS = 4  # workers that may die with a task; a task that waits at a worker dies with it as well
+_MEMORY = 0.9  # share of a worker's memory that its cells may use; Dask ends a worker with 0.95
 _SETTINGS = {  # settings of this machine's workers
     # Dask counts the death of a worker against every task assigned to it, so only the running task is assigned.
     "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.scheduler.allowed-failures": 0,
     # By default Dask profiles a worker every 10 ms, checks its event loop every 20 ms and its memory every 100 ms,
     # which takes 10 % of the time of short cells.
     "distributed.worker.profile.enabled": False,
@@ -57,11 +69,13 @@ class Job(NamedTuple):
         number: number within the sweep.
         key: hash that identifies the cell.
         values: values of the varied parameters, by target.
+        code: hash of the third-party classes of the cell; None if there are none.
     """
 
     number: int
     key: str
     values: dict[str, Value]
+    code: str | None
 
 
 class Order(NamedTuple):
@@ -74,7 +88,8 @@ class Order(NamedTuple):
         targets: columns of the varied parameters.
         measures: further columns.
         schema: schema of the rows.
-        code: options that allow a worker to import packages, see `lathe_rc.allowed_code`.
+        allowed: options that allow a worker to import packages, see `lathe_rc.allowed_code`.
+        inputs: third-party classes and files, which the worker verifies.
     """
 
     name: str
@@ -83,7 +98,8 @@ class Order(NamedTuple):
     targets: Sequence[str]
     measures: Sequence[Measure]
     schema: pa.Schema
-    code: Sequence[str]
+    allowed: Sequence[str]
+    inputs: Inputs
 
 
 @dataclass(frozen=True)
@@ -92,6 +108,7 @@ class Share:
 
     order: Order
     jobs: Sequence[Job]
+    limit: float  # time limit of a cell [s]
 
 
 @lru_cache(maxsize=4)
@@ -114,14 +131,75 @@ def _scenario(name: str, text: str, identity: str) -> Scenario:
 
 def compute(share: Share) -> pa.Table:
     """Compute the rows of several cells (task function for Dask)."""
-    order = share.order
-    allowed_code.taken_from(order.code)
-    base, bench = _scenario(order.name, order.text, order.identity), CellRunner()
-    rows = [
-        {"cell": job.number, "key": job.key, **row.compute(base, job.values, order.targets, order.measures, bench)}
-        for job in share.jobs
-    ]
+    order, bench = share.order, CellRunner()
+    allowed_code.taken_from(order.allowed)
+    rows = []
+    with _guarded(share.limit) as begin:
+        for job in share.jobs:
+            begin()
+            rows.append(_row(order, job, bench))
+    check_here(order.inputs)  # not earlier: a cell imports the classes that its values name
     return pa.Table.from_pylist(rows, order.schema)
+
+
+def compute_alone(share: Share) -> pa.Table:
+    """Compute the rows of several cells, none of which can end the worker (task function for Dask)."""
+    order, began = share.order, time.perf_counter()
+    allowed_code.taken_from(order.allowed)
+    work = partial(_row, order)
+    rows = []
+    for job, found in zip(share.jobs, alone(work, share.jobs, share.limit, _memory()), strict=True):
+        rows.append(_failed(order, job, found, share.limit) if isinstance(found, str) else found)
+        rows[-1].setdefault("seconds", time.perf_counter() - began)
+        began = time.perf_counter()
+    check_here(order.inputs)
+    return pa.Table.from_pylist(rows, order.schema)
+
+
+def _row(order: Order, job: Job, bench: CellRunner | None = None) -> dict[str, Any]:
+    base = _scenario(order.name, order.text, order.identity)
+    found = row.compute(base, job.values, order.targets, order.measures, bench)
+    return {"cell": job.number, "key": job.key, "code": job.code} | found
+
+
+def _failed(order: Order, job: Job, reason: str, limit: float) -> dict[str, Any]:
+    """Return the row of a cell that has ended its process."""
+    found = {"cell": job.number, "key": job.key, "code": job.code, "status": row.FAILED, "reason": reason}
+    found |= {"version": row.revision(), "time_limit": limit if reason.startswith(NO_END) else None, "limits": ""}
+    base, values = _scenario(order.name, order.text, order.identity), dict(job.values)
+    with suppress(InputError):
+        scenario = base.varied(values)
+        values = row.effective(scenario, order.targets) | {"seed": scenario.shared.seed}
+    return found | values
+
+
+def _worker() -> distributed.Worker | None:
+    """Return the Dask worker that this process consists of; None in a process of the user's own."""
+    worker = distributed.get_worker()
+    return worker if worker.nanny and worker.state.nthreads == 1 else None
+
+
+def _memory() -> int | None:
+    """Return the memory limit of cells [B]; None: no limit."""
+    worker = _worker()
+    limit = worker.memory_manager.memory_limit if worker else None
+    return int(_MEMORY * limit) if limit else None
+
+
+@contextmanager
+def _guarded(limit: float) -> Iterator[Callable[[], None]]:
+    """Limit the time and the memory of a worker's cells; yield a function that begins a cell."""
+    if _worker() is None:
+        yield lambda: None
+        return
+    if memory := _memory():
+        limit_memory(memory)
+    with Path(os.devnull).open("w") as stream:
+        watchdog = Watchdog(limit, stream)
+        try:
+            yield watchdog.begin
+        finally:
+            watchdog.end()
 
 
 @contextmanager
@@ -179,7 +257,9 @@ def _cluster(workers: int | None) -> distributed.LocalCluster:
             signal.signal(signal.SIGINT, before)
 
 
-def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: int) -> Generator[pa.Table]:
+def rows(
+    client: distributed.Client, order: Order, jobs: Iterable[Job], count: int, limit: float | None = None
+) -> Generator[pa.Table]:
     """Compute cells and yield their rows as they arrive.
 
     Args:
@@ -187,13 +267,22 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
         order: data shared by the jobs.
         jobs: cells, taken from the iterator when workers become free.
         count: number of jobs.
+        limit: time limit of a cell [s]; None: a multiple of the time of the slowest cell so far.
 
     Raises:
-        LatheError: workers died repeatedly while computing the same cells.
+        LatheError: workers died repeatedly with the same task, although its cells could not end them.
     """
     waiting = iter(jobs)
-    left, size = count, 1
-    sent: dict[distributed.Future[pa.Table], Sequence[Job]] = {}
+    left, size, longest = count, 1, _UNKNOWN
+    sent: dict[distributed.Future[pa.Table], tuple[Sequence[Job], int]] = {}
+
+    def submit(some: Sequence[Job], deaths: int) -> None:
+        # Not pure; otherwise Dask would hash all jobs of a task in order to recognise the task.
+        task = compute_alone if deaths else compute
+        future = client.submit(task, Share(order, some, limit or longest), pure=False)
+        sent[future] = some, deaths
+        arriving.add(future)
+
     arriving = distributed.as_completed(loop=client.loop)
     try:
         while True:
@@ -203,24 +292,30 @@ def rows(client: distributed.Client, order: Order, jobs: Iterable[Job], count: i
                 if not (some := list(islice(waiting, max(min(size, fair), size // _LEAST, 1)))):
                     break
                 left -= len(some)
-                # Not pure; otherwise Dask would hash all jobs of a task in order to recognise the task.
-                future = client.submit(compute, Share(order, some), pure=False)
-                sent[future] = some
-                arriving.add(future)
+                submit(some, 0)
             if not sent:
                 return
             future = next(arriving)
-            found = _result(future, sent.pop(future))
-            size = _next(size, found)
+            sharing, deaths = sent.pop(future)
+            found = _result(future, sharing, last=deaths == _DEATHS)
+            if found is None:
+                submit(sharing, deaths + 1)
+                continue
+            if not deaths:
+                slowest = _SLOWER * max(found.column("seconds").to_pylist())
+                size, longest = _next(size, found), max(slowest, _SHORTEST, longest if longest < _UNKNOWN else 0.0)
             yield found
     finally:
         client.cancel(list(sent))
 
 
-def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job]) -> pa.Table:
+def _result(future: distributed.Future[pa.Table], jobs: Sequence[Job], *, last: bool) -> pa.Table | None:
+    """Return the rows of a task; None if its worker died, unless it was the last try."""
     try:
         return future.result()
     except KilledWorker:
+        if not last:
+            return None
         raise LatheError(
             f"workers died again and again over cells {jobs[0].number} to {jobs[-1].number}, perhaps out of memory; "
             "what is computed is kept; allowed: fewer workers (--workers), or shorter runs"
