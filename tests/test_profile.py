@@ -202,7 +202,7 @@ GOOD = "0,1\n90,2\n180,3\n"
         (HEAD + GOOD + "270\n", ":5: 1 values; allowed: 2"),
         (
             HEAD + "0,1,5\n90,2\n",
-            ":2: 3 values; allowed: 2, as in the header (between columns a semicolon, or decimals with a point)",
+            ":2: 3 values; allowed: 2, as in the header (between columns a semicolon, or",
         ),
         (HEAD + GOOD + "90,2\n", ": angle 90° at height 0 mm appears more than once"),
         (HEAD + "360,1\n120,2\n240,3\n360,1\n", ": angle 0° at height 0 mm appears more than once"),
