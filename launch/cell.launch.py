@@ -4,8 +4,8 @@
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes,
 ``allow_code`` a package of the current folder that the scenario names code of;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
-its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
-others, and the launch fails.
+its last block has been recorded; without a number of revolutions it goes on until Ctrl-C, which ends it with a last
+block. A node that fails ends the others, and the launch fails.
 
 This file imports launch and launch_ros alone, since ``ros2`` runs the system's Python: the executable ``launch_plan``
 of lathe_rc checks the scenario and says which processes it has.
@@ -39,6 +39,7 @@ ARGUMENTS = {
 }  #: default and description
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
 PUSHED = "ros_namespace"  # configuration in which launch_ros keeps what PushRosNamespace has set
+LONGEST_END = "60"  # [s] from Ctrl-C to SIGTERM: the digests of a bag are computed as it is closed
 PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
 
 
@@ -74,6 +75,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             arguments=process["arguments"],
             parameters=[found["file"]],
             ros_arguments=["--enclave", process["enclave"]],
+            additional_env={"LATHE_ENDS_WITH_PARENT": "1"},
+            sigterm_timeout=LaunchConfiguration("sigterm_timeout", default=LONGEST_END),
             output="screen",
             on_exit=ends,
         )
@@ -153,7 +156,7 @@ class Ends:
         self._running -= 1
         if event.returncode and not context.is_shutdown:
             self._failed.append(how_it_ended(event.process_name, event.returncode))
-            if event.returncode > 0:
+            if event.returncode > 0 or -event.returncode in (signal.SIGINT, signal.SIGTERM):
                 self.fail()
             if self._running and not self._replaced:
                 return [TimerAction(period=PATIENCE, actions=[OpaqueFunction(function=lambda _: self.fail())])]

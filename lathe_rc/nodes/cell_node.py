@@ -330,8 +330,12 @@ class CellNode(LifecycleNode):
             self.finish()
         self.protocol.shut_down(time.monotonic())
 
+    def end_by(self, signal: str) -> None:
+        """End the node because of a signal: in a run together with the cell (see `MemberProtocol.end_by`)."""
+        self.attempt(self.protocol.end_by, signal, time.monotonic())
+
     def interrupt(self, signal: str) -> None:
-        """Announce to the other members that this process ends by a signal."""
+        """Announce to the other members that this process ends at once, by a signal."""
         self.protocol.interrupt(signal)
         self._perform_actions()
         if self._host and self.protocol.failure:
@@ -404,6 +408,8 @@ class CellNode(LifecycleNode):
 
     def _on_cell_state(self, message: Any) -> None:
         self.protocol.hear_cell_state(from_ros(message, CellState), time.monotonic())
+        if self.protocol.active and not self._is_early():
+            self._take_up()
 
     def completed(self, blocks: int, samples: int, *, last: bool) -> None:
         """Report the total number of blocks and samples that the role has completed."""

@@ -414,8 +414,9 @@ class RecorderRole(Role):
         if self._writer is None:
             return
         complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
-        if self._snapshots is not None and not complete:
-            cause = f"{self.node.get_name()}: {self.node.protocol.failure or 'interrupted'}"
+        if self._snapshots is not None and (self.node.protocol.cut or not complete):
+            why = self.node.protocol.failure or self.node.protocol.cut or "interrupted"
+            cause = f"{self.node.get_name()}: {why}"
             self.node.attempt(self._snapshots.interrupt, cause)
         if self._merger is not None:
             self.node.attempt(self._merger.write_rest)
