@@ -179,6 +179,7 @@ class TestLaunch:
     @pytest.mark.parametrize(
         ("argument", "said"),
         [
+            ("spindle_encoder.members", "spindle_encoder.members: no node 'far' in the scenario; allowed: learning"),
             (
                 "revolutions",
                 "no launch argument 'revolutions'; allowed: scenario, bag, namespace, allow_code, NODE.* .*nominal_rpm",
@@ -190,7 +191,7 @@ class TestLaunch:
     )
     def test_refuses_an_argument_that_there_is_not(self, start: Callable[..., Any], argument: str, said: str) -> None:
         with pytest.raises(RuntimeError, match=said):
-            start(**{argument: "far"})
+            start(**{argument: "[far]" if argument.endswith("members") else "far"})
 
     def test_names_a_program_that_says_nothing(
         self, start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
@@ -233,6 +234,7 @@ class TestEndsUnderLaunch:
         [
             pytest.param([("tool-1", 0), ("recorder-2", 0)], ("spindle-3", 0), "", id="in order"),
             pytest.param([], ("tool-1", 2), "tool-1 ended with exit code 2$", id="a failure is named at once"),
+            pytest.param([], ("tool-1", -15), "tool-1 was killed by SIGTERM$", id="ended before it handles signals"),
             pytest.param(
                 [("tool-1", -9), ("recorder-2", 0)],
                 ("spindle-3", 0),

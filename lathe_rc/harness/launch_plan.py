@@ -48,6 +48,7 @@ def plan(asked: Mapping[str, Any]) -> dict[str, Any]:
     scenario = scenarios.load(resources.find(Path(asked["scenario"]))).varied(
         {name: ros_yaml.parse_value(text, name) for name, text in values.items()}
     )
+    scenario.check_members()
     Cell(scenario.nodes).check()
     namespace = checked_namespace(asked["namespace"])
     bag = Path(asked["bag"]) if asked["bag"] else scenario.recorder[1].folder
