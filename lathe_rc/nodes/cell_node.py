@@ -38,6 +38,7 @@ from lathe_rc.nodes import declare, graph
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
@@ -682,11 +683,22 @@ class CellNode(LifecycleNode):
         """Report each publisher once whose quality of service does not fit."""
         for topic, name, why in set(graph.unfit(self, self.inlets)) - self._unfit:
             self._unfit.add((topic, name, why))
+            if topic in self.table.volatile_inputs and not self.table.window:
+                self._subscribe_anew(topic)
+                continue
             told = (
                 f"a publisher offers a quality of service that does not fit ({why}); if it is a device that keeps no "
-                f"messages, add {topic} to {self.get_name()}.volatile_inputs"
+                f"messages, add {topic} to {self.get_name()}.volatile_inputs; if it is best effort, with window: 0"
             )
             self._refuse(ForeignMessage(topic, name, "", told))
+
+    def _subscribe_anew(self, topic: str) -> None:
+        """Replace the subscription to a device by one with the quality of service that its publishers offer."""
+        before, offers = self.inlets[topic], self.get_publishers_info_by_topic(topic)
+        kind, callback = before.msg_type, before.callback
+        self.inlets[topic] = self.create_subscription(kind, topic, callback, asked(offers), raw=True)
+        self.destroy_subscription(before)
+        self.get_logger().info(f"{topic} is read as its device sends it: lost blocks are held and counted")
 
     def _report_refused(self, message: ForeignMessage) -> None:
         publishers = graph.publishers(self, message.topic)
