@@ -2,7 +2,8 @@
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes,
-``allow_code`` a package of the current folder that the scenario names code of;
+``allow_code`` a package of the current folder that the scenario names code of; ``log_level`` and ``use_sim_time`` are
+those of the nodes;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
 its last block has been recorded; without a number of revolutions it goes on until Ctrl-C, which ends it with a last
 block. A node that fails ends the others, and the launch fails.
@@ -36,7 +37,13 @@ ARGUMENTS = {
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
     "namespace": ("", "of the nodes, in the one that an including file has pushed; two cells in one domain need two"),
     "allow_code": ("", "package of the current folder that the scenario names code of"),
+    "log_level": ("info", "least level of the nodes' log lines"),
+    "use_sim_time": (
+        "false",
+        "whether the nodes' ROS clocks follow /clock; samples, and the wall time of diagnostics, do not depend on it",
+    ),
 }  #: default and description
+CHOICES = {"log_level": ["debug", "info", "warn", "error", "fatal"], "use_sim_time": ["true", "false"]}
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
 PUSHED = "ros_namespace"  # configuration in which launch_ros keeps what PushRosNamespace has set
 LONGEST_END = "60"  # [s] from Ctrl-C to SIGTERM: the digests of a bag are computed as it is closed
@@ -50,7 +57,7 @@ class CellError(RuntimeError):
 def generate_launch_description() -> LaunchDescription:
     """Describe the launch; `ros2 launch` calls it."""
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
+        DeclareLaunchArgument(name, default_value=default, description=description, choices=CHOICES.get(name))
         for name, (default, description) in ARGUMENTS.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=nodes)])
@@ -65,6 +72,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     folder = tempfile.mkdtemp(prefix="lathe_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     found = plan(context, folder)
+    log_level, use_sim_time = (LaunchConfiguration(name).perform(context) for name in CHOICES)
+    given = ["--log-level", log_level, "-p", f"use_sim_time:={use_sim_time}"]
     ends = Ends(len(found["processes"]), replaced=found["restarts"])
     return [
         Node(
@@ -74,7 +83,7 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             namespace=found["namespace"],
             arguments=process["arguments"],
             parameters=[found["file"]],
-            ros_arguments=["--enclave", process["enclave"]],
+            ros_arguments=["--enclave", process["enclave"], *given],
             additional_env={"LATHE_ENDS_WITH_PARENT": "1"},
             sigterm_timeout=LaunchConfiguration("sigterm_timeout", default=LONGEST_END),
             output="screen",

@@ -82,8 +82,8 @@ def _refuse_unknown(given: Iterable[str], own: Sequence[str]) -> None:
         if not (name in own or _replaces(name)):
             shared = ", ".join(SharedParameters.model_fields)
             raise InputError(
-                f"no launch argument {name!r}; allowed: scenario, bag, namespace, allow_code, NODE.PARAM for a value "
-                f"of the scenario, or a shared one: {shared}"
+                f"no launch argument {name!r}; allowed: scenario, bag, namespace, allow_code, log_level, use_sim_time, "
+                f"NODE.PARAM for a value of the scenario, or a shared one: {shared}"
             )
 
 

@@ -18,6 +18,7 @@ from lathe_rc_msgs.msg import CellState as CellStateMessage
 from lathe_rc_msgs.msg import Member
 from lathe_rc_msgs.msg import Progress as ProgressMessage
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -720,7 +721,9 @@ class CellNode(LifecycleNode):
             values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = (
+            Clock().now().to_msg()
+        )  # wall time, also with use_sim_time: reports derive the pace from it
         self._host["diagnostics"].publish(message)
 
 

@@ -13,7 +13,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lathe_rc import messages
-from lathe_rc.cell.latency_histogram import LATENCY, LATENESS
+from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, PERCENT
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
@@ -142,9 +142,13 @@ class SpindleRole(StageRole):
 
     def statistics(self) -> dict[str, object]:
         """Return the time master's figures for the diagnostics (implements `Role`)."""
-        leads = self.leads
+        leads, pace = self.leads, self.pace.figures()
+        lateness = {f"lateness, {percent} % within [s]": late for percent, late in pace.within.items()} if pace else {}
         return {
             **super().statistics(),
+            **lateness,
+            **({"late blocks": pace.late, "worst lateness [s]": pace.worst} if pace else {}),
+            **{f"latency, {percent} % within [s]": leads.latency.within(percent) for percent in PERCENT},
             "blocks in flight": self.blocks - leads.least,
             "slowest member": leads.slowest,
             "schedule slipped [s]": round(self.pace.slipped, 3),
