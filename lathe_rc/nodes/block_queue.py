@@ -2,7 +2,7 @@
 """Queue of the blocks of one topic that a node reads: checked, and in order."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import astuple, replace
 from typing import Any
 
@@ -17,6 +17,8 @@ from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.protocol import BlockOrder, ForeignMessage
+
+_QUIET = 1.0  # [s] after which the last blocks of a device that loses blocks count as lost
 
 
 class BlockQueue(BlockOrder):
@@ -36,7 +38,8 @@ class BlockQueue(BlockOrder):
     def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
         self._limit, self._size = 8 * signal_depth(parameters), parameters.block_size
         super().__init__(topic, parameters.run_id, None if parameters.window else self._limit * self._size)
-        self.type = msgtype
+        self.type, self.lossy = msgtype, not parameters.window and topic in parameters.volatile_inputs
+        self._quiet = (0, 0.0)  # end of the newest block, and the monotonic time at which it was first seen
         self.blocks: deque[Block] = deque()
         self.inside = False
         self._decoder = Decoder(msgtype, fields, self.admit)
@@ -105,11 +108,27 @@ class BlockQueue(BlockOrder):
         if missing is None:
             return None
         if missing:  # a free-running cell holds the last sample, and counts the lost blocks
-            for held in self._held(self._last(), self.end, block.first_index):
-                self.blocks.append(held)
-                self.received += 1
-                self.lost += 1
+            self._lose(block.first_index)
         return self._append(block)
+
+    def _lose(self, end: int, *, last: bool = False) -> None:
+        """Hold and count the lost blocks of a free-running cell, which end before sample ``end``."""
+        self.lost_from = self.end if self.lost_from is None else self.lost_from
+        for held in self._held(self._last(), self.end, end):
+            held.last = last and held.first_index + held.samples == end
+            self.blocks.append(held)
+            self.received += 1
+            self.lost += 1
+
+    def end_at(self, end: int, now: float) -> None:
+        """Hold the newest sample up to the end of the run once a device that loses blocks is quiet; ``now`` [s]."""
+        if not self.lossy or self.ended:
+            return
+        if self._quiet[0] != self.end or not self._quiet[1]:
+            self._quiet = (self.end, now)
+        elif now - self._quiet[1] > _QUIET:
+            self._lose(end, last=True)
+            self.hold(end)
 
     def until(self, end: int) -> Iterator[Block]:
         """Remove and yield the queued samples before ``end``."""
@@ -182,3 +201,10 @@ class BlockQueue(BlockOrder):
         if len(self.blocks) > self._limit:
             raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
         return block
+
+
+def explain_losses(node: str, queues: Collection[BlockQueue]) -> str:
+    """Say how many blocks of a free-running cell a node has lost, and from which sample on; empty if none."""
+    lost = [f"{queue.lost} of {queue.topic} from sample {queue.lost_from} on" for queue in queues if queue.lost]
+    total = sum(queue.lost for queue in queues)
+    return f"{node}: lost {total} blocks of a free-running cell: {', '.join(lost)}" if lost else ""

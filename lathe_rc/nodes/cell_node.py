@@ -18,6 +18,7 @@ from lathe_rc_msgs.msg import CellState as CellStateMessage
 from lathe_rc_msgs.msg import Member
 from lathe_rc_msgs.msg import Progress as ProgressMessage
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -38,6 +39,7 @@ from lathe_rc.nodes import declare, graph
 from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
@@ -330,8 +332,12 @@ class CellNode(LifecycleNode):
             self.finish()
         self.protocol.shut_down(time.monotonic())
 
+    def end_by(self, signal: str) -> None:
+        """End the node because of a signal: in a run together with the cell (see `MemberProtocol.end_by`)."""
+        self.attempt(self.protocol.end_by, signal, time.monotonic())
+
     def interrupt(self, signal: str) -> None:
-        """Announce to the other members that this process ends by a signal."""
+        """Announce to the other members that this process ends at once, by a signal."""
         self.protocol.interrupt(signal)
         self._perform_actions()
         if self._host and self.protocol.failure:
@@ -404,6 +410,8 @@ class CellNode(LifecycleNode):
 
     def _on_cell_state(self, message: Any) -> None:
         self.protocol.hear_cell_state(from_ros(message, CellState), time.monotonic())
+        if self.protocol.active and not self._is_early():
+            self._take_up()
 
     def completed(self, blocks: int, samples: int, *, last: bool) -> None:
         """Report the total number of blocks and samples that the role has completed."""
@@ -676,11 +684,22 @@ class CellNode(LifecycleNode):
         """Report each publisher once whose quality of service does not fit."""
         for topic, name, why in set(graph.unfit(self, self.inlets)) - self._unfit:
             self._unfit.add((topic, name, why))
+            if topic in self.table.volatile_inputs and not self.table.window:
+                self._subscribe_anew(topic)
+                continue
             told = (
                 f"a publisher offers a quality of service that does not fit ({why}); if it is a device that keeps no "
-                f"messages, add {topic} to {self.get_name()}.volatile_inputs"
+                f"messages, add {topic} to {self.get_name()}.volatile_inputs; if it is best effort, with window: 0"
             )
             self._refuse(ForeignMessage(topic, name, "", told))
+
+    def _subscribe_anew(self, topic: str) -> None:
+        """Replace the subscription to a device by one with the quality of service that its publishers offer."""
+        before, offers = self.inlets[topic], self.get_publishers_info_by_topic(topic)
+        kind, callback = before.msg_type, before.callback
+        self.inlets[topic] = self.create_subscription(kind, topic, callback, asked(offers), raw=True)
+        self.destroy_subscription(before)
+        self.get_logger().info(f"{topic} is read as its device sends it: lost blocks are held and counted")
 
     def _report_refused(self, message: ForeignMessage) -> None:
         publishers = graph.publishers(self, message.topic)
@@ -702,7 +721,9 @@ class CellNode(LifecycleNode):
             values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = (
+            Clock().now().to_msg()
+        )  # wall time, also with use_sim_time: reports derive the pace from it
         self._host["diagnostics"].publish(message)
 
 

@@ -28,7 +28,7 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes import publisher_info
-from lathe_rc.nodes.block_queue import BlockQueue
+from lathe_rc.nodes.block_queue import BlockQueue, explain_losses
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import latched_qos, message_class
@@ -68,7 +68,6 @@ class RecorderRole(Role):
         self._newest: dict[str, bytes] = {}  # newest message of each topic from another process
         self._encoder = cache(Encoder)  # by message type, run, source and step [ns]
         self._merger: Merger | None = None
-        self._ended: set[str] = set()  # topics whose last block has arrived
         self._first = self._blocks = self._samples = self._sound = 0
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
@@ -295,8 +294,13 @@ class RecorderRole(Role):
 
     def tick(self, now: float) -> float:
         """Flush the bag periodically, so that a crash loses a bounded time (implements `Role`)."""
+        if (run_end := self.node.protocol.run_end) and self._merger is None:
+            for queue in self._queues.values():
+                queue.end_at(run_end, now)
+            self.node.attempt(self._end_unsorted, run_end)
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
+            self._tell_gaps()
             self.node.attempt(self._writer.flush)
         return self._flush_due
 
@@ -377,11 +381,24 @@ class RecorderRole(Role):
         """Write a block of a free-running cell in order of arrival: blocks may be missing, so sorting cannot wait."""
         self._write(block.log_ns, queue.topic, data)
         if block.last:
-            self._ended.add(queue.topic)
-        if self._ended == set(self._queues):
-            self._samples = block.first_index + block.samples
+            self._end_unsorted(block.first_index + block.samples)
+
+    @property
+    def _all_ended(self) -> bool:
+        return bool(self._queues) and all(queue.ended for queue in self._queues.values())
+
+    def _end_unsorted(self, end: int) -> None:
+        """Finish once all topics of a free-running cell have ended before sample ``end``."""
+        if self._all_ended and not self.node.protocol.over:
+            self._samples = end
             self._blocks = -(-self._samples // self.table.block_size)
             self._complete()
+
+    def _tell_gaps(self) -> None:
+        """Store in the bag from which sample on blocks of each topic were lost."""
+        gaps = {topic: queue.lost_from for topic, queue in self._queues.items() if queue.lost_from is not None}
+        if gaps:
+            self._open.tell({loss.GAPS: json.dumps(gaps)})
 
     def _complete(self) -> None:
         """Finish after the last block of every topic is written."""
@@ -413,9 +430,11 @@ class RecorderRole(Role):
         """Write the remaining data and close the bag."""
         if self._writer is None:
             return
-        complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
-        if self._snapshots is not None and not complete:
-            cause = f"{self.node.get_name()}: {self.node.protocol.failure or 'interrupted'}"
+        self._tell_gaps()
+        complete = bool(self._queues) and self._merger.complete if self._merger else self._all_ended
+        if self._snapshots is not None and (self.node.protocol.cut or not complete):
+            why = self.node.protocol.failure or self.node.protocol.cut or "interrupted"
+            cause = f"{self.node.get_name()}: {why}"
             self.node.attempt(self._snapshots.interrupt, cause)
         if self._merger is not None:
             self.node.attempt(self._merger.write_rest)
@@ -432,5 +451,5 @@ class RecorderRole(Role):
             whole = "to the end of the safe state; what lost members published is held"
         self.node.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
         self.node.reporter("closed", self.node.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
-        if self._lost:
-            self.node.fail(LossyRunError(f"{self.node.full_name}: lost {self._lost} blocks of a free-running cell"))
+        if losses := explain_losses(self.node.full_name, self._queues.values()):
+            self.node.fail(LossyRunError(losses))

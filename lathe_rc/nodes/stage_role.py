@@ -18,7 +18,7 @@ from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals
-from lathe_rc.nodes.block_queue import BlockQueue
+from lathe_rc.nodes.block_queue import BlockQueue, explain_losses
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.inputs import Inputs
 from lathe_rc.nodes.outputs import Memory, Outputs
@@ -206,8 +206,12 @@ class StageRole(Role):
             self.node.exchange.stages.remove(self)
 
     def tick(self, now: float) -> float:
-        """Check for readers in other processes; no further call is due (implements `Role`)."""
+        """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
+        if run_end := self.node.protocol.run_end:
+            for queue in self.inputs.queues.values():
+                queue.end_at(run_end, now)
+            self.node.due = True
         return float("inf")
 
     def statistics(self) -> dict[str, object]:
@@ -355,8 +359,8 @@ class StageRole(Role):
             self.node.get_logger().warning(f"not reached: {'; '.join(waiting)}")
             self.node.reporter("not_reached", self.node.get_name(), events=waiting)
         self.node.complete_part()
-        if self.lost:
-            raise LossyRunError(f"{self.node.full_name}: lost {self.lost} blocks of a free-running cell")
+        if losses := explain_losses(self.node.full_name, self.inputs.queues.values()):
+            raise LossyRunError(losses)
 
     # ---- in a chain ---------------------------------------------------------------------------------
 

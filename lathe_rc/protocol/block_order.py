@@ -21,6 +21,8 @@ class BlockOrder:
         end: index after the newest sample; the next block has to begin there unless the order is `open`.
         received: number of blocks so far, lost blocks included.
         lost: number of lost blocks; always 0 unless the cell is free-running.
+        lossy: the source is a device that keeps no messages, so that the first blocks and the last ones may be lost.
+        lost_from: first lost sample; None: none.
         ended: the last block has arrived.
         repeats: blocks may be repeated, since the source can be restarted in another process.
         held_from: sample from which the newest sample of a lost source is held; None: the source is not lost.
@@ -32,6 +34,8 @@ class BlockOrder:
         self.source = ""
         self.open, self.ended, self.repeats = True, False, False
         self.received = self.lost = self.end = 0
+        self.lossy = False
+        self.lost_from: int | None = None
         self.held_from: int | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
@@ -64,7 +68,7 @@ class BlockOrder:
         if self.repeats and first + samples <= self.end:
             return None
         missing = first - self.end
-        if missing < 0 or (missing and (self._longest_gap is None or not self.received)):
+        if missing < 0 or (missing and (self._longest_gap is None or not (self.received or self.lossy))):
             what = f"{missing} samples are missing" if missing > 0 else "a block came twice"
             raise LatheError(f"{self.topic}: {source} goes from sample {self.end} to {first}: {what}")
         if missing > (self._longest_gap or 0):

@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -23,7 +23,9 @@ PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
 _NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
+_END_BY_MASTER = 1.0  # [s] for a time master that is ended by the same Ctrl-C to announce the end of the run
 _MOST_MEMBERS = 256  # largest number of announced names
+INACTIVE = "inactive"  #: message of a member that is deactivated
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
@@ -47,6 +49,9 @@ class MemberProtocol:
         safe: this member knows that members are lost.
         over: this member's part of the run is complete.
         done: this member may leave.
+        run_end: end of the run, as the time master has announced it [sample]; 0: not announced.
+        cut: why the run ends before its planned end; empty: it does not.
+        left_early: this member was ended before the run.
         failure: reason of this member's failure.
         without: lost members.
         unmatched: topics with missing peers at the last look at the graph, for messages.
@@ -73,6 +78,7 @@ class MemberProtocol:
         self._newest_state: CellState | None = None  # from a time master that is not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
+        self.run_end, self.cut, self.left_early = 0, "", False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
         self.unmatched: Sequence[str] = ()
@@ -85,8 +91,10 @@ class MemberProtocol:
         self._reported_blocks = 0
         self._moved = 0.0  # time of the last block that this member completed
         self._master_stalls = False
+        self._silences: Counter[str] = Counter()  # by member
         self._repeat_due = self._time = 0.0
-        self._join_due = self._leave_due = self._wait_report_due = math.inf
+        self._join_due = self._leave_due = self._wait_report_due = self._end_due = math.inf
+        self._ended_by = ""
         self._wait_report_after: Iterator[float] = iter(())
 
     # ---- lifecycle ----------------------------------------------------------------------------------
@@ -102,13 +110,14 @@ class MemberProtocol:
         self.active = True
         if not self._started:
             self._started = True
-            self._wait_report_after = chain(_WAIT_REPORTS, repeat(_WAIT_REPORTS[-1]))
-            self._wait_report_due = now + next(self._wait_report_after)
+            self._report_waiting_from(now)
         self.announce()
 
     def deactivate(self) -> None:
         """Deactivate the member: node and cell pause."""
         self.active = False
+        if self._started:
+            self.announce()
 
     def clean_up(self) -> None:
         """Leave the cell, which must not begin without this member: its next announcement is a new join."""
@@ -125,13 +134,27 @@ class MemberProtocol:
             self._leave_due = now + _LAST_ANSWER
         self.active = False
 
+    def end_by(self, signal: str, now: float) -> None:
+        """Handle a signal that ends the node's process; in a run, the time master has some time to end the run first.
+
+        Ctrl-C reaches all members: then the time master ends the run for all. If it has not, this member is lost.
+        """
+        if self.takes_part or (self.over and not self.done):
+            self._ended_by, self._end_due = signal, math.inf if self.cut else now + _END_BY_MASTER
+        else:
+            self.interrupt(signal)
+            self.done = True
+
     def interrupt(self, signal: str) -> None:
-        """Handle a signal that ends the node's process."""
+        """Handle a signal after which the node's process ends at once."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
         elif not (self.over or self.failure or self.done):
             self._leave_before_the_run()
-            self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
+            self.left_early = not self._moved
+            why = f"{self.own.name} was ended by {signal}" + " before the run began" * self.left_early
+            self._log("info", why)
+            self._report("interrupted", message=why)
 
     def _leave_before_the_run(self) -> None:
         """Announce that the cell must not begin without this member."""
@@ -148,7 +171,8 @@ class MemberProtocol:
     def announce(self) -> None:
         """Publish name, topics and state."""
         session = self.own.session if self.own.members else self._session
-        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""), session=session)
+        pauses = INACTIVE if self.ready and not self.active else ""
+        self.own = replace(self.own, state=self._state(), message=str(self.failure or pauses), session=session)
         self.members[self.own.name] = self.own
         if self.own.members:
             self.master = self.own
@@ -349,9 +373,11 @@ class MemberProtocol:
         self.members_changed(now)
 
     def missing(self) -> list[str]:
-        """Return the members and topics that this member still needs in order to begin; empty if none."""
-        if self.done or self.failure or (self.ready and self.phase not in (None, Phase.WAITING)):
+        """Return the members and topics for which this member waits; empty if there are none."""
+        if self.done or self.failure or self.over or self.phase == Phase.SAFE:
             return []
+        if self.ready and self.phase == Phase.RUNNING:
+            return self.pausing()
         if not self.active:
             return ["its own activation"]
         if self.master is None:
@@ -359,13 +385,16 @@ class MemberProtocol:
             return [*([] if self.alone or not lonely else ["a time master"]), *lonely]
         others = [name for name in self.master.members if name != self.own.name]
         states = {name: self.members[name].state if name in self.members else None for name in others}
-        unheard = [name + self._near(name) for name, state in states.items() if state is None]
-        joining = [f"{name} to join" for name, state in states.items() if state == MemberState.JOINING]
-        if unheard or joining:
-            return [*unheard, *joining]
-        if not self.ready:
-            return list(self.unmatched)
-        return [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
+        absent = [name + self._near(name) for name, state in states.items() if state is None]
+        absent += [f"{name} to join" for name, state in states.items() if state == MemberState.JOINING]
+        if absent:
+            return absent
+        unready = [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
+        return unready if self.ready else list(self.unmatched)
+
+    def pausing(self) -> list[str]:
+        """Return the members that pause the run: for all but the time master, a time master that is silent."""
+        return [f"{self.master.name}, which is silent"] if self._master_stalls and self.master else []
 
     def _near(self, name: str) -> str:
         """Return a hint at a node with a similar name that the time master does not name."""
@@ -405,6 +434,9 @@ class MemberProtocol:
             self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
+        if self.phase == Phase.RUNNING and state.end_index:
+            self.run_end, self.cut, self._end_due = state.end_index, state.message, math.inf
+            self.active = True  # a deactivated member resumes for the end
         if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
             # A member that cannot resume gives up, and names its established namesake if there is one.
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
@@ -444,6 +476,10 @@ class MemberProtocol:
         self.silent, self.ended, self.look_due, self._time = silent, ended, math.inf, now
         if now >= self._leave_due:
             self.leave()
+        if now >= self._end_due:
+            self._end_due = math.inf
+            self.interrupt(self._ended_by)
+            self.done = self.done or not self.failure
         if not self._started or self.done:
             return
         self.look_after_others(now)
@@ -455,7 +491,12 @@ class MemberProtocol:
             self._wait_report_due = now + next(self._wait_report_after)
             if missing := self.missing():
                 self._log("warning", f"waits for {'; '.join(missing)}")
-                self._report("waits", missing=missing)
+                self._report("paused" if self.phase == Phase.RUNNING else "waits", missing=missing)
+
+    def _report_waiting_from(self, now: float) -> None:
+        """Begin to wait: the first report comes soon, the next ones later and later."""
+        self._wait_report_after = chain(_WAIT_REPORTS, repeat(_WAIT_REPORTS[-1]))
+        self._wait_report_due = now + next(self._wait_report_after)
 
     def look_after_others(self, now: float) -> None:
         """Report a silent time master, and fail if it is gone, since no further block can follow."""
@@ -495,14 +536,17 @@ class MemberProtocol:
             if now - self._moved < SILENCE:  # blocks in flight are still being computed
                 self.look_due = self._moved + SILENCE
                 return
-            self._tell_stall(name, self._reported_blocks)
+            self._tell_stall(name, self._reported_blocks, now)
         self._master_stalls = silent
 
-    def _tell_stall(self, name: str, blocks: int) -> None:
-        """Report that a member is silent, with the number of blocks that it has completed."""
+    def _tell_stall(self, name: str, blocks: int, now: float) -> None:
+        """Report that a member is silent, with the number of blocks that it has completed; log only the first time."""
         # Report first: the first log message takes some 70 ms.
         self._report("stall", member=name, blocks=blocks)
-        self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
+        self._silences[name] += 1
+        self._report_waiting_from(now)
+        if self._silences[name] == 1:
+            self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
 
     # ---- failure and end ----------------------------------------------------------------------------
 
@@ -549,6 +593,9 @@ class MemberProtocol:
         """Request once that the node leaves, after at most ``patience`` [s] for the acknowledgement of its messages."""
         if not self._leaving:
             self._leaving = True
+            for name, count in self._silences.items():
+                if count > 1:
+                    self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms {count} times")
             self.actions.append(do.Leave(patience))
 
     def left(self) -> None:

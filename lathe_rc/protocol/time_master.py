@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import actions as do
-from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol, given_up, why_failed
+from lathe_rc.protocol.member import GIVEN_UP, INACTIVE, SILENCE, MemberProtocol, given_up, why_failed
 from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
 
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
@@ -41,6 +41,7 @@ class TimeMasterProtocol(MemberProtocol):
         running: True from block 0 to the end of the run.
         unsafe: members that have not confirmed the safe state; no block is released until all have.
         completed: number of blocks that each member has completed.
+        ends_early: the run ends with the next block, whatever its pace.
         held_at: total number of blocks after which the run is held; None: it is not held.
         latency: histogram of the time from the release of a block to its completion by every member.
     """
@@ -63,10 +64,11 @@ class TimeMasterProtocol(MemberProtocol):
         self.running = False
         self.unsafe: frozenset[str] = frozenset()
         self.completed = {name: 0 for name in own.members if name != own.name}
+        self.ends_early = False
         self.held_at: int | None = None
         self.latency = Durations()
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were released
-        self._checking = self._declared = False
+        self._checking = self._declared = self._short = False
         self._why = ""
         self._heard = self._looked = 0.0
         self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
@@ -150,7 +152,8 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions += [do.Start(), do.Release()]
 
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
-        end, lost = (self.end or 0, tuple(sorted(self.without))) if self._declared else (0, ())
+        known = self._declared or self.ends_early or (self.blocks == self.blocks_in_run and not self.window)
+        end, lost = (self.end or 0, tuple(sorted(self.without))) if known else (0, ())
         self.phase = phase
         self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
 
@@ -162,6 +165,11 @@ class TimeMasterProtocol(MemberProtocol):
         """
         if (state.run_id, state.session) != (self.own.run_id, self.own.session):
             raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
+
+    def deactivate(self) -> None:
+        """Pause the cell (extends `MemberProtocol`)."""
+        super().deactivate()
+        self._report_waiting_from(self._time)
 
     # ---- progress -----------------------------------------------------------------------------------
 
@@ -237,6 +245,31 @@ class TimeMasterProtocol(MemberProtocol):
         """Record that the last block is released; the run ends when all members have completed it."""
         if not self.completed:
             self.finish_run()
+        elif not self.window and self.running:
+            self._say(Phase.RUNNING, self._first, self.cut)  # for readers that lose the last block of a device
+
+    def end_by(self, signal: str, now: float) -> None:
+        """End the run for all members with the next block (extends `MemberProtocol`)."""
+        if self.running:
+            self.end_run(f"{self.own.name} was ended by {signal} in the middle of a run", now)
+        else:
+            super().end_by(signal, now)
+
+    def end_run(self, why: str, now: float) -> None:
+        """End a run with the next block, as fast as the members follow; a safe state comes to its own end.
+
+        A run with a planned end fails after it, since it has not come to this end.
+        """
+        planned, self.ends_early, self.active, self.held_at, self._heard = self.end, True, True, None, now
+        if not (self._declared or self.cut):
+            end = self.samples + self._reactions.block_size
+            if planned is None or end < planned:
+                self._set_end(end)
+                self.cut = f"{why}; it ends at sample {end}" + (f" of {planned}" if planned is not None else "")
+                self._short = planned is not None
+                self._log("info", self.cut)
+                self._say(Phase.RUNNING, self._first, self.cut)
+        self.actions.append(do.Release())
 
     def finish_run(self) -> None:
         """End the run after all members have completed the last block."""
@@ -244,8 +277,8 @@ class TimeMasterProtocol(MemberProtocol):
         self._say(Phase.ENDED, self.samples, self._why)
         self._log("info", f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.over, self.running = True, False
-        if self._declared:
-            super().fail(LatheError(self._why))
+        if self._declared or self._short:
+            super().fail(LatheError(self._why or self.cut))
         self.leave(self.patience)
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
@@ -270,6 +303,9 @@ class TimeMasterProtocol(MemberProtocol):
             return
         self._forgive(now - self._looked)
         self._looked = now
+        if self.ends_early and now - self._heard > GIVEN_UP:
+            self.fail(LatheError(f"{self.cut or self._why}; {self.slowest} has not completed its blocks"))
+            return
         for name in [each for each in self.completed if each in self.ended and each not in self._dead]:
             restarts, self.patience = self.restarts(name) and not self._declared, _GONE
             self._dead[name] = now + (self._reactions.restart_time if restarts else 0.0)
@@ -294,9 +330,9 @@ class TimeMasterProtocol(MemberProtocol):
         stands = (self.unsafe or self._room <= 0) and now - self._heard > SILENCE
         if stands:
             # Waiting members lag as much as the stalled one: members without DDS liveliness are named first.
-            self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
+            self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}), now)
         elif stopped:
-            self._name_the_silent(frozenset(stopped) | self._stalled)
+            self._name_the_silent(frozenset(stopped) | self._stalled, now)
         if stands and self._reactions.stall_reaction == "safe" and now - self._heard > self._reactions.stall_time:
             late = now - self._reactions.stall_time
             lost = {name for name, since in self.silent.items() if since < late} & self.completed.keys()
@@ -314,10 +350,16 @@ class TimeMasterProtocol(MemberProtocol):
             self._members_moved = {name: moved + passed for name, moved in self._members_moved.items()}
             self.silent = {name: since + passed for name, since in self.silent.items()}
 
-    def _name_the_silent(self, names: frozenset[str]) -> None:
+    def _name_the_silent(self, names: frozenset[str], now: float) -> None:
         new, self._stalled = names - self._stalled, names
         for name in sorted(new):
-            self._tell_stall(name, self.completed[name])
+            self._tell_stall(name, self.completed[name], now)
+
+    def pausing(self) -> list[str]:
+        """Return the members that pause the run: inactive ones, and silent ones once the window is exhausted."""
+        why = dict.fromkeys(self.silent.keys() & self.completed.keys() if self._room <= 0 else (), "silent")
+        why |= {name: INACTIVE for name in self.own.members if self.members[name].message == INACTIVE}
+        return [f"{name}, which is {how}" for name, how in sorted(why.items())]
 
     def member_failed(self, member: Announcement, now: float) -> None:
         """Handle the failure of a member: the others go to the safe state if there is a window, else the cell fails."""
