@@ -203,6 +203,7 @@ class SpindleRole(StageRole):
         if self.chain is None and not self.inputs.ports:
             return samples
         ready = self.chain.ready() if self.chain is not None else self.ready()
+        self.leads.starved = not ready
         return min(samples, ready[0]) if ready else 0
 
     def release(self) -> None:

@@ -423,11 +423,11 @@ class MemberProtocol:
             self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
             return
         self.without = frozenset(state.lost)
-        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
         if not self.over:
             self.actions.append(do.Lose(self.without, state.first_index, state.end_index, self.safe))
         self.safe = True
         self.announce()
+        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
 
     # ---- time ---------------------------------------------------------------------------------------
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocol of the time master: starts the run, releases blocks by window, ends it and leads the way to a safe state."""
 
+import math
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ class TimeMasterProtocol(MemberProtocol):
         unsafe: members that have not confirmed the safe state; no block is released until all have.
         completed: number of blocks that each member has completed.
         held_at: total number of blocks after which the run is held; None: it is not held.
+        starved: the time master itself lacks an input for its next block.
         latency: histogram of the time from the release of a block to its completion by every member.
     """
 
@@ -64,6 +66,7 @@ class TimeMasterProtocol(MemberProtocol):
         self.unsafe: frozenset[str] = frozenset()
         self.completed = {name: 0 for name in own.members if name != own.name}
         self.held_at: int | None = None
+        self.starved = False
         self.latency = Durations()
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were released
         self._checking = self._declared = False
@@ -291,16 +294,28 @@ class TimeMasterProtocol(MemberProtocol):
     def _look_at_the_silent(self, now: float) -> None:
         silent = self.silent.keys() & self.completed.keys()
         stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
-        stands = (self.unsafe or self._room <= 0) and now - self._heard > SILENCE
-        if stands:
+        quiet = now - max(self._heard, self._moved)
+        waits = self.unsafe or self._room <= 0 or (self.starved and self.held_at is None)
+        if waits and quiet > SILENCE:
             # Waiting members lag as much as the stalled one: members without DDS liveliness are named first.
             self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
         elif stopped:
             self._name_the_silent(frozenset(stopped) | self._stalled)
-        if stands and self._reactions.stall_reaction == "safe" and now - self._heard > self._reactions.stall_time:
-            late = now - self._reactions.stall_time
-            lost = {name for name, since in self.silent.items() if since < late} & self.completed.keys()
+        if self._reactions.stall_reaction != "safe":
+            return
+        # In the safe state a drive that is only slow must not be given up: it alone can retract its tool.
+        late = now - (max(self._reactions.stall_time, GIVEN_UP) if self._declared else self._reactions.stall_time)
+        lost = {name for name in stopped if max(self.silent[name], self._members_moved[name]) < late}
+        if waits and now - quiet < late:
             self._lose(dict.fromkeys(lost or self._stalled, "fell silent"), now)
+        elif lost := {name for name in lost if self._owed_since(name) < late}:
+            self._lose(dict.fromkeys(lost, "fell silent"), now)
+
+    def _owed_since(self, name: str) -> float:
+        """Return the time of release of the blocks that a member has to report next [s]; inf: not released yet."""
+        done = self.completed[name]
+        due = min((done // self.progress_step + 1) * self.progress_step, self.blocks_in_run or math.inf)
+        return self._released[int(due) - self.least - 1] if done < due <= self.blocks else math.inf
 
     def _forgive(self, passed: float) -> None:
         """Extend all silence deadlines by the time ``passed`` [s] during which this node itself was stopped.
@@ -374,7 +389,7 @@ class TimeMasterProtocol(MemberProtocol):
             self.unsafe = frozenset(self.completed)
         self._say(Phase.SAFE, self.samples, self._why)
         assert self.end is not None, "a safe state has an end"
-        self._log("error", self._why)
-        self._report("safe", sample=self.samples, end=self.end, lost=sorted(self.without), why=self._why)
         self.actions.append(do.Lose(self.without, self.samples, self.end, again))
+        self._report("safe", sample=self.samples, end=self.end, lost=sorted(self.without), why=self._why)
+        self._log("error", self._why)  # last: the first log message takes some 70 ms
         self._heard = now
