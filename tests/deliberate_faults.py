@@ -177,7 +177,7 @@ FAULTS = (
     ),
     Fault(
         "block_order",
-        "        if self.held_from is not None:\n            return None\n",
+        "        if self.ignores:\n            return None\n",
         "",
         "late blocks of a lost member are taken after those that stand for them",
     ),

@@ -40,7 +40,7 @@ from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
-from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol import Announcement, BadBlock, CellState, ForeignMessage, MemberProtocol, Progress, actions
 
 _TICK = 0.02  # [s] between polls of the graph while members join
 _BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
@@ -435,6 +435,8 @@ class CellNode(LifecycleNode):
             step(*arguments)
         except ForeignMessage as refused:
             self._refuse(refused)
+        except BadBlock as error:
+            self.protocol.reject(error, time.monotonic())
         except LatheError as error:
             self.fail(error)
         if self.protocol.actions:

@@ -224,6 +224,7 @@ class RecorderRole(Role):
             )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
+        queue.run_end = lambda: self.node.protocol.end
         begun = self.node.begun()
         queue.expect(source, (begun.sample if begun else 0) if in_cell else None)
         queue.repeats = in_cell and self.node.protocol.restarts(source)

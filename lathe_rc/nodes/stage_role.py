@@ -89,6 +89,7 @@ class StageRole(Role):
         self.outputs.activate()
         for topic, queue in self.inputs.queues.items():
             queue.inside = self.node.exchange.has(topic)
+            queue.run_end = lambda: self.node.protocol.end
             self.node.listen(topic, queue.type, queue.add, queue.take)
         self.inputs.share()
         self.node.exchange.stages.append(self)

@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.actions import Action
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 
 SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node counts as silent
 GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
@@ -23,6 +23,7 @@ PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
 _NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
+LONGEST_MESSAGE = 1024  #: characters of Member.msg and CellState.msg
 _MOST_MEMBERS = 256  # largest number of announced names
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
@@ -49,6 +50,7 @@ class MemberProtocol:
         done: this member may leave.
         failure: reason of this member's failure.
         without: lost members.
+        end: end of the run [sample]; None: endless, or not known yet.
         unmatched: topics with missing peers at the last look at the graph, for messages.
         patience: longest wait for acknowledgements [s].
         silent: time since which a member is silent or stopped [s], by name.
@@ -75,6 +77,8 @@ class MemberProtocol:
         self.active = self.ready = self.safe = self.over = self.done = False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
+        self.end: int | None = None
+        self._rejected: dict[str, str] = {}  # members whose blocks are rejected, and why
         self.unmatched: Sequence[str] = ()
         self.patience = PATIENCE
         self.silent: Mapping[str, float] = {}
@@ -148,7 +152,8 @@ class MemberProtocol:
     def announce(self) -> None:
         """Publish name, topics and state."""
         session = self.own.session if self.own.members else self._session
-        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""), session=session)
+        said = str(self.failure) if self.failure else "\n".join(map(": ".join, self._rejected.items()))
+        self.own = replace(self.own, state=self._state(), message=said[:LONGEST_MESSAGE], session=session)
         self.members[self.own.name] = self.own
         if self.own.members:
             self.master = self.own
@@ -188,6 +193,8 @@ class MemberProtocol:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
         if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
             self.member_failed(member, now)
+        elif member.rejects and self._is_peer(member.name):
+            self.member_rejects(member, now)
         elif known and known.process == member.process and known.state > member.state == MemberState.JOINING:
             self.member_left(member, now)
         self.actions.append(do.MembersChanged())
@@ -278,6 +285,9 @@ class MemberProtocol:
 
     def member_left(self, member: Announcement, now: float) -> None:
         """Handle a member that was ready and is not any more; only a time master does."""
+
+    def member_rejects(self, member: Announcement, now: float) -> None:
+        """Handle the rejection of blocks by a member; only a time master does."""
 
     def abandon(self, member: Announcement) -> None:
         """Fail because another member has failed."""
@@ -387,6 +397,15 @@ class MemberProtocol:
         """Record that the node resumes in place of another process, after a number of blocks."""
         self._reported_blocks = blocks
 
+    def reject(self, block: BadBlock, now: float) -> None:
+        """Wait for the loss of a member that has sent a bad block; without a cell, nobody can declare it: fail."""
+        if self.master is None or block.source not in self.master.members:
+            self.fail(block)
+        elif block.source not in self.without:
+            self._rejected[block.source] = str(block)
+            self._log("error", f"{block.source} is rejected: {block}")
+            self.announce()
+
     # ---- the state of the cell ----------------------------------------------------------------------
 
     def hear_cell_state(self, state: CellState, now: float) -> None:
@@ -405,6 +424,7 @@ class MemberProtocol:
             self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
+        self.end = state.end_index or self.end
         if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
             # A member that cannot resume gives up, and names its established namesake if there is one.
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
@@ -420,7 +440,8 @@ class MemberProtocol:
     def go_safe(self, state: CellState) -> None:
         """Enter the safe state, since members are lost."""
         if self.own.name in state.lost or not self.ready:
-            self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
+            why = f"{self.own.name}: the cell went to its safe state without it: {state.message}"
+            self.fail(LatheError(why), cause="abandoned")
             return
         self.without = frozenset(state.lost)
         if not self.over:
@@ -447,7 +468,7 @@ class MemberProtocol:
         if not self._started or self.done:
             return
         self.look_after_others(now)
-        waits = self.phase != Phase.RUNNING or self.failure or not self.ready
+        waits = self.phase != Phase.RUNNING or self.failure or self._rejected or not self.ready
         if (self.master is not None or self.own.members) and waits and now >= self._repeat_due:
             self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have displaced the last one
             self.announce()

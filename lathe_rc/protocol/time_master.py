@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import actions as do
-from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol, given_up, why_failed
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.member import GIVEN_UP, LONGEST_MESSAGE, SILENCE, MemberProtocol, given_up, why_failed
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
 _GONE = 0.2  # [s] to wait for acknowledgements after a member has died
@@ -37,7 +37,6 @@ class TimeMasterProtocol(MemberProtocol):
 
     Attributes:
         blocks, samples: number released so far, samples including those before the run.
-        end: end of the run [sample]; None: endless, or not known yet.
         blocks_in_run: length of the run in blocks; None: endless, or not known yet.
         running: True from block 0 to the end of the run.
         unsafe: members that have not confirmed the safe state; no block is released until all have.
@@ -60,7 +59,6 @@ class TimeMasterProtocol(MemberProtocol):
         self._reactions = reactions
         self._first = self.samples = first
         self.blocks = 0
-        self.end: int | None = None
         self.blocks_in_run: int | None = None
         self.running = False
         self.unsafe: frozenset[str] = frozenset()
@@ -153,9 +151,8 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions += [do.Start(), do.Release()]
 
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
-        end, lost = (self.end or 0, tuple(sorted(self.without))) if self._declared else (0, ())
-        self.phase = phase
-        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
+        self.phase, lost, why = phase, tuple(sorted(self.without)), why[:LONGEST_MESSAGE]
+        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why, self.end or 0, lost, self.own.session)))
 
     def hear_cell_state(self, state: CellState, now: float) -> None:
         """Reject cell states that are not the time master's own.
@@ -341,6 +338,21 @@ class TimeMasterProtocol(MemberProtocol):
             self.fail(LatheError(why))
         else:
             self._give_up_on(member.name, why_failed(member), now)
+
+    def member_rejects(self, member: Announcement, now: float) -> None:
+        """Give up members whose blocks another member rejects; a time master that sends such blocks fails."""
+        for name, why in member.rejects.items():
+            if name == self.own.name:
+                self.fail(LatheError(f"{member.name} rejects {why}"))
+            elif name in self.completed:
+                self._give_up_on(name, f"is rejected by {member.name}: {why}", now)
+
+    def reject(self, block: BadBlock, now: float) -> None:
+        """Give up a member that has sent this time master a bad block (extends `MemberProtocol`)."""
+        if block.source in self.completed:
+            self._give_up_on(block.source, f"is rejected: {block}", now)
+        else:
+            super().reject(block, now)
 
     def member_left(self, member: Announcement, now: float) -> None:
         """Give up a member that has left when the run had begun, before it was informed of that."""
