@@ -92,8 +92,8 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "        elif state.session and state.session != self.master.session:\n",
-        "        elif False:\n",
+        "        if self.master is None or state.session not in (0, self.master.session):\n",
+        "        if self.master is None:\n",
         "the state of another start of the cell is taken for this one's",
     ),
     Fault(

@@ -52,11 +52,15 @@ class BlockQueue(BlockOrder):
         self.blocks.clear()
         self._newest = None
 
-    def add(self, data: bytes) -> Block | None:
+    def add(self, data: bytes, sender: str = "") -> Block | None:
         """Check and queue an encoded block; return None for a repeat, or if a held block (see `hold`) replaces it.
 
+        Args:
+            data: the encoded block.
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the block has another source or run id, or the message is not a block.
+            ForeignMessage: the block has another source, sender or run id, or the message is not a block.
             BadBlock: wrong step or length, time stamp that does not match the samples, numbers that are not finite,
                 gap, repeat, wrong end of the run, or far more waiting blocks than the window allows.
             LatheError: far more waiting blocks in a free-running cell.
@@ -66,10 +70,14 @@ class BlockQueue(BlockOrder):
         try:
             block = self._decoder.decode(data)
             self.admit(block.run_id, block.source)
+            if sender not in ("", block.source):
+                raise ForeignMessage(self.topic, block.source, block.run_id, f"it is from {sender}")
             self._decoder.check()
         except NoBlockError as error:
             raise ForeignMessage(self.topic, "", "", str(error)) from None
         except ValueError as error:
+            if sender not in ("", self.source):
+                raise ForeignMessage(self.topic, self.source, self._run_id, f"it is from {sender}") from None
             raise self.reject(self.source, str(error)) from None
         return self._accept(block)
 

@@ -119,13 +119,13 @@ class SpindleRole(StageRole):
         super().activate()
         node = self.node
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        node.create_subscription(ProgressMessage, "progress", node.guarded(self._on_progress), latched_qos())
+        node.subscribe(ProgressMessage, "progress", self._on_progress, latched_qos())
         node.exchange.master = node.guarded(self._reported.append)
         if self.table.simulation_services:
             self._simulation = SimulationServices(node, self.leads, self.pace)
 
-    def _on_progress(self, message: ProgressMessage) -> None:
-        self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
+    def _on_progress(self, data: bytes, sender: str) -> None:
+        self.leads.hear_progress(from_ros("progress", data, ProgressMessage, Progress), time.monotonic(), sender)
 
     def statistics(self) -> dict[str, object]:
         """Return the time master's figures for the diagnostics (implements `Role`)."""

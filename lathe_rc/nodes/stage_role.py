@@ -188,8 +188,8 @@ class StageRole(Role):
         pace.expect(master.name, first)
         pace.repeats = True
 
-        def come(take: Callable[[Any], object], delivery: Any) -> None:
-            take(delivery)
+        def come(take: Callable[..., object], *delivery: Any) -> None:
+            take(*delivery)
             pace.blocks.clear()
             self.inputs.reach = max(first, pace.end)
 

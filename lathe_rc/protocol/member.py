@@ -72,7 +72,7 @@ class MemberProtocol:
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
         self._former_peers: tuple[str, ...] = ()
-        self._newest_state: CellState | None = None  # from a time master that is not announced yet
+        self._newest_states: dict[str, CellState] = {}  # by sender, from time masters that are not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
         self.failure: LatheError | None = None
@@ -172,15 +172,20 @@ class MemberProtocol:
             return MemberState.READY  # a member that the time master does not name is an observer
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
-    def hear_member(self, member: Announcement, now: float) -> None:
+    def hear_member(self, member: Announcement, now: float, sender: str = "") -> None:
         """Process a member's announcement.
+
+        Args:
+            member: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
 
         Raises:
             ForeignMessage: the sender is no member of this cell.
         """
         if member.name == self.own.name and member.process == self.own.process:
             return  # this member itself
-        self._check(member)
+        self._check(member, sender)
         if member.name == self.own.name:
             self._meet_namesake(member)
             return
@@ -205,8 +210,8 @@ class MemberProtocol:
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
-        if (state := self._newest_state) is not None:
-            self._newest_state = None
+        newest, self._newest_states = self._newest_states, {}
+        if state := newest.get(master.name) or newest.get(""):
             self.hear_cell_state(state, now)
 
     def _forget_master(self) -> None:
@@ -219,11 +224,15 @@ class MemberProtocol:
         peers = self.master.members if self.master else self._former_peers
         return name in peers and name != self.own.name and name not in self.without
 
-    def _check(self, member: Announcement) -> None:
+    def _check(self, member: Announcement, sender: str) -> None:
         """Reject an announcement from outside the cell."""
         why, known = "", self.members.get(member.name)
         if self.own.run_id and member.run_id != self.own.run_id:
             why = f"expected run {self.own.run_id!r}"
+        elif sender not in ("", member.name):
+            why = f"it is from {sender}"
+        elif member.state not in tuple(MemberState):
+            why = f"state {member.state}; expected one of its states"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
         elif member.members and not self._may_lead(member):
@@ -408,20 +417,29 @@ class MemberProtocol:
 
     # ---- the state of the cell ----------------------------------------------------------------------
 
-    def hear_cell_state(self, state: CellState, now: float) -> None:
+    def hear_cell_state(self, state: CellState, now: float, sender: str = "") -> None:
         """Process the cell state published by the time master.
 
+        Args:
+            state: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the cell state belongs to another run.
+            ForeignMessage: the cell state belongs to another run, or is not the time master's.
         """
         if state.run_id != self.own.run_id:
             if self.own.run_id:
                 raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
             return
-        if self.master is None:
-            self._newest_state = state
-        elif state.session and state.session != self.master.session:
-            self._newest_state = state  # from a process not announced yet, or from outside the cell
+        if state.state not in tuple(Phase):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
+        if self.master is not None and sender not in ("", self.master.name):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"the time master is {self.master.name}")
+        if self.master is None or state.session not in (0, self.master.session):
+            self._newest_states[sender] = state  # from a process not announced yet, or from outside the cell
+            if len(self._newest_states) > _MOST_MEMBERS:
+                del self._newest_states[next(iter(self._newest_states))]
             return
         self.phase = Phase(state.state)
         self.end = state.end_index or self.end

@@ -151,17 +151,18 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions += [do.Start(), do.Release()]
 
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
-        self.phase, lost, why = phase, tuple(sorted(self.without)), why[:LONGEST_MESSAGE]
-        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why, self.end or 0, lost, self.own.session)))
+        lost, end, session = tuple(sorted(self.without)), self.end or 0, self.own.session
+        self.phase = phase
+        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:LONGEST_MESSAGE], end, lost, session)))
 
-    def hear_cell_state(self, state: CellState, now: float) -> None:
+    def hear_cell_state(self, state: CellState, now: float, sender: str = "") -> None:
         """Reject cell states that are not the time master's own.
 
         Raises:
             ForeignMessage: the cell state was published by another time master.
         """
-        if (state.run_id, state.session) != (self.own.run_id, self.own.session):
-            raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
+        if (state.run_id, state.session) != (self.own.run_id, self.own.session) or sender not in ("", self.own.name):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"this node, {self.own.name}, is the time master")
 
     # ---- progress -----------------------------------------------------------------------------------
 
@@ -175,15 +176,22 @@ class TimeMasterProtocol(MemberProtocol):
         self.blocks, self.samples = blocks, samples
         super().computed(blocks, samples, now, last=last)
 
-    def hear_progress(self, progress: Progress, now: float) -> None:
+    def hear_progress(self, progress: Progress, now: float, sender: str = "") -> None:
         """Process the progress of a member.
 
+        Args:
+            progress: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the progress belongs to another run.
+            ForeignMessage: the progress belongs to another run, or is another node's.
         """
         if progress.run_id != self.own.run_id:
             raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
         name = progress.name
+        if sender not in ("", name):
+            raise ForeignMessage("progress", name, progress.run_id, f"it is from {sender}")
         if name == self.own.name and progress.session in (0, self.own.session):
             return  # a process publishes the progress of all its nodes, which reaches them too
         if not self.running:

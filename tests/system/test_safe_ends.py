@@ -58,7 +58,9 @@ def assert_safe(folder, events: Sequence[harness.Event], lost: set[str]) -> None
         found = check(bag)
         assert not found.wrong
         recording = read_bag(bag, whole=True)
-        assert {signals.size for topic in recording.dense.values() for signals in topic.values()} == {declared[-1]["end"]}
+        assert {signals.size for topic in recording.dense.values() for signals in topic.values()} == {
+            declared[-1]["end"]
+        }
         position = recording.of_type(messages.STATE)["position"]
         if DRIVE not in lost:
             assert position[-1] == pytest.approx(SAFE_POSITION, abs=1e-6)
