@@ -210,9 +210,9 @@ class MemberProtocol:
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
-        newest, self._newest_states = self._newest_states, {}
-        if state := newest.get(master.name) or newest.get(""):
-            self.hear_cell_state(state, now)
+        for sender in (master.name, ""):
+            if state := self._newest_states.pop(sender, None):
+                self.hear_cell_state(state, now, sender)
 
     def _forget_master(self) -> None:
         """Forget the time master and wait for another; only before the run."""
@@ -434,12 +434,13 @@ class MemberProtocol:
             return
         if state.state not in tuple(Phase):
             raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
-        if self.master is not None and sender not in ("", self.master.name):
-            raise ForeignMessage("cell_state", sender, state.run_id, f"the time master is {self.master.name}")
-        if self.master is None or state.session not in (0, self.master.session):
+        led = self.master is not None and sender in ("", self.master.name)
+        if self.master is None or not led or state.session not in (0, self.master.session):
             self._newest_states[sender] = state  # from a process not announced yet, or from outside the cell
             if len(self._newest_states) > _MOST_MEMBERS:
                 del self._newest_states[next(iter(self._newest_states))]
+            if self.master is not None and not led:
+                raise ForeignMessage("cell_state", sender, state.run_id, f"the time master is {self.master.name}")
             return
         self.phase = Phase(state.state)
         self.end = state.end_index or self.end
