@@ -859,36 +859,12 @@ def violations(cell: Simulation) -> list[str]:
     left = [each for each in cell.processes.values() if not _waits_for_another(each)]
     found = [f"{each.identity} hangs" for each in left if not (each.stopped and cell.stalls == "safe")]
     found += [cell.overrun] if cell.overrun else []
-    expected = cell.expected()
     safe = next((cell.block(values["sample"]) for _, _, event, values in cell.reports if event == "safe"), cell.length)
     for _, _, event, values in cell.reports:
         if event == "safe" and cell.block(values["end"]) != (safe if safe == cell.length else safe + cell.safe_blocks):
             found.append(f"a safe state from block {safe} ends with sample {values['end']}")
     everyone = [process for process in (*cell.gone, *cell.processes.values()) if not process.namesake]
-    held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
-    for process in everyone:
-        certain = process.values[: min(safe, held)]
-        if certain != expected[process.design.name][: len(certain)]:
-            found.append(f"{process.identity} has computed other values than offline")
-        at_end = process.design.name != cell.master and process.safe_from == safe
-        wanted = [safe_value(process.design.name)] * (len(process.values) - safe) if at_end else []
-        if process.values[safe:] != wanted and at_end:
-            found.append(f"{process.identity} is not at its safe position")
-        if process.protocol.safe and not process.protocol.failure and process.protocol.over:
-            if len(process.values) < min(cell.length, safe + cell.safe_blocks):
-                found.append(f"{process.identity} ends before the safe state does")
-            if at_end is False and safe < cell.length and process.design.name != cell.master:
-                found.append(f"{process.identity} did not go to its safe state at block {safe}")
-            if process.design.records:
-                found += [f"the bag lacks {name}" for name in _lacking(process, cell, safe)]
-        if len(process.values) > max(cell.length, safe + cell.safe_blocks):
-            found.append(f"{process.identity} ran beyond the end")
-        if (
-            process.protocol.failure
-            and not cell.spoiled
-            and any(words in str(process.protocol.failure) for words in ("missing", "twice", "heard before"))
-        ):
-            found.append(f"{process.identity}: {process.protocol.failure}")
+    found += _wrong_values(cell, everyone, safe)
     lost = {name for _, _, event, values in cell.reports if event == "safe" for name in values["lost"]}
     to_blame = cell.culprits | cell.killed.keys()
     if not lost <= to_blame:
@@ -907,13 +883,34 @@ def violations(cell: Simulation) -> list[str]:
     return found
 
 
-def _lacking(recorder: Process, cell: Simulation, safe: int) -> Iterator[str]:
-    """Yield the members whose safe position is not in the bag, although they were not lost."""
-    end = min(cell.length, safe + cell.safe_blocks)
-    for name, values in recorder.taken.items():
-        if name not in recorder.protocol.without and name != cell.master:
-            if values[safe:end] != [safe_value(name)] * (end - safe):
-                yield name
+def _wrong_values(cell: Simulation, everyone: list[Process], safe: int) -> list[str]:
+    """Return which members have computed other values than offline up to the safe state, or than the safe ones."""
+    found, expected = [], cell.expected()
+    held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
+    for process in everyone:
+        certain = process.values[: min(safe, held)]
+        if certain != expected[process.design.name][: len(certain)]:
+            found.append(f"{process.identity} has computed other values than offline")
+        if process.protocol.safe and process.protocol.over and not process.protocol.failure:
+            found += _unsafe(process, cell, safe)
+        if len(process.values) > max(cell.length, safe + cell.safe_blocks):
+            found.append(f"{process.identity} ran beyond the end")
+        if (
+            process.protocol.failure
+            and not cell.spoiled
+            and any(words in str(process.protocol.failure) for words in ("missing", "twice", "heard before"))
+        ):
+            found.append(f"{process.identity}: {process.protocol.failure}")
+    return found
+
+
+def _unsafe(process: Process, cell: Simulation, safe: int) -> Iterator[str]:
+    """Yield what a member lacks at the end of the safe state: its own safe position, or in the bag that of others."""
+    blocks = cell.safe_blocks if safe != cell.length else 0
+    if process.design.name != cell.master and process.values[safe:] != [safe_value(process.design.name)] * blocks:
+        yield f"{process.identity} is not at its safe position"
+    left = process.taken.keys() - process.protocol.without - {cell.master} if process.design.records else ()
+    yield from (f"the bag lacks {name}" for name in left if process.taken[name][safe:] != [safe_value(name)] * blocks)
 
 
 def _lost_too_early(cell: Simulation) -> Iterator[str]:
