@@ -169,8 +169,5 @@ def _load(queue: BlockQueue, buffer: DelayBuffer, until: int) -> None:
     """Move queued blocks into the topic's buffer up to sample ``until``, as far as blocks have arrived."""
     while buffer.end < until and queue.blocks:
         block = queue.blocks.popleft()
-        try:
-            # The publisher of a block in this process has checked it.
-            block.copy_to(buffer.extend(block.samples), check=not queue.inside)
-        except ValueError as error:
-            raise LatheError(f"{queue.topic}: {error}") from None
+        for name, array in buffer.extend(block.samples).items():
+            array[:] = block.signals[name]

@@ -32,6 +32,7 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.control import bounded
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
@@ -208,6 +209,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     _tune(members[0][0])
     reporter = Reporter()
     dds.settle()
+    bounded.prepare()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
         rclpy.init(args=["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
@@ -266,6 +268,7 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
         nodes: kind and parameters of each node; nodes with third-party classes load these themselves, since they may
             have changed.
     """
+    bounded.prepare()
     inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
     for package in _MESSAGES:
         for found in vars(importlib.import_module(package)).values():

@@ -110,8 +110,7 @@ class RecorderRole(Role):
             full, offered = self.node.topic(topic), _OFFERED[topic]
             durability = cast("Durability", offered.durability.replace(" ", "_"))
             self._open.add_topic(full, offered.type, offered_qos(offered.depth, durability))
-            callback = self.node.guarded(partial(self._on_host, offered.type, full))
-            self.node.create_subscription(message_class(offered.type), full, callback, qos, raw=True)
+            self.node.subscribe(message_class(offered.type), full, partial(self._on_host, offered.type, full), qos)
 
     def clean_up(self) -> None:
         """Reset the role; the bag of a cell that did not begin holds no block and is removed (implements `Role`)."""
@@ -125,7 +124,7 @@ class RecorderRole(Role):
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
-    def _on_host(self, msgtype: str, topic: str, data: bytes) -> None:
+    def _on_host(self, msgtype: str, topic: str, data: bytes, sender: str) -> None:
         if self._writer is None:
             return
         try:
@@ -134,11 +133,15 @@ class RecorderRole(Role):
             return
         # All cells of a domain share /diagnostics.
         if msgtype == messages.CELL_STATE:
-            ours = told.run_id == self.table.run_id
+            ours = told.run_id == self.table.run_id and self._is_master(sender)
         else:
-            ours = any(status.name in self.node.protocol.members for status in told.status)
+            ours = sender in self.node.protocol.members and {status.name for status in told.status} == {sender}
         if ours:
             self._open.write(topic, self._log_ns, data)
+
+    def _is_master(self, name: str) -> bool:
+        master = self.node.protocol.master
+        return master is None or master.name == name
 
     def subscriptions(self) -> list[str]:
         """Return all signal topics of the members."""
@@ -223,6 +226,7 @@ class RecorderRole(Role):
             )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
+        queue.run_end = lambda: self.node.protocol.end
         begun = self.node.begun()
         queue.expect(source, (begun.sample if begun else 0) if in_cell else None)
         queue.repeats = in_cell and self.node.protocol.restarts(source)
@@ -294,7 +298,7 @@ class RecorderRole(Role):
 
     def tick(self, now: float) -> float:
         """Flush the bag periodically, so that a crash loses a bounded time (implements `Role`)."""
-        if (run_end := self.node.protocol.run_end) and self._merger is None:
+        if (run_end := self.node.protocol.fixed_end) and self._merger is None:
             for queue in self._queues.values():
                 queue.end_at(run_end, now)
             self.node.attempt(self._end_unsorted, run_end)
@@ -304,7 +308,7 @@ class RecorderRole(Role):
             self.node.attempt(self._writer.flush)
         return self._flush_due
 
-    def _on_message_at(self, topic: str, msgtype: str, data: bytes) -> None:
+    def _on_message_at(self, topic: str, msgtype: str, data: bytes, sender: str) -> None:
         """Check and record a message at a chosen sample from a node in another process."""
         try:
             message = messages.decode(msgtype, data)
@@ -314,6 +318,8 @@ class RecorderRole(Role):
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
+        if sender != source:
+            raise ForeignMessage(topic, source, run_id, f"it is from {sender}")
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._first + (self._merger.samples if self._merger else 0)
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
@@ -343,11 +349,11 @@ class RecorderRole(Role):
         else:
             self._merger.add_sparse(topic, stamp, data)
 
-    def _on_message(self, queue: BlockQueue, data: bytes) -> None:
+    def _on_message(self, queue: BlockQueue, data: bytes, sender: str) -> None:
         """Record a block from a node in another process."""
         if self.node.protocol.over:
             return
-        block = queue.add(data)
+        block = queue.add(data, sender)
         if block is None:
             return
         self._newest[queue.topic] = data = queue.message

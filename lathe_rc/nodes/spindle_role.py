@@ -120,7 +120,7 @@ class SpindleRole(StageRole):
         super().activate()
         node = self.node
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        node.create_subscription(ProgressMessage, "progress", node.guarded(self._on_progress), latched_qos())
+        node.subscribe(ProgressMessage, "progress", self._on_progress, latched_qos())
         node.exchange.master = node.guarded(self._reported.append)
         node.create_service(Trigger, "~/end", self._on_end)
         if self.table.simulation_services:
@@ -137,8 +137,8 @@ class SpindleRole(StageRole):
             response.message = "no run to end: it has not begun, or it is over"
         return response
 
-    def _on_progress(self, message: ProgressMessage) -> None:
-        self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
+    def _on_progress(self, data: bytes, sender: str) -> None:
+        self.leads.hear_progress(from_ros("progress", data, ProgressMessage, Progress), time.monotonic(), sender)
 
     def statistics(self) -> dict[str, object]:
         """Return the time master's figures for the diagnostics (implements `Role`)."""
@@ -220,6 +220,7 @@ class SpindleRole(StageRole):
         if self.chain is None and not self.inputs.ports:
             return samples
         ready = self.chain.ready() if self.chain is not None else self.ready()
+        self.leads.starved = not ready
         return min(samples, ready[0]) if ready else 0
 
     def release(self) -> None:

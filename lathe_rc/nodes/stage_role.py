@@ -89,6 +89,7 @@ class StageRole(Role):
         self.outputs.activate()
         for topic, queue in self.inputs.queues.items():
             queue.inside = self.node.exchange.has(topic)
+            queue.run_end = lambda: self.node.protocol.end
             self.node.listen(topic, queue.type, queue.add, queue.take)
         self.inputs.share()
         self.node.exchange.stages.append(self)
@@ -187,8 +188,8 @@ class StageRole(Role):
         pace.expect(master.name, first)
         pace.repeats = True
 
-        def come(take: Callable[[Any], object], delivery: Any) -> None:
-            take(delivery)
+        def come(take: Callable[..., object], *delivery: Any) -> None:
+            take(*delivery)
             pace.blocks.clear()
             self.inputs.reach = max(first, pace.end)
 
@@ -208,7 +209,7 @@ class StageRole(Role):
     def tick(self, now: float) -> float:
         """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
-        if run_end := self.node.protocol.run_end:
+        if run_end := self.node.protocol.fixed_end:
             for queue in self.inputs.queues.values():
                 queue.end_at(run_end, now)
             self.node.due = True

@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.actions import Action
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 
 SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node counts as silent
 GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
@@ -24,8 +24,10 @@ _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe st
 _NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
 _END_BY_MASTER = 1.0  # [s] for a time master that is ended by the same Ctrl-C to announce the end of the run
+LONGEST_MESSAGE = 1024  #: characters of Member.msg and CellState.msg
 _MOST_MEMBERS = 256  # largest number of announced names
 INACTIVE = "inactive"  #: message of a member that is deactivated
+ALL_SENT = "all blocks are sent"  #: message of a free-running cell's state, for readers that lose the last block
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
@@ -49,11 +51,12 @@ class MemberProtocol:
         safe: this member knows that members are lost.
         over: this member's part of the run is complete.
         done: this member may leave.
-        run_end: end of the run, as the time master has announced it [sample]; 0: not announced.
+        all_sent: the time master has announced that it has sent all blocks of a free-running cell.
         cut: why the run ends before its planned end; empty: it does not.
         left_early: this member was ended before the run.
         failure: reason of this member's failure.
         without: lost members.
+        end: end of the run [sample]; None: endless, or not known yet.
         unmatched: topics with missing peers at the last look at the graph, for messages.
         patience: longest wait for acknowledgements [s].
         silent: time since which a member is silent or stopped [s], by name.
@@ -75,12 +78,14 @@ class MemberProtocol:
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
         self._former_peers: tuple[str, ...] = ()
-        self._newest_state: CellState | None = None  # from a time master that is not announced yet
+        self._newest_states: dict[str, CellState] = {}  # by sender, from time masters that are not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
-        self.run_end, self.cut, self.left_early = 0, "", False
+        self.all_sent, self.cut, self.left_early = False, "", False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
+        self.end: int | None = None
+        self._rejected: dict[str, str] = {}  # members whose blocks are rejected, and why
         self.unmatched: Sequence[str] = ()
         self.patience = PATIENCE
         self.silent: Mapping[str, float] = {}
@@ -172,7 +177,8 @@ class MemberProtocol:
         """Publish name, topics and state."""
         session = self.own.session if self.own.members else self._session
         pauses = INACTIVE if self.ready and not self.active else ""
-        self.own = replace(self.own, state=self._state(), message=str(self.failure or pauses), session=session)
+        said = str(self.failure) if self.failure else pauses or "\n".join(map(": ".join, self._rejected.items()))
+        self.own = replace(self.own, state=self._state(), message=said[:LONGEST_MESSAGE], session=session)
         self.members[self.own.name] = self.own
         if self.own.members:
             self.master = self.own
@@ -191,15 +197,20 @@ class MemberProtocol:
             return MemberState.READY  # a member that the time master does not name is an observer
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
-    def hear_member(self, member: Announcement, now: float) -> None:
+    def hear_member(self, member: Announcement, now: float, sender: str = "") -> None:
         """Process a member's announcement.
+
+        Args:
+            member: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
 
         Raises:
             ForeignMessage: the sender is no member of this cell.
         """
         if member.name == self.own.name and member.process == self.own.process:
             return  # this member itself
-        self._check(member)
+        self._check(member, sender)
         if member.name == self.own.name:
             self._meet_namesake(member)
             return
@@ -212,6 +223,8 @@ class MemberProtocol:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
         if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
             self.member_failed(member, now)
+        elif member.rejects and self._is_peer(member.name):
+            self.member_rejects(member, now)
         elif known and known.process == member.process and known.state > member.state == MemberState.JOINING:
             self.member_left(member, now)
         self.actions.append(do.MembersChanged())
@@ -222,9 +235,9 @@ class MemberProtocol:
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
-        if (state := self._newest_state) is not None:
-            self._newest_state = None
-            self.hear_cell_state(state, now)
+        for sender in (master.name, ""):
+            if state := self._newest_states.pop(sender, None):
+                self.hear_cell_state(state, now, sender)
 
     def _forget_master(self) -> None:
         """Forget the time master and wait for another; only before the run."""
@@ -236,11 +249,15 @@ class MemberProtocol:
         peers = self.master.members if self.master else self._former_peers
         return name in peers and name != self.own.name and name not in self.without
 
-    def _check(self, member: Announcement) -> None:
+    def _check(self, member: Announcement, sender: str) -> None:
         """Reject an announcement from outside the cell."""
         why, known = "", self.members.get(member.name)
         if self.own.run_id and member.run_id != self.own.run_id:
             why = f"expected run {self.own.run_id!r}"
+        elif sender not in ("", member.name):
+            why = f"it is from {sender}"
+        elif member.state not in tuple(MemberState):
+            why = f"state {member.state}; expected one of its states"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
         elif member.members and not self._may_lead(member):
@@ -302,6 +319,9 @@ class MemberProtocol:
 
     def member_left(self, member: Announcement, now: float) -> None:
         """Handle a member that was ready and is not any more; only a time master does."""
+
+    def member_rejects(self, member: Announcement, now: float) -> None:
+        """Handle the rejection of blocks by a member; only a time master does."""
 
     def abandon(self, member: Announcement) -> None:
         """Fail because another member has failed."""
@@ -372,6 +392,11 @@ class MemberProtocol:
         self._report("ready")
         self.members_changed(now)
 
+    @property
+    def fixed_end(self) -> int | None:
+        """End of the run once no more than the last blocks can be under way [sample]; None before."""
+        return self.end if self.all_sent or self.cut else None
+
     def missing(self) -> list[str]:
         """Return the members and topics for which this member waits; empty if there are none."""
         if self.done or self.failure or self.over or self.phase == Phase.SAFE:
@@ -416,27 +441,44 @@ class MemberProtocol:
         """Record that the node resumes in place of another process, after a number of blocks."""
         self._reported_blocks = blocks
 
+    def reject(self, block: BadBlock, now: float) -> None:
+        """Wait for the loss of a member that has sent a bad block; without a cell, nobody can declare it: fail."""
+        if self.master is None or block.source not in self.master.members:
+            self.fail(block)
+        elif block.source not in self.without:
+            self._rejected[block.source] = str(block)
+            self._log("error", f"{block.source} is rejected: {block}")
+            self.announce()
+
     # ---- the state of the cell ----------------------------------------------------------------------
 
-    def hear_cell_state(self, state: CellState, now: float) -> None:
+    def hear_cell_state(self, state: CellState, now: float, sender: str = "") -> None:
         """Process the cell state published by the time master.
 
+        Args:
+            state: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the cell state belongs to another run.
+            ForeignMessage: the cell state belongs to another run, or is not the time master's.
         """
         if state.run_id != self.own.run_id:
             if self.own.run_id:
                 raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
             return
-        if self.master is None:
-            self._newest_state = state
-        elif state.session and state.session != self.master.session:
-            self._newest_state = state  # from a process not announced yet, or from outside the cell
+        if state.state not in tuple(Phase):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
+        led = self.master is not None and sender in ("", self.master.name)
+        if self.master is None or not led or state.session not in (0, self.master.session):
+            self._newest_states[sender] = state  # from a process not announced yet, or from outside the cell
+            if len(self._newest_states) > _MOST_MEMBERS:
+                del self._newest_states[next(iter(self._newest_states))]
+            if self.master is not None and not led:
+                raise ForeignMessage("cell_state", sender, state.run_id, f"the time master is {self.master.name}")
             return
         self.phase = Phase(state.state)
-        if self.phase == Phase.RUNNING and state.end_index:
-            self.run_end, self.cut, self._end_due = state.end_index, state.message, math.inf
-            self.active = True  # a deactivated member resumes for the end
+        self._hear_end(state)
         if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
             # A member that cannot resume gives up, and names its established namesake if there is one.
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
@@ -449,17 +491,26 @@ class MemberProtocol:
         elif self.phase == Phase.SAFE:
             self.go_safe(state)
 
+    def _hear_end(self, state: CellState) -> None:
+        """Take the end of the run: the planned one, or one that has come nearer."""
+        self.end = state.end_index or self.end
+        if state.state == Phase.RUNNING and state.message:
+            self.all_sent, self.cut = state.message == ALL_SENT, "" if state.message == ALL_SENT else state.message
+            self._end_due = math.inf
+            self.active = True  # a deactivated member resumes for the end
+
     def go_safe(self, state: CellState) -> None:
         """Enter the safe state, since members are lost."""
         if self.own.name in state.lost or not self.ready:
-            self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
+            why = f"{self.own.name}: the cell went to its safe state without it: {state.message}"
+            self.fail(LatheError(why), cause="abandoned")
             return
         self.without = frozenset(state.lost)
-        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
         if not self.over:
             self.actions.append(do.Lose(self.without, state.first_index, state.end_index, self.safe))
         self.safe = True
         self.announce()
+        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
 
     # ---- time ---------------------------------------------------------------------------------------
 
@@ -483,7 +534,7 @@ class MemberProtocol:
         if not self._started or self.done:
             return
         self.look_after_others(now)
-        waits = self.phase != Phase.RUNNING or self.failure or not self.ready
+        waits = self.phase != Phase.RUNNING or self.failure or self._rejected or not self.ready
         if (self.master is not None or self.own.members) and waits and now >= self._repeat_due:
             self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have displaced the last one
             self.announce()
