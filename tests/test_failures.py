@@ -22,8 +22,8 @@ from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import process
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.report import Reporter
+from lathe_rc.protocol.exchange import Exchange
 
 CONFIG = Path(__file__).parents[1] / "config"
 PISTON = CONFIG / "piston.yaml"

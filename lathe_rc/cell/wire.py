@@ -13,7 +13,7 @@ from lathe_rc.
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -191,6 +191,11 @@ class Encoder:
         return log_ns, scratch.message(log_ns, first, self._step_ns, last=last, companions=companions)
 
 
+@cache
+def _create_codec(msgtype: str) -> None:
+    messages.decode(msgtype, _message(msgtype, "", "", 1, _NOTHING))
+
+
 class NoBlockError(ValueError):
     """Error for bytes that are not a block, so that the sender is unknown."""
 
@@ -218,7 +223,7 @@ class Decoder:
 
     def prepare(self) -> None:
         """Create the rosbags codec of the message type before the first block arrives."""
-        messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
+        _create_codec(self._type)
 
     def decode(self, data: bytes) -> Block:
         """Decode a block.

@@ -37,13 +37,13 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare, graph
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.protocol import Announcement, BadBlock, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol.exchange import Exchange
 
 _TICK = 0.02  # [s] between polls of the graph while members join
 _BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
@@ -680,7 +680,7 @@ class CellNode(LifecycleNode):
             topic: fully qualified name.
             msgtype: message type.
             callback: called with the encoded message from DDS, and the name of the node that has published it.
-            inside: called instead with the `lathe_rc.nodes.exchange.Delivery` of a node of this process.
+            inside: called instead with the `lathe_rc.protocol.exchange.Delivery` of a node of this process.
         """
         if self.exchange.has(topic):
             self.exchange.listen(topic, self.full_name, self.guarded(self._in_turn(inside)))

@@ -18,9 +18,9 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, shown
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.taking import GID
 from lathe_rc.protocol import Announcement, MemberProtocol
+from lathe_rc.protocol.exchange import Exchange
 
 _NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # name in the graph of a node whose name is not known yet
 

@@ -37,12 +37,12 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.encoder_role import EncoderRole
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.executor import Events
 from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.nodes.stage_role import StageRole
+from lathe_rc.protocol.exchange import Exchange
 
 _MESSAGES = (  # message and service types of the nodes, rclpy's own services included
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),

@@ -28,11 +28,11 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes import publisher_info
-from lathe_rc.nodes.block_queue import BlockQueue, explain_losses
 from lathe_rc.nodes.cell_node import CellNode, Role
-from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
+from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
+from lathe_rc.protocol.exchange import Run
 
 _HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos(4)}
 _OFFERED = {topic.name: topic for topic in HOST_TOPICS}

@@ -15,8 +15,9 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.nodes.exchange import Run
-from lathe_rc.protocol import BlockOrder, ForeignMessage
+from lathe_rc.protocol.block_order import BlockOrder
+from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.messages import ForeignMessage
 
 _QUIET = 1.0  # [s] after which the last blocks of a device that loses blocks count as lost
 
@@ -82,7 +83,7 @@ class BlockQueue(BlockOrder):
             if sender not in ("", self.source):
                 raise ForeignMessage(self.topic, self.source, self._run_id, f"it is from {sender}") from None
             raise self.reject(self.source, str(error)) from None
-        return self._accept(block)
+        return self._queue(block)
 
     def take(self, run: Run) -> None:
         """Queue blocks that a node of this process has handed over, which has checked their numbers.
@@ -92,8 +93,7 @@ class BlockQueue(BlockOrder):
         """
         if self.open or run.block.first_index != self.end:
             for each in run.blocks(self._size):
-                self.admit(each.run_id, each.source)
-                self._accept(each)
+                self.accept(each)
             return
         # The other checked fields cannot differ between blocks of a node in this process.
         self._append(run.block, len(run.companions))
@@ -103,8 +103,12 @@ class BlockQueue(BlockOrder):
         """Return the last block taken by `add`, encoded as lathe_rc's own nodes do."""
         return self._decoder.message
 
-    def _accept(self, block: Block) -> Block | None:
-        """Check a decoded block and queue it (see `add`)."""
+    def accept(self, block: Block) -> Block | None:
+        """Check a decoded block of finite numbers and queue it (see `add`)."""
+        self.admit(block.run_id, block.source)
+        return self._queue(block)
+
+    def _queue(self, block: Block) -> Block | None:
         if self.ignores:
             return None
         if why := self._fault(block):
