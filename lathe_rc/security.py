@@ -47,6 +47,7 @@ _PLAYER = "burst get_rate is_paused pause play_next resume seek set_rate stop to
 _SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split()), **dict.fromkeys(MASTERS, ("end",))}
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
 _OF_A_SIMULATOR = ("get_simulation_state", "get_simulator_features", "set_simulation_state", "step_simulation")
+_STEPS = "simulate_steps/_action"  # its services and topics
 _OF_THE_MACHINE = {"joint_states", "wrench"}  # topics of the node machine_state
 _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create
 
@@ -109,7 +110,11 @@ class _Maker:
             services=services,
         )
         if getattr(self._scenario.nodes[name], "simulation_services", ""):
-            profile = replace(profile, reply=profile.reply.union(_OF_A_SIMULATOR))
+            steps = (f"{_STEPS}/{service}" for service in ("send_goal", "get_result", "cancel_goal"))
+            reply = profile.reply.union(_OF_A_SIMULATOR, steps)
+            profile = replace(
+                profile, reply=reply, publish=profile.publish | {f"{_STEPS}/feedback", f"{_STEPS}/status"}
+            )
         self.members.append(profile)
         return profile
 
