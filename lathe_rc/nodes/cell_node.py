@@ -756,9 +756,8 @@ class CellNode(LifecycleNode):
             values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = (
-            Clock().now().to_msg()
-        )  # wall time, also with use_sim_time: reports derive the pace from it
+        # Wall time, also with use_sim_time: reports derive the pace from it.
+        message.header.stamp = Clock().now().to_msg()
         self._host["diagnostics"].publish(message)
 
 

@@ -142,9 +142,10 @@ class MemberProtocol:
     def end_by(self, signal: str, now: float) -> None:
         """Handle a signal that ends the node's process; in a run, the time master has some time to end the run first.
 
-        Ctrl-C reaches all members: then the time master ends the run for all. If it has not, this member is lost.
+        Ctrl-C reaches all members: then the time master ends the run for all. If it has not, this member is lost. A
+        member that is ready may hear only later that the run has begun.
         """
-        if self.takes_part or (self.over and not self.done):
+        if self.ready and not (self.failure or self.done):
             self._ended_by, self._end_due = signal, math.inf if self.cut else now + _END_BY_MASTER
         else:
             self.interrupt(signal)

@@ -270,8 +270,11 @@ class TimeMasterProtocol(MemberProtocol):
         """End the run for all members with the next block (extends `MemberProtocol`)."""
         if self.running:
             self.end_run(f"{self.own.name} was ended by {signal} in the middle of a run", now)
-        else:
+        elif self.over:
             super().end_by(signal, now)
+        else:
+            self.interrupt(signal)
+            self.done = True
 
     def end_run(self, why: str, now: float) -> None:
         """End a run with the next block, as fast as the members follow; a safe state comes to its own end.
@@ -328,7 +331,9 @@ class TimeMasterProtocol(MemberProtocol):
             self._last_due, self.held_at = math.inf, None
             self.actions.append(do.Release())
         if self.ends_early and now - self._heard > GIVEN_UP:
-            self.fail(LatheError(f"{self.cut or self._why}; {self.slowest} has not completed its blocks"))
+            waits = self._room <= 0 or self.blocks == self.blocks_in_run
+            stuck = f"{self.slowest} has not completed its blocks" if waits else "its last block was not sent"
+            self.fail(LatheError(f"{self.cut or self._why}; {stuck} within {GIVEN_UP:g} s"))
             return
         for name in [each for each in self.completed if each in self.ended and each not in self._dead]:
             restarts, self.patience = self.restarts(name) and not self._declared, _GONE

@@ -14,6 +14,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cells import until
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
@@ -63,8 +64,11 @@ def test_two_included_cells_are_in_the_namespaces_that_are_pushed_and_end():
         assert all(topic.startswith(f"{namespace}/") for topic in recording.dense)
 
 
-def signalled(line, number, *, group, pids):
-    """Exit code and output of a launch of an endless cell, signalled at a line; ``group``: as Ctrl-C does."""
+def signalled(line, number, target=None):
+    """Exit code and output of a launch of an endless cell, and a signal at a line.
+
+    ``target``: node, or ``launch``; None: all processes, as by Ctrl-C.
+    """
     command = [ROS2, "launch", "lathe_rc", "cell.launch.py", "bag:=bag", "spindle_encoder.revolutions:=0.0"]
     with subprocess.Popen(
         command,
@@ -74,7 +78,7 @@ def signalled(line, number, *, group, pids):
         text=True,
         start_new_session=True,
     ) as launch:
-        said = ""
+        said, pids = "", {"launch": launch.pid}
         for text in launch.stdout:
             said += text
             pids |= {
@@ -82,21 +86,28 @@ def signalled(line, number, *, group, pids):
             }
             if re.search(line, text):
                 line = "(?!)"
-                os.killpg(launch.pid, number) if group else os.kill(pids["tool"], number)
+                os.kill(pids[target], number) if target else os.killpg(launch.pid, number)
         return launch.wait(), said
 
 
 def test_ctrl_c_ends_an_endless_cell_with_a_whole_bag_and_no_error():
-    code, said = signalled("begins with", signal.SIGINT, group=True, pids={})
+    code, said = signalled("begins with", signal.SIGINT)
     assert code == 0
     assert said.count("process has finished cleanly") == 5
     assert not re.search("ERROR|Traceback|died", said)
     assert reader.read_bag(Path("bag")).digests() == json.loads(Path("bag", "digests.json").read_text())["digest"]
 
 
+def test_a_launch_that_sigterm_ends_leaves_no_node_and_a_whole_bag():
+    signalled("begins with", signal.SIGTERM, "launch")
+    digests = Path("bag", "digests.json")
+    until(digests.exists)
+    assert reader.read_bag(Path("bag")).digests() == json.loads(digests.read_text())["digest"]
+
+
 @pytest.mark.parametrize("line", [r"tool-\d]: process started", r"tool]: unconfigured"])
 def test_a_member_that_a_signal_ends_before_the_run_ends_the_others(line):
-    code, said = signalled(line, signal.SIGTERM, group=False, pids={})
+    code, said = signalled(line, signal.SIGTERM, "tool")
     assert code == 1
     assert re.search(r"tool-\d (was killed by SIGTERM|ended with exit code 143)", said)
 
