@@ -15,6 +15,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 from lathe_rc.sweep import inputs, row
+from lathe_rc.sweep.comparison import compare
 from lathe_rc.sweep.expression import Expression
 from lathe_rc.sweep.objectives import front, objectives
 from lathe_rc.sweep.space import Space, given
@@ -210,3 +211,33 @@ def test_a_function_of_a_result_is_a_column_whose_code_is_pinned(piston, client,
             .to_pylist()
         )
     assert (failed["status"], failed["reason"]) == (row.FAILED, "my_goal:settled is nan; allowed: a finite number")
+
+
+# ---- folders side by side --------------------------------------------------------------------------------------------
+
+
+def test_two_sweeps_are_compared_by_their_common_cells(piston, client, tmp_path):
+    """Another law: the differing parameter, the change of each common cell, both best cells and effects."""
+    law = "learning_controller.lead_law"
+    one = lathe_rc.run_sweep(
+        piston.varied({law: "constant_angle"}), Space(grid={LEAD: "1.3e-3:1.5e-3:3"}), tmp_path / "a", client=client
+    )
+    other = lathe_rc.run_sweep(piston, Space(grid={LEAD: "1.4e-3:1.6e-3:3", Q: [67e-6]}), tmp_path / "b", client=client)
+    found = compare(one.folder, other.folder)
+    assert found.differences == [f"{law} = constant_angle there, and variable here"]
+    before, after = ({each[LEAD]: each["tool.max_error"] for each in side.table().to_pylist()} for side in (one, other))
+    changes = [(after[lead] - before[lead]) * 1e6 for lead in (1.4e-3, 1.5e-3)]
+    assert found.changes == pytest.approx(changes)
+    assert found.better == sum(change < 0.0 for change in changes)
+    assert [side.best[LEAD] for side in found.sides] == [min(errors, key=errors.get) for errors in (before, after)]
+    shown = CliRunner().invoke(main, ["sweep", "compare", str(tmp_path / "a"), str(tmp_path / "b")])
+    assert f"2 cells in common: {found.better} better in" in shown.stdout
+    assert f"lathe sweep show {tmp_path / 'b'} --cell {found.sides[1].best['cell']} --panel" in shown.stdout
+
+
+def test_a_cell_gives_its_bag_and_its_report_in_one_command(piston, client, tmp_path):
+    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), tmp_path / "rows", client=client)
+    shown = CliRunner().invoke(main, ["sweep", "show", str(tmp_path / "rows"), "--cell", "0", "--report"])
+    assert shown.exit_code == 0, shown.output
+    assert (tmp_path / "rows" / "cell-0" / "metadata.yaml").exists()
+    assert "</html>" in (tmp_path / "rows" / "cell-0.html").read_text(encoding="utf-8")

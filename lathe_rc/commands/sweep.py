@@ -203,6 +203,68 @@ def _formatted(value: object, factor: float, unit: str) -> str:
 
 
 @sweep.command()
+@click.argument("first", type=options.PATH)
+@click.argument("second", type=options.PATH)
+@click.option("--goal", default="", metavar="COLUMN", help="column or formula that ranks the cells")
+@options.allow_code
+@options.as_json
+def compare(first: Path, second: Path, goal: str, *, as_json: bool) -> None:
+    """Compare the sweeps in two folders: scenarios and code, best cells, effects, and the cells in common."""
+    import numpy as np
+
+    from lathe_rc.commands.tables import console, table
+    from lathe_rc.sweep import comparison
+    from lathe_rc.sweep.figures import effect_said
+    from lathe_rc.sweep.folder import Folder
+
+    found = comparison.compare(Folder(first), Folder(second), goal)
+    name, effects = found.sides[0].goal.name, list(dict.fromkeys(key for side in found.sides for key in side.effects))
+    rows: dict[str, list[str]] = {
+        "cells": [", ".join(f"{n} {s}" for s, n in side.statuses.items()) for side in found.sides]
+    }
+    for side in found.sides:
+        value = side.goal.told(float(side.goal.values[side.goal.order[0]])) if side.best else "none"
+        rows.setdefault(f"best {name}", []).append(value)
+        for key in ["cell", *effects, "margin"]:
+            shown = side.best.get(key)
+            rows.setdefault(f"  {key}", []).append(
+                f"{shown:.6g}" if isinstance(shown, float) else "" if shown is None else str(shown)
+            )
+    for key in effects:
+        told = [effect_said(side.effects[key]) if key in side.effects else ("", "", "") for side in found.sides]
+        rows[f"effect of {key}"] = [total or share for total, share, _ in told]
+    changed = found.changes
+    middle = [float(np.quantile(changed, share)) for share in (0.0, 0.5, 1.0)] if changed.size else []
+    if as_json:
+        summary = {"differences": list(found.differences), "common": changed.size, "better": found.better}
+        click.echo(json.dumps(summary | {"changes": middle, "rows": rows}))
+        return
+    out = console()
+    for each in found.differences or ["no difference of the scenarios, the code and the version of lathe_rc"]:
+        out.print(each, soft_wrap=True, highlight=False)
+    made = table("", str(first), str(second), left=1, overflow="fold")
+    for key, texts in rows.items():
+        made.add_row(key, *texts)
+    out.print(made, soft_wrap=False)
+    if changed.size:
+        low, half, high = (found.sides[0].goal.told(value) for value in middle)
+        equal = int((changed == 0.0).sum())
+        out.print(
+            f"{changed.size} cells in common: {found.better} better in {second}, {equal} equal, "
+            f"{changed.size - found.better - equal} worse; change {low} to {high}, median {half}",
+            soft_wrap=True,
+            highlight=False,
+        )
+    else:
+        out.print("no cell in common")
+    for side in found.sides:
+        if side.best:
+            out.print(
+                f"best run: lathe sweep show {side.folder.path} --cell {side.best['cell']} --panel", soft_wrap=True
+            )
+
+
+@sweep.command()
 @click.argument("folder", type=options.PATH)
 @click.option("--cell", type=click.IntRange(0), help="run this cell again, and compare it with its row")
 @click.option("--bag", type=options.PATH, help="with --cell: folder to record it to; default: FOLDER/cell-N")
