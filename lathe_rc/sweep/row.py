@@ -53,7 +53,6 @@ from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.extensions import attribute
-from lathe_rc.harness.result import Result
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
@@ -91,7 +90,7 @@ _TAIL = {
 
 
 class Measure(NamedTuple):
-    """Measure of a run: a statistic of a field over the last revolution, a figure of a loop, or a function of a result.
+    """Measure of a run: a statistic of a field over the last revolution, a figure of a loop, or one of the user's.
 
     Attributes:
         topic, field: signal; for a loop the error that its controller sees, which is part of the digest; empty for a
@@ -168,8 +167,8 @@ def measure(text: str, scenario: Scenario) -> Measure:
     return Measure(topic, field, statistic)
 
 
-def function(name: str) -> Callable[[Any], float]:
-    """Return the function ``package.module:name`` of a result (`lathe_rc.harness.Result`) to a number.
+def function(name: str) -> Callable[[Recording], float]:
+    """Return the function ``package.module:name`` of a recording to a number.
 
     Raises:
         InputError: there is no such function.
@@ -180,8 +179,8 @@ def function(name: str) -> Callable[[Any], float]:
         raise InputError(f"measure {name}: code that is not allowed; allowed: {allowed_code.OPTION} {package}")
     found = attribute(module, place, f"measure {name}")
     if not callable(found):
-        raise InputError(f"measure {name}: {shown(repr(found))}; allowed: a function of a result to a number")
-    return cast("Callable[[Any], float]", found)
+        raise InputError(f"measure {name}: {shown(repr(found))}; allowed: a function of a recording to a number")
+    return cast("Callable[[Recording], float]", found)
 
 
 def schema(targets: Mapping[str, "Target"], carried: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
@@ -257,11 +256,11 @@ class _Keeper(Errors):
         for watch in self._loops:
             watch.chunk(first, samples, dense, sparse)
 
-    def row(self, errors: FormErrors, scenario: Scenario) -> dict[str, Any]:
-        """Return the result columns of a completed run of a scenario.
+    def row(self, errors: FormErrors) -> dict[str, Any]:
+        """Return the result columns of a completed run.
 
         Raises:
-            LatheError: a function of the result has no finite value.
+            LatheError: a function of the recording has no finite value.
         """
         starts = (errors if self._tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
@@ -282,9 +281,8 @@ class _Keeper(Errors):
                 found[f"tool.{name}_errors"] = values
         if self._whole:
             recording = self._whole.kept()
-            whole = Result(scenario, "offline", recording.samples, 0.0, None, (), recording)
             for name in self._functions:
-                found[name] = value = float(function(name)(whole))
+                found[name] = value = float(function(name)(recording))
                 if not math.isfinite(value):
                     raise LatheError(f"{name} is {value}; allowed: a finite number")
         if self._tolerance and not self.soundness.why:
@@ -351,7 +349,7 @@ def compute(
         cell.check(cures=False)
         keeper = _Keeper(cell, cell.samples - cell.first, measures)
         started = True  # from here on an InputError is a failure of the run, not of the check
-        row |= keeper.row(bench.run(cell, keeper), scenario) | {"samples": cell.samples - cell.first}
+        row |= keeper.row(bench.run(cell, keeper)) | {"samples": cell.samples - cell.first}
     except LatheError as error:
         refused = isinstance(error, InputError) and not started
         row["status"] = REFUSED if refused else DIVERGED if isinstance(error, DivergedError) else FAILED
