@@ -29,6 +29,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -149,8 +150,9 @@ def measure(text: str, scenario: Scenario) -> Measure:
     place, colon, statistic = text.partition(":")
     topic, dot, field = place.removeprefix("/").rpartition(".")
     dense = Cell(scenario.nodes).dense
-    if colon and topic not in dense:
-        allowed_code.allow_named(text)
+    if colon and topic not in dense and place.replace(".", "_").isidentifier():
+        if find_spec(place.partition(".")[0]):  # otherwise it is rather a misspelt topic
+            allowed_code.allow_named(text)
         if allowed_code.is_allowed(place) or not dot:
             function(text)
             return Measure("", "", text)
