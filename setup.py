@@ -83,7 +83,6 @@ setup(
             "py.typed",
             "__init__.pyi",
             "*/__init__.pyi",
-            "commands/completion.*",
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",

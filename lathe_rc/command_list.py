@@ -12,7 +12,6 @@ COMMANDS = {
     "bag": "Show, check, copy and recover bags; extract a tachogram.",
     "budget": "Split the form error of a scenario by its causes.",
     "compare": "Write several runs side by side as an HTML page.",
-    "completion": "Print the shell completion script.",
     "container": "Run several nodes in one process.",
     "correct": "Correct the programmed form of the next part.",
     "demo": "Turn a piston with ROS 2 processes and draw it.",

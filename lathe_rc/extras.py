@@ -13,7 +13,7 @@ from lathe_rc.errors import LatheError
 _MODULES = {
     "fmu": ("fmpy",),
     "formats": ("asammdf", "nptdms", "x3pio"),
-    "panel": ("starlette", "trimesh", "uvicorn"),
+    "panel": ("starlette", "uvicorn"),
     "ros": (
         *("diagnostic_msgs", "domain_coordinator", "lathe_rc_msgs", "lifecycle_msgs", "rclpy", "rosgraph_msgs"),
         *("sensor_msgs", "std_msgs", "std_srvs"),

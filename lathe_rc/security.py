@@ -16,6 +16,7 @@ from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import ALIVE, SAFETY
 from lathe_rc.names import absolute, checked_namespace
@@ -42,9 +43,11 @@ _LIFECYCLE = (
     "get_transition_graph",
 )
 _PLAYER = "burst get_rate is_paused pause play_next resume seek set_rate stop toggle_paused"
-_SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split())}  # services of some kinds of nodes
+#: services of some kinds of nodes
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split()), **dict.fromkeys(MASTERS, ("end",))}
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
 _OF_A_SIMULATOR = ("get_simulation_state", "get_simulator_features", "set_simulation_state", "step_simulation")
+_STEPS = "simulate_steps/_action"  # its services and topics
 _OF_THE_MACHINE = {"joint_states", "wrench"}  # topics of the node machine_state
 _COMMAND_LINE = "/_ros2cli_*/get_type_description"  # service of the nodes that the ros2 commands create
 
@@ -107,7 +110,11 @@ class _Maker:
             services=services,
         )
         if getattr(self._scenario.nodes[name], "simulation_services", ""):
-            profile = replace(profile, reply=profile.reply.union(_OF_A_SIMULATOR))
+            steps = (f"{_STEPS}/{service}" for service in ("send_goal", "get_result", "cancel_goal"))
+            reply = profile.reply.union(_OF_A_SIMULATOR, steps)
+            profile = replace(
+                profile, reply=reply, publish=profile.publish | {f"{_STEPS}/feedback", f"{_STEPS}/status"}
+            )
         self.members.append(profile)
         return profile
 

@@ -2,10 +2,11 @@
 """Start every node of a scenario, the recorder included: ``ros2 launch lathe_rc cell.launch.py``.
 
 ``scenario`` names the ROS 2 parameter file, ``bag`` the folder to record to, ``namespace`` that of the nodes,
-``allow_code`` a package of the current folder that the scenario names code of;
+``allow_code`` a package of the current folder that the scenario names code of; ``log_level`` and ``use_sim_time`` are
+those of the nodes;
 ``NODE.PARAM:=VALUE``, or ``PARAM:=VALUE`` for a shared parameter, replaces a value of the scenario. The run ends when
-its last block has been recorded; without a number of revolutions it goes on until Ctrl-C. A node that fails ends the
-others, and the launch fails.
+its last block has been recorded; without a number of revolutions it goes on until Ctrl-C, which ends it with a last
+block. A node that fails ends the others, and the launch fails.
 
 This file imports launch and launch_ros alone, since ``ros2`` runs the system's Python: the executable ``launch_plan``
 of lathe_rc checks the scenario and says which processes it has.
@@ -36,9 +37,16 @@ ARGUMENTS = {
     "bag": ("", "folder to record to, which must not exist; empty: the scenario's, or bag_ and the run id"),
     "namespace": ("", "of the nodes, in the one that an including file has pushed; two cells in one domain need two"),
     "allow_code": ("", "package of the current folder that the scenario names code of"),
+    "log_level": ("info", "least level of the nodes' log lines"),
+    "use_sim_time": (
+        "false",
+        "whether the nodes' ROS clocks follow /clock; samples, and the wall time of diagnostics, do not depend on it",
+    ),
 }  #: default and description
+CHOICES = {"log_level": ["debug", "info", "warn", "error", "fatal"], "use_sim_time": ["true", "false"]}
 OF_LAUNCH = {"emulate_tty", "launch-prefix", "launch-prefix-filter", "sigkill_timeout", "sigterm_timeout"}
 PUSHED = "ros_namespace"  # configuration in which launch_ros keeps what PushRosNamespace has set
+LONGEST_END = "60"  # [s] from Ctrl-C to SIGTERM: the digests of a bag are computed as it is closed
 PATIENCE = 30.0  # [s] for a cell that has lost a member to end by itself
 
 
@@ -49,7 +57,7 @@ class CellError(RuntimeError):
 def generate_launch_description() -> LaunchDescription:
     """Describe the launch; `ros2 launch` calls it."""
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
+        DeclareLaunchArgument(name, default_value=default, description=description, choices=CHOICES.get(name))
         for name, (default, description) in ARGUMENTS.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=nodes)])
@@ -64,6 +72,8 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     folder = tempfile.mkdtemp(prefix="lathe_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     found = plan(context, folder)
+    log_level, use_sim_time = (LaunchConfiguration(name).perform(context) for name in CHOICES)
+    given = ["--log-level", log_level, "-p", f"use_sim_time:={use_sim_time}"]
     ends = Ends(len(found["processes"]), replaced=found["restarts"])
     return [
         Node(
@@ -73,7 +83,9 @@ def nodes(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             namespace=found["namespace"],
             arguments=process["arguments"],
             parameters=[found["file"]],
-            ros_arguments=["--enclave", process["enclave"]],
+            ros_arguments=["--enclave", process["enclave"], *given],
+            additional_env={"LATHE_ENDS_WITH_PARENT": "1"},
+            sigterm_timeout=LaunchConfiguration("sigterm_timeout", default=LONGEST_END),
             output="screen",
             on_exit=ends,
         )
@@ -153,7 +165,7 @@ class Ends:
         self._running -= 1
         if event.returncode and not context.is_shutdown:
             self._failed.append(how_it_ended(event.process_name, event.returncode))
-            if event.returncode > 0:
+            if event.returncode > 0 or -event.returncode in (signal.SIGINT, signal.SIGTERM):
                 self.fail()
             if self._running and not self._replaced:
                 return [TimerAction(period=PATIENCE, actions=[OpaqueFunction(function=lambda _: self.fail())])]

@@ -92,8 +92,8 @@ FAULTS = (
     ),
     Fault(
         "member",
-        "        elif state.session and state.session != self.master.session:\n",
-        "        elif False:\n",
+        " or state.session not in (0, self.master.session):\n",
+        ":\n",
         "the state of another start of the cell is taken for this one's",
     ),
     Fault(
@@ -170,6 +170,42 @@ FAULTS = (
         "a member that is ready for another start of the cell is taken for ready",
     ),
     Fault(
+        "time_master",
+        "(max(self._reactions.stall_time, GIVEN_UP) if self._declared else self._reactions.stall_time)",
+        "self._reactions.stall_time",
+        "a slow begin of the safe state is taken for silence",
+    ),
+    Fault(
+        "time_master",
+        "waits = self.unsafe or self._room <= 0 or (self.starved and self.held_at is None)\n",
+        "waits = self.unsafe or self._room <= 0\n",
+        "a time master that waits for its own input forgets the members that are silent",
+    ),
+    Fault(
+        "member",
+        "        if self.master is None or block.source not in self.master.members:\n",
+        "        if True:\n",
+        "a bad block ends its reader",
+    ),
+    Fault(
+        "member",
+        '        elif sender not in ("", member.name):\n',
+        "        elif False:\n",
+        "the announcement of another node in a member's name is believed",
+    ),
+    Fault(
+        "member",
+        '        led = self.master is not None and sender in ("", self.master.name)\n',
+        "        led = self.master is not None\n",
+        "the state of the cell is heard from any node",
+    ),
+    Fault(
+        "time_master",
+        '        if sender not in ("", name):\n',
+        "        if False:\n",
+        "the progress of another node in a member's name is believed",
+    ),
+    Fault(
         "block_order",
         "        if self.repeats and first + samples <= self.end:\n            return None\n",
         "",
@@ -177,7 +213,7 @@ FAULTS = (
     ),
     Fault(
         "block_order",
-        "        if self.held_from is not None:\n            return None\n",
+        "        if self.ignores:\n            return None\n",
         "",
         "late blocks of a lost member are taken after those that stand for them",
     ),

@@ -8,8 +8,8 @@ import rclpy
 
 from lathe_rc.harness import free_domain
 from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.report import Reporter
+from lathe_rc.protocol.exchange import Exchange
 
 
 def time_master(kind, role, **parameters):

@@ -19,6 +19,7 @@ from lathe_rc import messages
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import (
     Announcement,
+    BadBlock,
     BlockOrder,
     CellState,
     ForeignMessage,
@@ -66,6 +67,11 @@ class Design:
         return self.name == "/recorder"
 
 
+def safe_value(name: str) -> int:
+    """Return what a member computes in the safe state, whatever its inputs: its safe position."""
+    return hash((name, "safe"))
+
+
 class Network:
     """Reliable channels between processes: in order on each topic, in any order across topics."""
 
@@ -105,9 +111,9 @@ class Network:
         cell.at(arrival, partial(self._arrive, channel, message))
 
     def _arrive(self, channel: tuple[str, str, str], message: object) -> None:
-        _, reader, topic = channel
+        writer, reader, topic = channel
         if channel in self._matched and reader in self._cell.processes:
-            self._cell.processes[reader].take(topic, message)
+            self._cell.processes[reader].take(topic, message, writer.partition(" ")[0])
 
     def cut(self, one: str, other: str, until: float) -> None:
         self._cut[frozenset((one, other))] = until
@@ -134,6 +140,8 @@ class Process:
         self.identity = f"{design.name} {pid}"
         self.stopped = False
         self.free_at, self.cost = 0.0, 0.0  # end of the computation, and its time per message [s]
+        self.dawdles = 0.0  # time that the begin of the safe state takes [s]
+        self.spoils = ""  # what is wrong with the next block
         self._inbox: deque[Callable[[], None]] = deque()
         self._waits = False
         self.strangers = 0
@@ -153,6 +161,7 @@ class Process:
         self.taken: dict[str, list[int]] = {name: [] for name, _ in design.inputs}
         self.last: dict[str, int | None] = dict.fromkeys(self.taken)  # index of the last block
         self.held: dict[str, int] = {}  # index of the block from which the newest is held
+        self.safe_from: int | None = None  # index of the first block in the safe state
         self._pace: BlockOrder | None = None  # of the time master, if no input limits the member
         self._early: list[tuple[str, Block]] = []
         is_master = design.name == cell.master
@@ -185,7 +194,7 @@ class Process:
             self._advertise()
         self.protocol.activate(self.cell.now)
         while self._put_off:
-            self._receive(*self._put_off.popleft())
+            self._receive(*self._put_off.popleft(), "")
         self._step()
 
     def _advertise(self) -> None:
@@ -207,14 +216,14 @@ class Process:
 
     # ---- messages
 
-    def take(self, topic: str, message: object) -> None:
-        """Receive a message."""
+    def take(self, topic: str, message: object, sender: str) -> None:
+        """Receive a message of a node."""
         if self._waits or self.stopped or self._inbox or self.free_at > self.cell.now:
-            self._inbox.append(partial(self._receive, topic, message))
+            self._inbox.append(partial(self._receive, topic, message, sender))
             self.wake()
             return
         self.free_at = self.cell.now + self.cost
-        self._receive(topic, message)
+        self._receive(topic, message, sender)
         self._step()
 
     def wake(self) -> None:
@@ -237,7 +246,7 @@ class Process:
     def alive(self) -> bool:
         return self.cell.processes.get(self.identity) is self
 
-    def _receive(self, topic: str, message: object) -> None:
+    def _receive(self, topic: str, message: object, sender: str) -> None:
         protocol, now = self.protocol, self.cell.now
         if not self.listens or (protocol.failure and topic != "cell_state"):
             return
@@ -249,18 +258,20 @@ class Process:
                 identity = f"{message.name} {message.pid}"
                 if message.name == self.design.name and message.pid and identity not in self.cell.processes:
                     return  # of this member's previous process
-                protocol.hear_member(message, now)
+                protocol.hear_member(message, now, sender)
             elif isinstance(message, CellState):
-                protocol.hear_cell_state(message, now)
+                protocol.hear_cell_state(message, now, sender)
             elif isinstance(message, Progress):
                 assert isinstance(protocol, TimeMasterProtocol)
-                protocol.hear_progress(message, now)
+                protocol.hear_progress(message, now, sender)
             elif not protocol.active:
                 self._put_off.append((topic, message))
             elif isinstance(message, Block):
                 self._take_block(topic, message)
         except ForeignMessage:
             self.strangers += 1
+        except BadBlock as error:
+            protocol.reject(error, now)
         except LatheError as error:
             protocol.fail(error)
 
@@ -352,7 +363,7 @@ class Process:
                 self.protocol.begun(now)
                 early, self._early = self._early, []
                 for topic, block in early:
-                    self._receive(topic, block)
+                    self._receive(topic, block, "")
             case actions.CheckCell():
                 assert isinstance(self.protocol, TimeMasterProtocol)
                 self.protocol.start(now)
@@ -413,6 +424,9 @@ class Process:
     def _lose(self, action: actions.Lose) -> None:
         if not action.again and self.cell.sample(self.blocks) > action.first:
             self.cell.overrun = f"{self.identity} hears of the safe state after its first sample"
+        if not action.again and self.design.name != self.cell.master:
+            self.safe_from = self.cell.block(action.first)
+            self.free_at, self.dawdles = max(self.free_at, self.cell.now) + self.dawdles, 0.0
         lost, end = action.lost, self.cell.block(action.end)
         for name, order in self.orders.items():
             if name in lost and order.held_from is None:
@@ -447,7 +461,8 @@ class Process:
             return
         if isinstance(protocol, TimeMasterProtocol):
             while protocol.may_release and protocol.credit > 0 and self.blocks != protocol.blocks_in_run:
-                if not self._compute(last=self.blocks + 1 == protocol.blocks_in_run):
+                protocol.starved = not self._compute(last=self.blocks + 1 == protocol.blocks_in_run)
+                if protocol.starved:
                     return
                 self._perform_all()
             return
@@ -470,14 +485,16 @@ class Process:
             if value is None:
                 return False
             inputs.append(value)
-        value = hash((self.design.name, self.blocks, *inputs))
+        safe = self.safe_from is not None and self.blocks >= self.safe_from
+        value = safe_value(self.design.name) if safe else hash((self.design.name, self.blocks, *inputs))
         self.values.append(value)
         if isinstance(self.protocol, TimeMasterProtocol):
             self.protocol.release(1, self.cell.now)
         self.blocks += 1
         self.free_at = max(self.free_at, self.cell.now) + self.cost
         if not self.design.records:
-            block = Block(self.design.name, self.blocks - 1, value, last)
+            shift, self.spoils = {"": 0, "gap": 1, "repeat": -1}[self.spoils], ""
+            block = Block(self.design.name, self.blocks - 1 + shift, value, last)
             self.cell.network.publish(self.identity, self.design.name, block)
         self.protocol.computed(self.blocks, self.cell.sample(self.blocks), self.cell.now, last=last)
         if self.design.name == self.cell.master and not self.namesake:
@@ -521,7 +538,7 @@ class Simulation:
         self.at_block: dict[int, list[Callable[[], None]]] = {}  # disturbances, by number of released blocks
         self.culprits: set[str] = set()  # members with a disturbance that may end the run
         self.plan: list[str] = []
-        self.overrun = ""
+        self.overrun, self.spoiled = "", False
 
     def sample(self, blocks: int) -> int:
         """Return the sample at which a block begins."""
@@ -684,8 +701,8 @@ class Schedule:
             else:
                 cell.at(when, call)
 
-    _HARMLESS = ("stop", "cut", "slow", "pause", "stranger", "namesake")
-    _HARMFUL = ("kill", "kill", "kill", "interrupt", "shutdown", "clean_up", "claim")
+    _HARMLESS = ("stop", "cut", "slow", "pause", "stranger", "namesake", "dawdle")
+    _HARMFUL = ("kill", "kill", "kill", "interrupt", "shutdown", "clean_up", "claim", "freeze", "spoil")
 
     def _launch(self, design: Design) -> None:
         self.cell.start(design)
@@ -712,6 +729,24 @@ class Schedule:
             self.cell.stop(process, seconds)
             if self.cell.stalls == "safe" and seconds > 0.3:
                 self.cell.culprits.add(design.name)
+
+    def _freeze(self, design: Design, seconds: float, other: Design) -> None:
+        """Stop a process for good, if the cell shall not wait."""
+        if (process := self._process(design)) and self.cell.stalls == "safe" and self._running():
+            self._blame(design)
+            self.cell.stop(process, 1e9)
+
+    def _spoil(self, design: Design, seconds: float, other: Design) -> None:
+        """Let a member send a bad block."""
+        if (process := self._process(design)) and not design.restarts and not design.records and self._running():
+            self._blame(design)
+            self.cell.spoiled = True
+            process.spoils = "gap" if seconds < 0.1 else "repeat"
+
+    def _dawdle(self, design: Design, seconds: float, other: Design) -> None:
+        """Let the begin of the safe state take its time: the cell has to wait for it."""
+        if process := self._process(design):
+            process.dawdles = min(seconds, 1.5)
 
     def _cut(self, design: Design, seconds: float, other: Design) -> None:
         one, another = self._process(design), self._process(other)
@@ -745,9 +780,21 @@ class Schedule:
     def _stranger(self, design: Design, seconds: float, other: Design) -> None:
         """Send announcements and a cell state from outside the cell."""
         if process := self._process(design):
-            process.take("members", Announcement("another", "/spindle", "spindle_encoder", 2, ("/spindle",)))
-            process.take("members", Announcement("run", "/second", "spindle_encoder", 2, ("/second",)))
-            process.take("cell_state", CellState("another", 3, 0))
+            for sender, message in (
+                ("/spindle", Announcement("another", "/spindle", "spindle_encoder", 2, ("/spindle",))),
+                ("/second", Announcement("run", "/second", "spindle_encoder", 2, ("/second",))),
+                ("/ghost", Announcement("run", other.name, "tool", 3, message="no")),
+                ("/ghost", Announcement("run", other.name, "tool", 77)),
+            ):
+                process.take("members", message, sender)
+            for state in (
+                CellState("another", 3, 0),
+                CellState("run", 77, 0),
+                CellState("run", 4, 0, "", 9, (other.name,)),
+            ):
+                process.take("cell_state", state, "/ghost")
+            if design.name == self.cell.master:
+                process.take("progress", Progress("run", other.name, 10**6, 10**7), "/ghost")
 
     def _namesake(self, design: Design, seconds: float, other: Design) -> None:
         """Start a second node with a member's name."""
@@ -804,30 +851,20 @@ class Schedule:
         master = self._process(self.cell.designs[0])
         if master and design.name != self.cell.master and self._running():
             self._blame(design)
-            master.take("progress", Progress("run", design.name, 10**6, 10**7))
+            master.take("progress", Progress("run", design.name, 10**6, 10**7), design.name)
 
 
 def violations(cell: Simulation) -> list[str]:
     """Return the guarantees that a cell has violated, after `Simulation.run`."""
-    found = [f"{process.identity} hangs" for process in cell.processes.values() if not _waits_for_another(process)]
+    left = [each for each in cell.processes.values() if not _waits_for_another(each)]
+    found = [f"{each.identity} hangs" for each in left if not (each.stopped and cell.stalls == "safe")]
     found += [cell.overrun] if cell.overrun else []
-    expected = cell.expected()
     safe = next((cell.block(values["sample"]) for _, _, event, values in cell.reports if event == "safe"), cell.length)
     for _, _, event, values in cell.reports:
         if event == "safe" and cell.block(values["end"]) != (safe if safe == cell.length else safe + cell.safe_blocks):
             found.append(f"a safe state from block {safe} ends with sample {values['end']}")
     everyone = [process for process in (*cell.gone, *cell.processes.values()) if not process.namesake]
-    held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
-    for process in everyone:
-        certain = process.values[: min(safe, held)]
-        if certain != expected[process.design.name][: len(certain)]:
-            found.append(f"{process.identity} has computed other values than offline")
-        if len(process.values) > max(cell.length, safe + cell.safe_blocks):
-            found.append(f"{process.identity} ran beyond the end")
-        if process.protocol.failure and any(
-            words in str(process.protocol.failure) for words in ("missing", "twice", "heard before")
-        ):
-            found.append(f"{process.identity}: {process.protocol.failure}")
+    found += _wrong_values(cell, everyone, safe)
     lost = {name for _, _, event, values in cell.reports if event == "safe" for name in values["lost"]}
     to_blame = cell.culprits | cell.killed.keys()
     if not lost <= to_blame:
@@ -844,6 +881,36 @@ def violations(cell: Simulation) -> list[str]:
     if causes and not any(name in text for name in to_blame for text in causes):
         found.append(f"none of {causes} names {sorted(to_blame)}")
     return found
+
+
+def _wrong_values(cell: Simulation, everyone: list[Process], safe: int) -> list[str]:
+    """Return which members have computed other values than offline up to the safe state, or than the safe ones."""
+    found, expected = [], cell.expected()
+    held = min((index for process in (*everyone, *cell.dead) for index in process.held.values()), default=safe)
+    for process in everyone:
+        certain = process.values[: min(safe, held)]
+        if certain != expected[process.design.name][: len(certain)]:
+            found.append(f"{process.identity} has computed other values than offline")
+        if process.protocol.safe and process.protocol.over and not process.protocol.failure:
+            found += _unsafe(process, cell, safe)
+        if len(process.values) > max(cell.length, safe + cell.safe_blocks):
+            found.append(f"{process.identity} ran beyond the end")
+        if (
+            process.protocol.failure
+            and not cell.spoiled
+            and any(words in str(process.protocol.failure) for words in ("missing", "twice", "heard before"))
+        ):
+            found.append(f"{process.identity}: {process.protocol.failure}")
+    return found
+
+
+def _unsafe(process: Process, cell: Simulation, safe: int) -> Iterator[str]:
+    """Yield what a member lacks at the end of the safe state: its own safe position, or in the bag that of others."""
+    blocks = cell.safe_blocks if safe != cell.length else 0
+    if process.design.name != cell.master and process.values[safe:] != [safe_value(process.design.name)] * blocks:
+        yield f"{process.identity} is not at its safe position"
+    left = process.taken.keys() - process.protocol.without - {cell.master} if process.design.records else ()
+    yield from (f"the bag lacks {name}" for name in left if process.taken[name][safe:] != [safe_value(name)] * blocks)
 
 
 def _lost_too_early(cell: Simulation) -> Iterator[str]:

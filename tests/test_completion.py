@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``lathe completion``: completed words, the script in a real bash, and its installation."""
+"""Completion of command lines: completed words, and those of a real bash."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from click.shell_completion import ShellComplete
-from click.testing import CliRunner
 
 from lathe_rc import cli
-from lathe_rc.commands.completion import completion
 
 ROOT = Path(__file__).parents[1]
 
@@ -41,7 +38,6 @@ def completed(*words):
         (["study", "sp"], ["speed-deviation"]),
         (["study", "piston", "--set", "height"], ["height_mm="]),
         (["node", "piezo"], ["piezo_actuator"]),
-        (["completion", ""], ["bash", "zsh", "fish"]),
     ],
     ids=" ".join,
 )
@@ -78,56 +74,11 @@ print(*{"numpy", "rclpy", "numba", "pydantic", "dask", "rich"} & sys.modules.key
 
 @pytest.mark.parametrize("program", [str(ROOT / "lathe"), "./lathe"])
 def test_bash_completes_lathe_and_the_launcher_of_a_checkout(program):
-    """The function of the printed script completes command lines in a real bash."""
-    script = CliRunner().invoke(completion, ["bash"]).output + "compopt() { echo compopt $@; }\n"
+    """The function of Click's script completes command lines in a real bash; setup is of ./lathe alone."""
+    script = f'eval "$(_LATHE_COMPLETE=bash_source {program})"\n'
     for line in (f"{program} run pist", f"{program} run piston --set tool.tol", f"{program} se"):
         *before, last = line.split()
-        script += f"COMP_WORDS=({line}) COMP_CWORD={len(before)}; _lathe_complete {program} {last} {before[-1]}\n"
-        script += "printf '%s\\n' \"${COMPREPLY[@]}\"\n"
+        script += f"COMPREPLY=() COMP_WORDS=({line}) COMP_CWORD={len(before)}\n"
+        script += f"_lathe_completion {program} {last} {before[-1]}; echo ${{COMPREPLY[@]}}\n"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stderr == ""
-    # After tool.tolerance= the value follows, without a blank; setup is of ./lathe alone.
-    assert done.stdout.splitlines() == ["piston", "compopt -o nospace", "tool.tolerance=", "setup"]
-
-
-class TestInstall:
-    @pytest.fixture(autouse=True)
-    def home(self, tmp_path, monkeypatch):
-        for name in ("ZDOTDIR", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
-            monkeypatch.delenv(name, raising=False)
-        monkeypatch.setenv("HOME", str(tmp_path))
-        return tmp_path
-
-    @pytest.mark.parametrize(
-        ("shell", "rc"), [("bash", ".bashrc"), ("zsh", ".zshrc"), ("fish", ".config/fish/config.fish")]
-    )
-    def test_writes_one_line_once_and_takes_it_out_again(self, home, shell, rc):
-        def run(option):
-            return CliRunner().invoke(completion, [shell, option]).output
-
-        rc, mine = home / rc, "# mine, without an end of line"
-        rc.parent.mkdir(parents=True, exist_ok=True)
-        rc.write_text(mine)
-        assert f"{rc}: one line added" in run("--install")
-        installed = rc.read_text()
-        script = home / ".local/share/lathe_rc" / f"completion.{shell}"
-        assert installed.startswith(f"{mine}\n")
-        assert installed.count(str(script)) == 2  # on one line: if it is there, read it
-        assert script.read_text() == CliRunner().invoke(completion, [shell]).output
-        assert "has its line already" in run("--install")
-        assert rc.read_text() == installed
-        assert "the line is gone" in run("--remove")
-        assert (rc.read_text(), script.exists()) == (f"{mine}\n", False)
-        assert "nothing to remove" in run("--remove")
-
-    def test_a_new_bash_has_it(self, home):
-        done = CliRunner().invoke(completion, ["--install"], env={"SHELL": "/bin/bash"})
-        assert done.exit_code == 0, done.output
-        shell = ["bash", "--norc", "-c", ". ~/.bashrc; complete -p lathe"]
-        told = subprocess.run(shell, capture_output=True, text=True, check=True, env=os.environ | {"HOME": str(home)})
-        assert told.stdout == "complete -o nosort -F _lathe_complete lathe\n"
-
-    def test_a_shell_that_there_is_no_script_for_is_named(self):
-        done = CliRunner().invoke(cli.main, ["completion"], env={"SHELL": "/bin/tcsh"})
-        assert done.exit_code == 2
-        assert "no shell 'tcsh'; allowed: bash, zsh, fish" in done.output
+    assert (done.stdout, done.stderr) == ("piston\ntool.tolerance=\nsetup\n", "")

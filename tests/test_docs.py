@@ -68,11 +68,11 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     rclpy = pytest.importorskip("rclpy")
     from lathe_rc.harness import free_domain
     from lathe_rc.nodes.cell_node import CellNode
-    from lathe_rc.nodes.exchange import Exchange
     from lathe_rc.nodes.recorder_role import RecorderRole
     from lathe_rc.nodes.report import Reporter
     from lathe_rc.nodes.spindle_role import SpindleRole
     from lathe_rc.nodes.stage_role import StageRole
+    from lathe_rc.protocol.exchange import Exchange
 
     bag = tmp_path_factory.mktemp("docs") / "bag"
     kinds = {"spindle_encoder": SpindleRole, "tool": StageRole, "recorder": RecorderRole}

@@ -13,6 +13,7 @@ from std_msgs.msg import Empty, String
 from std_srvs.srv import Trigger
 
 from lathe_rc.nodes.executor import Events
+from lathe_rc.nodes.taking import GID
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def answered(_, response):
 @pytest.mark.parametrize("raw", [False, True])
 def test_each_message_is_handed_over_once(ghost, node, raw):
     heard, writer = [], ghost.create_publisher(String, "/told", 200)
-    node.create_subscription(String, "/told", heard.append, 200, raw=raw)
+    node.create_subscription(String, "/told", lambda *message: heard.append(message), 200, raw=raw)
     until(writer.get_subscription_count)
     words = [f"{k:03}" for k in range(150)]  # more than are taken at a time
     for word in words:
@@ -38,7 +39,9 @@ def test_each_message_is_handed_over_once(ghost, node, raw):
     events = Events([node])
     until(lambda: len(heard) >= len(words), lambda: events.spin(0.1))
     events.spin(0.0)
-    assert [bytes(each)[8:11].decode() if raw else each.data for each in heard] == words
+    assert [each[0][8:11].decode() if raw else each[0].data for each in heard] == words
+    (gid,) = [bytes(end.endpoint_gid)[:GID] for end in node.get_publishers_info_by_topic("/told")]
+    assert not raw or {publisher for _, publisher in heard} == {gid}
 
 
 def test_what_a_callback_has_destroyed_is_not_called(ghost, node):

@@ -22,8 +22,8 @@ from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import process
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.report import Reporter
+from lathe_rc.protocol.exchange import Exchange
 
 CONFIG = Path(__file__).parents[1] / "config"
 PISTON = CONFIG / "piston.yaml"
@@ -218,8 +218,8 @@ def test_a_process_with_a_whole_cell_that_runs_flat_out_is_not_deaf(tmp_path):
     with harness.Processes(cell, [list(cell.nodes)]) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["tool"], signal.SIGTERM)
-        closed = next(event for event in processes.events(60.0) if event["event"] == "closed")
-        assert not closed["complete"]
+        ended = next(event for event in processes.events(60.0) if event["event"] == "error")
+        assert re.search(r"was ended by SIGTERM in the middle of a run; it ends at sample \d+ of \d+", ended["message"])
 
 
 BAD = (  #: node, ROS arguments, and what is said of them

@@ -35,6 +35,7 @@ class Run:
             self.folder, self.model, "CoSimulation", debug_logging=True, logger=lambda *told: self.said.append(told[-1])
         )
         self.is_3 = self.model.fmiVersion == "3.0"
+        self.step = float(self.model.defaultExperiment.stepSize)
         self.references = {each.name: each.valueReference for each in self.model.modelVariables}
         if self.is_3:
             self.fmu.enterInitializationMode()
@@ -58,7 +59,7 @@ class Run:
         for sample in range(first, last):
             for size, place, given in inputs:
                 self.put[size]([place], [given[sample]])
-            self.fmu.doStep((sample + held) * STEP, STEP)
+            self.fmu.doStep((sample + held) * self.step, self.step)
             for size, wanted in places.items():
                 found[size].append(self.get[size](wanted))
         differ = []

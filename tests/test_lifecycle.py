@@ -24,11 +24,11 @@ from lathe_rc.bag import reader
 from lathe_rc.messages import ALIVE
 from lathe_rc.nodes import cell_node
 from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import has_ended, this_host
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement
+from lathe_rc.protocol.exchange import Exchange
 
 WALK = [  # transition, whether it is possible, and where the node is then
     (Transition.TRANSITION_ACTIVATE, False, "active"),

@@ -172,7 +172,7 @@ def test_the_panel_and_the_view_of_a_bag_end_at_the_loss(lost):
     player = Player(lost)
     player.advance(player.samples)
     assert player.samples == SOUND_TO
-    assert len(player.view.revolutions) == 2
+    assert len(player.view._rows) == 2
     player.view.publish(player.told(), at_once=True)
     page = str(player.view.latest)
     assert not SEEN.search(page)

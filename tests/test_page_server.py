@@ -11,7 +11,7 @@ import pytest
 
 from lathe_rc.errors import InputError
 from lathe_rc.view import page_server
-from lathe_rc.view.page_server import Download, Page, Site
+from lathe_rc.view.page_server import Page, Site
 
 
 def refuse(question):
@@ -23,7 +23,6 @@ SITE = Site(
     {
         "twice": lambda question: {"found": 2 * question["value"]},
         "refuse": refuse,
-        "file": lambda _: Download("part.stl", "model/stl", b"solid"),
     },
 )
 
@@ -61,12 +60,9 @@ def test_a_page_contains_all_that_it_needs_and_the_browser_allows_nothing_else(a
     assert get(address, f"/other?{address.query}")[0] == 404
 
 
-def test_answers_are_data_files_and_refusals(address):
+def test_answers_are_data_and_refusals(address):
     assert ask(address, "twice", {"value": 21})[:2] == (200, '{"found":42}')
     assert ask(address, "refuse", {"gain": 3})[:2] == (400, '{"error":"gain = 3; allowed: less"}')
-    status, content, headers = ask(address, "file", {})
-    assert (status, content) == (200, "solid")
-    assert 'filename="part.stl"' in headers["Content-Disposition"]
     assert ask(address, "nothing", {})[0] == 404
 
 

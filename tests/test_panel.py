@@ -2,7 +2,6 @@
 """The panel: commands, snapshots, and a run that is that of `lathe run`."""
 
 import contextlib
-import io
 import json
 import re
 import socket
@@ -12,9 +11,7 @@ from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import cells
-import numpy as np
 import pytest
-import trimesh
 from bags import lathe
 from cells import until
 
@@ -23,14 +20,13 @@ from lathe_rc import event_log, harness, messages
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
-from lathe_rc.view import page_server, panel, panel_lamp, panel_part, panel_view
+from lathe_rc.view import page_server, panel, panel_lamp, panel_view
 from lathe_rc.view.live_runs import Backlog
 from lathe_rc.view.page_server import Site
 from lathe_rc.view.panel_live import LivePanel
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
 from lathe_rc.view.panel_view import Have, news
-from lathe_rc.view.rerun_revolutions import ANGLES, Revolution
 from lathe_rc.view.rerun_signals import is_drawn
 
 ROOT = Path(__file__).parents[1]
@@ -373,48 +369,6 @@ def test_only_news_are_told():
     cell.view.publish({"state": "paused"})
     told = news(cell.view, Have(epoch=9, run=1), 1.0)
     assert (told["rows"], told["history"], told["shape"], told["more"]) == ([], [], None, False)
-
-
-def revolution(number, height, deviation=0.0, error=0.0):
-    angle = 2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
-    radius = deviation * np.cos(2 * angle)
-    return Revolution(number, 0, np.full(ANGLES, error), radius, height, 0.0, 0.0)
-
-
-def test_the_part_is_a_closed_body_of_its_size_with_the_colours_of_its_error():
-    """STL in mm, GLB in m; blue: cut too deep; a revolution not further along the part is left out."""
-    turned = [revolution(k + 1, 1e-3 * height, 2e-4, 5e-6 * k) for k, height in enumerate([0, 10, 5, 40])]
-    mesh = panel_part.body(turned, 0.05, 1.0, 15e-6)
-    for ending, unit in (("stl", 1.0), ("glb", 1e-3)):
-        read = trimesh.load(io.BytesIO(panel_part.file(mesh, ending)), file_type=ending, force="mesh")
-        read.merge_vertices()
-        assert read.is_watertight
-        assert read.volume > 0.0
-        assert read.extents == pytest.approx(np.array([100.4, 99.6, 40.0]) * unit, abs=0.01 * unit)
-    rings = mesh.visual.vertex_colors[:-2].reshape(3, ANGLES, 4)
-    assert [tuple(ring[0]) for ring in rings][::2] == [(0xF4, 0xF4, 0xF4, 255), (0x08, 0x30, 0x6B, 255)]
-
-
-def test_a_part_without_feed_has_its_revolutions_beside_each_other():
-    mesh = panel_part.body([revolution(k, 0.0) for k in range(1, 5)], 0.05, 1.0, 1e-6)
-    assert mesh.extents[2] == pytest.approx(3 * panel_part.PITCH * 1e3)
-    with pytest.raises(InputError, match="after the second"):
-        panel_part.body([revolution(1, 0.0)], 0.05, 1.0, 1e-6)
-    with pytest.raises(InputError, match="reach the axis"):
-        panel_part.body([revolution(k, 0.0, 2e-4) for k in (1, 2)], 0.05, 1000.0, 1e-6)
-    with pytest.raises(InputError, match="allowed: stl, glb"):
-        panel_part.file(mesh, "ply")
-
-
-def test_the_part_is_saved_from_the_page(opened):
-    shown = opened(scenario("piston", 8))
-    shown.ask("start")
-    shown.until(lambda now: now["state"] == "ended")
-    found = shown.answers["part"]({"format": "stl", "enlarged": 1})
-    assert (found.name, found.type) == ("piston.stl", "model/stl")
-    assert trimesh.load(io.BytesIO(found.content), file_type="stl").is_watertight
-    with pytest.raises(InputError, match="enlarged = 0"):
-        shown.ask("part", format="stl", enlarged=0)
 
 
 @pytest.fixture(scope="module")

@@ -233,6 +233,14 @@ def test_waiting_is_reported_ever_more_seldom(tool):
     assert times == [2, 10, 40, 70, 100]
 
 
+def test_silences_of_a_member_are_logged_once_and_counted(tool):
+    for second in range(5):
+        tool._tell_stall("/spindle", 64 * second, 100.0 + second)
+    tool.leave()
+    said = [action.text for action in tool.actions if isinstance(action, actions.Log)]
+    assert said == ["/spindle has been silent for 80 ms at block 0", "/spindle has been silent for 80 ms 5 times"]
+
+
 def test_a_second_time_master_is_a_stranger(tool):
     """Unless it alone names this member: a master of other members may have been heard first."""
     tool.hear_member(member("/other", stage="spindle_encoder", members=("/other", "/its")), 0.0)

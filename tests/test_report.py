@@ -351,6 +351,9 @@ def test_durations_are_counted_in_bins_of_a_factor_of_two(seconds):
     edges = [0.0, *2.0 ** np.arange(31), np.inf]  # [µs]
     assert list(found.counts) == np.histogram([int(value * 1e6) for value in seconds], edges)[0].tolist()
     assert Durations.parse(str(found)).counts == found.counts
+    if seconds:
+        longest = int(max(seconds) * 1e6)
+        assert found.within(100.0) * 1e6 == pytest.approx(next(edge for edge in edges[1:] if edge > longest))
 
 
 @pytest.mark.parametrize("text", ["x", "1:", "1:2 ", "40:1", "1:-2", "1:2,3:4", "1:" + "9" * 20, "nan"])

@@ -129,6 +129,16 @@ def test_the_written_parameters_are_a_scenario(clean, tmp_path):
     assert lathe("resim", bag, "--scenario", file, "--identify", "--write-parameters", file).exit_code == 0
 
 
+@pytest.mark.parametrize("beyond", ["gain=0.8", "mode_frequency=[6000.0]"])
+def test_a_drive_beyond_the_identified_model_is_refused(clean, tmp_path, beyond):
+    modes = [f"electrodynamic_actuator.{name}=[0.01]" for name in ("mode_damping", "mode_participation")]
+    sets = [f"electrodynamic_actuator.{beyond}", *(modes if "mode" in beyond else [])]
+    (tmp_path / "other.yaml").write_text(scenarios.load(PISTON, sets).to_yaml())
+    refused = lathe("resim", clean[1], "--scenario", tmp_path / "other.yaml", "--identify")
+    assert refused.exit_code == 2
+    assert f"electrodynamic_actuator has {beyond.replace('=', ' = ')}; allowed: " in refused.stderr
+
+
 def test_the_result_is_a_complete_bag(clean, tmp_path):
     _, bag = clean
     assert lathe("resim", bag, *WITH, "-o", tmp_path / "whole").exit_code == 0

@@ -16,11 +16,11 @@ from lathe_rc.bag import reader
 from lathe_rc.cell.beside import ReplayerParameters
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.replayer import _Pace
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.nodes.standalone_node import StandaloneNode
+from lathe_rc.protocol.exchange import Exchange
 
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 CONTROLLER = "learning_controller"

@@ -108,6 +108,22 @@ def test_path_with_a_space(tmp_path):
     assert_refused(lathe(copy, "setup"), copy, "my lathe", "' '")
 
 
+@pytest.mark.parametrize("name", ["Müller", "日本"])
+def test_path_beyond_ascii(name):
+    with pytest.raises(workplace.RefusalError, match=f"{name}.* is not in ASCII, which CMake needs"):
+        preconditions.check_path(Path("/home", name, "lathe_rc"))
+
+
+@pytest.mark.parametrize("module", ["yaml.py", "numpy/", "random.py"])
+def test_python_path_that_hides_a_module(module, tmp_path):
+    """Other modules and packages in it stay importable."""
+    (tmp_path / "mine.py").touch()
+    preconditions.check_python_path({"PYTHONPATH": f"/nowhere:{tmp_path}:{workplace.ROOT}"})
+    (tmp_path / module).mkdir() if module.endswith("/") else (tmp_path / module).touch()
+    with pytest.raises(workplace.RefusalError, match=f"{module.strip('/')} hides the .* out of PYTHONPATH"):
+        preconditions.check_python_path({"PYTHONPATH": str(tmp_path)})
+
+
 def test_compiler_missing(copy, tmp_path):
     tools = tmp_path / "bin"
     tools.mkdir()
@@ -321,6 +337,12 @@ def test_a_command_says_what_it_needs(arguments, groups):
 def test_setup_of_an_unknown_group_is_refused(copy):
     allowed = "docs, fmu, formats, notebook, panel, sweep, test, view, or nothing more"
     assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
+
+
+def test_no_setting_of_pip_installs_elsewhere(monkeypatch):
+    monkeypatch.setenv("PIP_TARGET", "/elsewhere")
+    assert "PIP_TARGET" not in environment.build_environment(None)
+    assert "--no-user" in installer.pip("uv")
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():

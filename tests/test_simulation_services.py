@@ -8,8 +8,11 @@ pytest.importorskip("rclpy")
 pytest.importorskip("simulation_interfaces")
 
 import rclpy
+from action_msgs.msg import GoalStatus
 from lathe_rc_msgs.msg import ToolBlock
+from rclpy.action import ActionClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from simulation_interfaces.action import SimulateSteps
 from simulation_interfaces.msg import Result, SimulationState, SimulatorFeatures
 from simulation_interfaces.srv import GetSimulationState, GetSimulatorFeatures, SetSimulationState, StepSimulation
 
@@ -45,6 +48,27 @@ class Client:
     def step(self, steps=1):
         answer = self.call(StepSimulation, "step_simulation", steps=steps).result
         return answer.result, answer.error_message
+
+    def simulate_steps(self, steps, *, cancel=False):
+        """Result and feedback of the action; ``cancel``: it is cancelled at its first feedback."""
+        told = []
+        action = ActionClient(self._node, SimulateSteps, "/simulate_steps")
+        try:
+            assert action.wait_for_server(120.0)
+            sent = action.send_goal_async(SimulateSteps.Goal(steps=steps), lambda each: told.append(each.feedback))
+            until(sent.done, self._spin)
+            result = sent.result().get_result_async()
+            if cancel:
+                until(lambda: told, self._spin)
+                sent.result().cancel_goal_async()
+            until(result.done, self._spin)
+            until(lambda: cancel or not steps or (told and not told[-1].remaining_steps), self._spin)
+            return result.result(), told
+        finally:
+            action.destroy()
+
+    def _spin(self):
+        rclpy.spin_once(self._node, timeout_sec=0.1)
 
     def wait_until(self, state):
         until(lambda: self.state == state)
@@ -104,6 +128,14 @@ def test_a_run_pauses_goes_on_and_refuses_what_a_cell_cannot_do(ghost, domain, t
         assert client.set(state.STATE_PAUSED) == (SetSimulationState.Response.ALREADY_IN_TARGET_STATE, "")
         assert client.step(0) == (Result.RESULT_OPERATION_FAILED, "steps = 0; allowed: 1 or more")
         assert client.step(3) == (Result.RESULT_OK, "")
+        done, told = client.simulate_steps(4)
+        assert (done.status, done.result.result.result) == (GoalStatus.STATUS_SUCCEEDED, Result.RESULT_OK)
+        assert (told[-1].completed_steps, told[-1].remaining_steps) == (4, 0)
+        assert client.simulate_steps(0)[0].status == GoalStatus.STATUS_ABORTED
+        done, told = client.simulate_steps(10**6, cancel=True)
+        assert done.status == GoalStatus.STATUS_CANCELED
+        assert 0 < told[-1].completed_steps < 10**6
+        assert client.state == state.STATE_PAUSED
         code, why = client.set(state.STATE_STOPPED)
         assert code == Result.RESULT_FEATURE_UNSUPPORTED
         assert "reset by starting its processes again" in why

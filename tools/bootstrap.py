@@ -37,6 +37,8 @@ def main(arguments: Sequence[str]) -> int:
             return complete(Recipe(ros).ready([]))
         if is_help(arguments):
             return show_help(Recipe(ros).ready([]), arguments)
+        if ros is None and PYTHON.exists():
+            preconditions.check_python_path(os.environ)
         wanted = set_up(ros, needed(arguments))
     except RefusalError as refusal:
         say(str(refusal))

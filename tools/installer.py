@@ -24,7 +24,8 @@ _ALIKE = {"UV_INDEX_STRATEGY": "unsafe-best-match", "UV_LINK_MODE": "copy", "UV_
 
 def pip(*options: str | Path) -> list[str | Path]:
     """Return a command line of pip that installs."""
-    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-warn-script-location", *options]
+    # --no-user: a user's setting of pip would install elsewhere
+    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-user", "--no-warn-script-location", *options]
 
 
 def uv(lists: Iterable[str], locks: Iterable[str]) -> list[str | Path]:

@@ -6,10 +6,12 @@ import os
 import platform
 import re
 import shutil
+import sys
 import sysconfig
+from collections.abc import Mapping
 from pathlib import Path
 
-from ros import SourcedRos
+from ros import SourcedRos, site_packages, split_own
 from workplace import ROOT, RefusalError
 
 # Scripts' first lines, setup.bash and PATH-like lists cannot carry these.
@@ -32,6 +34,19 @@ def check_path(root: Path) -> None:
     """Refuse a checkout whose path would break the scripts made in it."""
     if unsafe := UNSAFE.search(str(root)):
         raise RefusalError(f"{str(root)!r} has a {unsafe[0]!r} in it, which ROS 2 cannot handle: move it")
+    if not str(root).isascii():
+        raise RefusalError(f"{str(root)!r} is not in ASCII, which CMake needs to build messages: move it")
+
+
+def check_python_path(environ: Mapping[str, str]) -> None:
+    """Refuse a folder of PYTHONPATH with a module of the environment or of Python: it would be imported instead."""
+    for folder in map(Path, split_own(environ.get("PYTHONPATH", ""))):
+        if folder == ROOT or not folder.is_dir():
+            continue
+        own = {path.name.removesuffix(".py") for path in site_packages().iterdir()} | sys.stdlib_module_names
+        for path in sorted(folder.iterdir()):
+            if (name := path.name.removesuffix(".py")).isidentifier() and name in own:
+                raise RefusalError(f"{path} hides the {name} that lathe_rc needs: take {folder} out of PYTHONPATH")
 
 
 def check_wheels_fit() -> None:

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from lathe_rc import __version__, allowed_code
+from lathe_rc import __version__, allowed_code, resources
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
@@ -66,7 +66,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
             # A file that does not exist yet or is too long is left out.
             with contextlib.suppress(OSError):
                 if row.is_path and row.name not in allowed_code.FILES:
-                    kept = contents(Path(str(getattr(table, row.name))), _MOST_FILE)
+                    kept = contents(resources.find(Path(str(getattr(table, row.name)))), _MOST_FILE)
                     files[f"{FILE}{name}.{row.name}"] = base64.b64encode(kept).decode()
     return {
         RUN_ID: scenario.shared.run_id,

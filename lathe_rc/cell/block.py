@@ -46,29 +46,15 @@ class Block:
         samples = stop - start
         return Block(self.run_id, self.source, first, self.step_ns, last, self.companions, samples, log_ns, signals)
 
-    def copy_to(self, signals: Signals, *, check: bool = True) -> None:
-        """Copy the samples into arrays of shape (samples,), by field.
-
-        Raises:
-            ValueError: ``check`` is set, and a sample is NaN or infinite.
-        """
-        for name, array in signals.items():
-            array[:] = self.signals[name]
-            if check:
-                self._check(name, array)
-
     def check(self) -> None:
         """Check that no sample is NaN or infinite.
 
         Raises:
             ValueError: a sample is NaN or infinite.
         """
-        if self.whole is None or self.whole.ravel().dot(_ZEROS[: self.whole.size]) != 0.0:
+        if self.whole is None or not is_finite(self.whole.ravel()):
             for name, array in self.signals.items():
-                self._check(name, array)
-
-    def _check(self, name: str, array: Samples) -> None:
-        check_finite(self.source, name, array, self.first_index)
+                check_finite(self.source, name, array, self.first_index)
 
 
 class NotFiniteError(ValueError):
@@ -83,6 +69,12 @@ class NotFiniteError(ValueError):
         self.index = index
 
 
+def is_finite(array: Samples) -> bool:
+    """Return whether no float64 of an array of shape (n,) is NaN or infinite."""
+    # 0 times a finite number is 0, and NaN otherwise, so one product checks all.
+    return bool(array.dot(_ZEROS[: array.size]) == 0.0)
+
+
 def check_finite(source: str, name: str, array: Samples, first: int) -> None:
     """Check that no sample of a field is NaN or infinite.
 
@@ -95,8 +87,7 @@ def check_finite(source: str, name: str, array: Samples, first: int) -> None:
     Raises:
         NotFiniteError: a sample is NaN or infinite; the error describes the first one.
     """
-    # 0 times a finite number is 0, and NaN otherwise, so one product checks the whole block.
-    if array.dtype == np.float64 and array.dot(_ZEROS[: array.size]) != 0.0:
+    if array.dtype == np.float64 and not is_finite(array):
         bad = int(np.flatnonzero(~np.isfinite(array))[0])
         index = first + bad
         raise NotFiniteError(f"{source} sends {name} = {array[bad]} at sample {index}; allowed: finite numbers", index)

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latency histograms: wall-clock durations counted by size, as text in a diagnostic report."""
 
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 
 BINS = 32
 LATENESS = "lateness of blocks"  #: key in a report: time from when a block was due until its release
@@ -28,6 +30,12 @@ class Durations:
     def add(self, seconds: float, count: int = 1) -> None:
         """Count ``count`` equal durations [s], which must not be negative."""
         self.counts[min(int(seconds * 1e6).bit_length(), BINS - 1)] += count
+
+    def within(self, percent: float) -> float:
+        """Return the upper edge [s] of the bin up to which the percentage of the durations lies; 0 without any."""
+        wanted = sum(self.counts) * percent / 100.0
+        place = next((place for place, found in enumerate(accumulate(self.counts)) if found >= wanted), 0)
+        return (2.0**place * 1e-6 if place < BINS - 1 else math.inf) if wanted else 0.0
 
     def __str__(self) -> str:
         """Return the non-empty bins, as BIN:COUNT."""

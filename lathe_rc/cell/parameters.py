@@ -301,7 +301,9 @@ class NodeParameters(SharedParameters):
         "what breaks and when, as 'revolution 20 to 25: coarse/state.measured_position stuck'; without 'to' it stays",
     )
     volatile_inputs: list[str] = parameter(
-        [], "input topics whose publisher keeps no messages for those who come late (a device with default QoS)"
+        [],
+        "input topics of devices that keep no messages for those who come late (default QoS), or with window = 0 are "
+        "best effort (sensor-data QoS)",
     )
     autostart: bool = parameter(default=True, doc="configure and activate by itself")
 

@@ -157,6 +157,19 @@ class Scenario:
         """Names of the time masters; exactly one in a valid cell."""
         return [name for name in self.nodes if self.kind(name) in MASTERS]
 
+    def check_members(self) -> None:
+        """Check that a time master names nodes of the scenario as members; a recorder may be added to them.
+
+        Raises:
+            InputError: a member does not exist.
+        """
+        known = dict.fromkeys([*self.nodes, self.recorder[0]])
+        for master in self.masters:
+            for name in getattr(self.nodes[master], "members", []):
+                if name.rpartition("/")[2] not in known:
+                    what = f"{master}.members: no node {shown(name)!r} in the scenario"
+                    raise InputError(f"{what}; {instead(name, [each for each in known if each != master])}")
+
     @property
     def recorder(self) -> tuple[str, RecorderParameters]:
         """Name and table of the recorder; default values if the scenario has none."""

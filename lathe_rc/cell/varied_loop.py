@@ -12,23 +12,17 @@ from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.analysis.regeneration import Regeneration, lobes
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
 from lathe_rc.cell.parameters import Values
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
 from lathe_rc.cell.stages.learner import Learner
-from lathe_rc.cell.stages.loaded_drive import LoadedParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.transfer import TransferFunction
 
 _WIDEST = 2.5  # end of a range, in values of the scenario
-_POINTS = 400  # of a response, and of a lobe
-_LOBES = 8
+_POINTS = 400  # of a response
 _REVOLUTIONS = 30.0  # longest run for the form error
 
 
@@ -84,28 +78,6 @@ class DriveCurve:
     frequency: Array
     value: Complex
     measured: bool = False
-
-
-class Chart(NamedTuple):
-    """Stability chart of a regenerative cut.
-
-    Attributes:
-        node: name of the node with the cut.
-        overlap: overlap µ of the chart.
-        off: whether the scenario has no regeneration, so that the chart is that of a full overlap.
-        lobes: spindle speeds [rad/s] and stiffnesses K [N/m] of each lobe.
-        limit: smallest K of all speeds [N/m].
-        speed: nominal speed [rad/s].
-        stiffness: K of the scenario's cut [N/m]; NaN if the longitudinal slide makes the feed.
-    """
-
-    node: str
-    overlap: float
-    off: bool
-    lobes: list[tuple[Array, Array]]
-    limit: float
-    speed: float
-    stiffness: float
 
 
 @dataclass(frozen=True)
@@ -228,30 +200,4 @@ def drive_curves(cell: Cell) -> list[DriveCurve]:
         if own[0]:
             value = ModalDrive(own[0], own[1], own[2]).response(frequency)
             found.append(DriveCurve(stage.name, f"model of {stage.name}", frequency, value))
-    return found
-
-
-def chatter_charts(cell: Cell) -> list[Chart]:
-    """Return the stability chart of each cut whose edge is elastic."""
-    found = []
-    for name, stage in cell.stages.items():
-        table = stage.shared
-        cut = table.cut if isinstance(table, LoadedParameters) else table
-        if not isinstance(cut, CuttingProcessParameters) or not cut.deflecting().inertia:
-            continue
-        edge = cut.deflecting()
-        deflection = edge.transfer
-        if cut.lag:
-            bottom = np.polymul(deflection.denominator, (cut.lag, 1.0))
-            deflection = TransferFunction(deflection.numerator, tuple(bottom.tolist()))
-        regeneration = Regeneration(deflection, edge.away, cut.regeneration or 1.0)
-        natural = edge.inertia**-0.5
-        frequency = natural * np.append(np.geomspace(0.5, 1.1, _POINTS), np.geomspace(1.1, 10.0, _POINTS)[1:])
-        drawn = [lobes(regeneration, waves, frequency) for waves in range(_LOBES)]
-        stiffness = np.nan
-        if "longitudinal" not in cut.moved_by:
-            stiffness = SpecificForce(cut.kc1, cut.mc, cut.wear_factor).stiffness(cut.feed, cut.wear)
-        limit = regeneration.worst().stiffness
-        speed = table.nominal_speed
-        found.append(Chart(name, cut.regeneration or 1.0, not cut.regeneration, drawn, limit, speed, stiffness))
     return found

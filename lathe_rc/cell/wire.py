@@ -13,13 +13,13 @@ from lathe_rc.
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
+from lathe_rc.cell.block import Block, is_finite
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
@@ -98,6 +98,17 @@ class Layout:
                 "itemsize": len(self.template),
             }
         )
+
+    @cached_property
+    def numbers(self) -> list[tuple[int, int]]:
+        """Offset and length of the arrays of numbers, those that follow each other in one with their lengths."""
+        runs: list[tuple[int, int]] = []
+        for dtype, place in self.fields.values():
+            if dtype != np.float64:
+                continue
+            first = runs.pop()[0] if runs and place == runs[-1][0] + 8 * runs[-1][1] + 8 else place
+            runs.append((first, (place - first) // 8 + self.samples))
+        return runs
 
     def fits(self, data: bytes) -> bool:
         """Return whether a message has this layout."""
@@ -180,6 +191,11 @@ class Encoder:
         return log_ns, scratch.message(log_ns, first, self._step_ns, last=last, companions=companions)
 
 
+@cache
+def _create_codec(msgtype: str) -> None:
+    messages.decode(msgtype, _message(msgtype, "", "", 1, _NOTHING))
+
+
 class NoBlockError(ValueError):
     """Error for bytes that are not a block, so that the sender is unknown."""
 
@@ -207,7 +223,7 @@ class Decoder:
 
     def prepare(self) -> None:
         """Create the rosbags codec of the message type before the first block arrives."""
-        messages.decode(self._type, _message(self._type, "", "", 1, _NOTHING))
+        _create_codec(self._type)
 
     def decode(self, data: bytes) -> Block:
         """Decode a block.
@@ -235,6 +251,17 @@ class Decoder:
             sec * _BILLION + nanosec,
             {name: np.frombuffer(data, fields[name][0], samples, fields[name][1]) for name in self._fields},
         )
+
+    def check(self) -> None:
+        """Check that no number of the last decoded block is NaN or infinite, in fields that are not requested either.
+
+        Raises:
+            ValueError: a number is; the message names the first.
+        """
+        assert self._layout is not None, "a block has been decoded"
+        # The length of an array, read as a number, is finite.
+        if any(not is_finite(np.frombuffer(self.message, np.float64, *run[::-1])) for run in self._layout.numbers):
+            Decoder(self._type).decode(self.message).check()
 
     def decode_all(self, whole: bytes, places: Samples) -> Iterator[Block]:
         """Decode several blocks, joining consecutive ones, in a fraction of the time of separate calls.

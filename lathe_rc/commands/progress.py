@@ -187,6 +187,7 @@ class SweepWatch:
 
 
 TROUBLE: dict[str, Callable[[harness.Event], str]] = {
+    "paused": lambda event: f"{event['node']} waits for {'; '.join(event['missing'])}",
     "stuck": lambda event: f"{event['node']} did not end{event['place']}; the bag is closed: no longer waited for",
     "foreign_message": lambda event: (
         f"{event['node']} refuses: {event['message']}; publishers: {', '.join(event['publishers'])}"

@@ -48,6 +48,7 @@ def plan(asked: Mapping[str, Any]) -> dict[str, Any]:
     scenario = scenarios.load(resources.find(Path(asked["scenario"]))).varied(
         {name: ros_yaml.parse_value(text, name) for name, text in values.items()}
     )
+    scenario.check_members()
     Cell(scenario.nodes).check()
     namespace = checked_namespace(asked["namespace"])
     bag = Path(asked["bag"]) if asked["bag"] else scenario.recorder[1].folder
@@ -81,8 +82,8 @@ def _refuse_unknown(given: Iterable[str], own: Sequence[str]) -> None:
         if not (name in own or _replaces(name)):
             shared = ", ".join(SharedParameters.model_fields)
             raise InputError(
-                f"no launch argument {name!r}; allowed: scenario, bag, namespace, allow_code, NODE.PARAM for a value "
-                f"of the scenario, or a shared one: {shared}"
+                f"no launch argument {name!r}; allowed: scenario, bag, namespace, allow_code, log_level, use_sim_time, "
+                f"NODE.PARAM for a value of the scenario, or a shared one: {shared}"
             )
 
 

@@ -30,7 +30,8 @@ Event = Mapping[str, Any]  #: event of a cell, as reported by a node or the harn
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
-_GRACE = 2.5  # [s] for a process to end after SIGTERM, before SIGKILL
+_GRACE = 2.5  # [s] for a process that ends anyway
+_LONGEST_END = 5.0  # [s] for a cell to end after SIGTERM, before SIGKILL
 _MOST_RESTARTS = 8  # maximum number of restarts of a process
 _SETTLING = 30.0  # [s] without any event while a cell goes to its safe state
 _NO_SIGN_OF_LIFE = {"stall", "foreign_message", "waits"}  # events of a stalled cell
@@ -414,7 +415,7 @@ class Processes:
                 if child.poll() is None:
                     with contextlib.suppress(ProcessLookupError):
                         child.send_signal(number)
-        deadline = time.monotonic() + _GRACE
+        deadline = time.monotonic() + _LONGEST_END
         for child in self._children.values():
             try:
                 child.wait(timeout=max(deadline - time.monotonic(), 0.0))

@@ -83,6 +83,7 @@ def run(
         process_launcher.server()  # the server imports while the cell is checked
     if start_from:
         scenario = scenario.varied({f"{name}.start_from": os.fspath(start_from) for name in scenario.masters})
+    scenario.check_members()
     cell = Cell(scenario.nodes)
     if mode != "offline" and checkpoints:
         raise InputError(f"a checkpoint written with mode {mode}; allowed: offline, where the state is the same")

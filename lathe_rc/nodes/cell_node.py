@@ -11,18 +11,20 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lathe_rc_msgs.msg import CellState as CellStateMessage
 from lathe_rc_msgs.msg import Member
 from lathe_rc_msgs.msg import Progress as ProgressMessage
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
@@ -35,12 +37,13 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare, graph
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
 from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
+from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
-from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol import Announcement, BadBlock, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol.exchange import Exchange
 
 _TICK = 0.02  # [s] between polls of the graph while members join
 _BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
@@ -48,6 +51,8 @@ _IDLE_TICK = 0.1  # [s] between checks of the other members
 _DIAGNOSTICS_PERIOD = 1.0  # [s]
 _LATCHED_DEPTH = 256
 _PROGRESS = f"{messages.PACKAGE}/msg/Progress"
+_NAMELESS = 10.0  # [s] for the ROS graph to name the node of a publisher
+_MOST_SENDERS = 4096  # publishers that are remembered by name
 _MOST_DEFERRED = 8  # times the blocks in flight of each topic, until a node is ready and active
 
 T = TypeVar("T")
@@ -173,7 +178,9 @@ class CellNode(LifecycleNode):
         self.role: Role | None = None
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
         self._performs = False
-        self._deferred: deque[tuple[Callable[[Any], object], Any]] = deque()  # signals received too early
+        self._deferred: deque[tuple[Callable[..., object], Any]] = deque()  # signals received too early
+        self._senders: dict[bytes, str] = {}  # names of nodes by the identity of their publishers
+        self._nameless: dict[tuple[str, bytes], deque[tuple[Callable[..., None], bytes, float]]] = {}
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
@@ -304,9 +311,8 @@ class CellNode(LifecycleNode):
         }
         if self.protocol.own.stage in MASTERS:
             self._host["cell_state"] = add(CellStateMessage, "cell_state", latched_qos(1))
-        subscribe = self.create_subscription
-        subscribe(Member, "members", self.guarded(self._on_member), latched_qos(_LATCHED_DEPTH))
-        subscribe(CellStateMessage, "cell_state", self.guarded(self._on_cell_state, always=True), latched_qos())
+        self.subscribe(Member, "members", self._on_member, latched_qos(_LATCHED_DEPTH))
+        self.subscribe(CellStateMessage, "cell_state", self._on_cell_state, latched_qos(), always=True)
         add(Empty, f"~/{messages.ALIVE}", liveliness())
         self.watch = Watch(self)
 
@@ -330,8 +336,12 @@ class CellNode(LifecycleNode):
             self.finish()
         self.protocol.shut_down(time.monotonic())
 
+    def end_by(self, signal: str) -> None:
+        """End the node because of a signal: in a run together with the cell (see `MemberProtocol.end_by`)."""
+        self.attempt(self.protocol.end_by, signal, time.monotonic())
+
     def interrupt(self, signal: str) -> None:
-        """Announce to the other members that this process ends by a signal."""
+        """Announce to the other members that this process ends at once, by a signal."""
         self.protocol.interrupt(signal)
         self._perform_actions()
         if self._host and self.protocol.failure:
@@ -393,17 +403,20 @@ class CellNode(LifecycleNode):
 
     # ---- events of the protocol ---------------------------------------------------------------------
 
-    def _on_member(self, message: Any) -> None:
-        member = from_ros(message, Announcement)
+    def _on_member(self, data: bytes, sender: str) -> None:
+        member = from_ros("members", data, Member, Announcement)
         known = self.protocol.members.get(member.name)
         if known and known.process != member.process:
             self._look()  # the previous process may have ended
         if member.name == self.protocol.own.name and has_ended(member):
             return  # the last announcement of this member's previous process is no namesake
-        self.protocol.hear_member(member, time.monotonic())
+        self.protocol.hear_member(member, time.monotonic(), sender)
 
-    def _on_cell_state(self, message: Any) -> None:
-        self.protocol.hear_cell_state(from_ros(message, CellState), time.monotonic())
+    def _on_cell_state(self, data: bytes, sender: str) -> None:
+        state = from_ros("cell_state", data, CellStateMessage, CellState)
+        self.protocol.hear_cell_state(state, time.monotonic(), sender)
+        if self.protocol.active and not self._is_early():
+            self._take_up()
 
     def completed(self, blocks: int, samples: int, *, last: bool) -> None:
         """Report the total number of blocks and samples that the role has completed."""
@@ -435,6 +448,8 @@ class CellNode(LifecycleNode):
             step(*arguments)
         except ForeignMessage as refused:
             self._refuse(refused)
+        except BadBlock as error:
+            self.protocol.reject(error, time.monotonic())
         except LatheError as error:
             self.fail(error)
         if self.protocol.actions:
@@ -457,6 +472,8 @@ class CellNode(LifecycleNode):
         self.next_tick = now + (_IDLE_TICK if self.protocol.ready else _TICK)
         if not self._host:
             return
+        for topic, publisher in list(self._nameless):
+            self._name(topic, publisher)
         self._look()
         self._read_elsewhere = self._host["progress"].get_subscription_count() > 1
         if self.role is not None:
@@ -562,32 +579,78 @@ class CellNode(LifecycleNode):
         """Return the fully qualified name of a relative topic after all remapping."""
         return str(self.resolve_topic_name(remapped(self.table, relative)))
 
-    def guarded(self, callback: Callable[[Any], object], *, always: bool = False) -> Callable[[Any], None]:
+    def guarded(self, callback: Callable[..., object], *, always: bool = False) -> Callable[..., None]:
         """Wrap a callback so that its error fails the node with a one-line message instead of a traceback.
 
         Args:
-            callback: function of one message.
+            callback: function of a message.
             always: call it also after the node has failed.
         """
 
-        def call(message: Any) -> None:
+        def call(*message: Any) -> None:
             self.due = True
             if self._host and (always or not self.protocol.failure):
-                self.attempt(callback, message)
+                self.attempt(callback, *message)
 
         return call
 
-    def _in_turn(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
+    def subscribe(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[bytes, str], object],
+        qos: QoSProfile,
+        *,
+        always: bool = False,
+    ) -> Subscription:
+        """Subscribe to encoded messages; the callback gets each with the name of the node that has published it.
+
+        Args:
+            kind: class of the messages.
+            topic: name of the topic.
+            callback: function of the message and the fully qualified name of its publisher, as DDS knows it.
+            qos: quality of service.
+            always: call it also after the node has failed.
+        """
+        full = self.resolve_topic_name(topic)
+        named = self.guarded(callback, always=always)
+
+        def call(data: bytes, publisher: bytes) -> None:
+            if sender := self._senders.get(publisher):
+                named(data, sender)
+                return
+            most = _MOST_DEFERRED * signal_depth(self.table)
+            waiting = self._nameless.setdefault((full, publisher), deque(maxlen=most))
+            waiting.append((named, data, time.monotonic()))
+            self._name(full, publisher)
+
+        # `lathe_rc.nodes.executor` hands the publisher over as well.
+        return self.create_subscription(kind, topic, cast("Callable[[bytes], None]", call), qos, raw=True)
+
+    def _name(self, topic: str, publisher: bytes) -> None:
+        """Hand over the messages of a publisher once the ROS graph names its node."""
+        self._senders = graph.senders(self, topic) | self._senders if len(self._senders) < _MOST_SENDERS else {}
+        sender, waiting = self._senders.get(publisher), self._nameless[topic, publisher]
+        while sender and waiting:
+            named, data, _ = waiting.popleft()
+            named(data, sender)
+        if waiting and time.monotonic() > waiting[0][2] + _NAMELESS:
+            waiting.clear()
+            self._refuse(ForeignMessage(topic, "", "", "the ROS graph names no node for its publisher"))
+        if not waiting:
+            self._nameless.pop((topic, publisher), None)
+
+    def _in_turn(self, callback: Callable[..., object]) -> Callable[..., None]:
         """Wrap a signal callback so that messages are deferred while the node is deactivated or not yet ready.
 
         So no message is lost, and blocks from before a node joined do not count as missing. In a free-running cell
         the signals of a deactivated node are dropped instead, and counted like any missing blocks.
         """
 
-        def call(message: Any) -> None:
+        def call(*message: Any) -> None:
             if self.protocol.active and not self._is_early():
                 self._take_up()
-                callback(message)
+                callback(*message)
             elif self.protocol.active or self.table.window:
                 self._deferred.append((callback, message))
                 if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table) * (len(self.inlets) + 1):
@@ -606,44 +669,24 @@ class CellNode(LifecycleNode):
     def _take_up(self) -> None:
         while self._deferred:
             callback, message = self._deferred.popleft()
-            self.guarded(callback)(message)
-
-    def _one_of_many(self, topic: str, callback: Callable[[bytes], object]) -> Callable[[bytes], None]:
-        """Wrap a callback so that its errors name all publishers of the topic, since any of them may be the cause."""
-
-        def call(data: bytes) -> None:
-            try:
-                callback(data)
-            except ForeignMessage:
-                raise
-            except LatheError as error:
-                if len(publishers := graph.publishers(self, topic)) > 1:
-                    error.args = (f"{error}; publishers of {topic}: {', '.join(publishers)}",)
-                raise
-
-        return call
+            self.guarded(callback)(*message)
 
     def listen(
-        self, topic: str, msgtype: str, callback: Callable[[bytes], object], inside: Callable[[Any], object]
+        self, topic: str, msgtype: str, callback: Callable[[bytes, str], object], inside: Callable[[Any], object]
     ) -> None:
         """Subscribe to a signal topic, over DDS or inside this process.
 
         Args:
             topic: fully qualified name.
             msgtype: message type.
-            callback: called with the encoded message from DDS.
-            inside: called instead with the `lathe_rc.nodes.exchange.Delivery` of a node of this process.
+            callback: called with the encoded message from DDS, and the name of the node that has published it.
+            inside: called instead with the `lathe_rc.protocol.exchange.Delivery` of a node of this process.
         """
         if self.exchange.has(topic):
             self.exchange.listen(topic, self.full_name, self.guarded(self._in_turn(inside)))
             return
-        self.inlets[topic] = self.create_subscription(
-            message_class(msgtype),
-            topic,
-            self.guarded(self._in_turn(self._one_of_many(topic, callback))),
-            signal_qos(self.table, topic),
-            raw=True,
-        )
+        qos = signal_qos(self.table, topic)
+        self.inlets[topic] = self.subscribe(message_class(msgtype), topic, self._in_turn(callback), qos)
 
     def begun(self) -> Checkpoint | None:
         """Return the checkpoint that the time master announces; None: the run begins at sample 0.
@@ -676,11 +719,22 @@ class CellNode(LifecycleNode):
         """Report each publisher once whose quality of service does not fit."""
         for topic, name, why in set(graph.unfit(self, self.inlets)) - self._unfit:
             self._unfit.add((topic, name, why))
+            if topic in self.table.volatile_inputs and not self.table.window:
+                self._subscribe_anew(topic)
+                continue
             told = (
                 f"a publisher offers a quality of service that does not fit ({why}); if it is a device that keeps no "
-                f"messages, add {topic} to {self.get_name()}.volatile_inputs"
+                f"messages, add {topic} to {self.get_name()}.volatile_inputs; if it is best effort, with window: 0"
             )
             self._refuse(ForeignMessage(topic, name, "", told))
+
+    def _subscribe_anew(self, topic: str) -> None:
+        """Replace the subscription to a device by one with the quality of service that its publishers offer."""
+        before, offers = self.inlets[topic], self.get_publishers_info_by_topic(topic)
+        kind, callback = before.msg_type, before.callback
+        self.inlets[topic] = self.create_subscription(kind, topic, callback, asked(offers), raw=True)
+        self.destroy_subscription(before)
+        self.get_logger().info(f"{topic} is read as its device sends it: lost blocks are held and counted")
 
     def _report_refused(self, message: ForeignMessage) -> None:
         publishers = graph.publishers(self, message.topic)
@@ -702,11 +756,21 @@ class CellNode(LifecycleNode):
             values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = (
+            Clock().now().to_msg()
+        )  # wall time, also with use_sim_time: reports derive the pace from it
         self._host["diagnostics"].publish(message)
 
 
-def from_ros(message: Any, kind: type[T]) -> T:
-    """Convert a ROS message to the protocol's message class of the same name."""
+def from_ros(topic: str, data: bytes, ros: type, kind: type[T]) -> T:
+    """Decode a ROS message to the protocol's message class of the same name.
+
+    Raises:
+        ForeignMessage: the bytes are no such message.
+    """
+    try:
+        message: Any = deserialize_message(data, ros)
+    except RuntimeError as error:
+        raise ForeignMessage(topic, "", "", str(error).splitlines()[0]) from None
     values = {field.name: getattr(message, field.name) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})

@@ -79,8 +79,7 @@ class Chain:
         """Compute and publish a number of samples in all stages; ``last``: the run ends with these samples."""
         first, failure, self._busy = self._roles[0].samples, None, True
         self._tapes.advance(first)
-        if not self._take_inputs(first, samples):
-            return
+        self._take_inputs(first, samples)
         try:
             self._program.run(first + samples)
         except LatheError as error:
@@ -110,25 +109,15 @@ class Chain:
         tape, delay = inputs[stage.angle_input]
         return float(self._tapes.view(tape, end - 1, 1, delay)["angle"][0])
 
-    def _take_inputs(self, first: int, samples: int) -> bool:
-        """Copy the samples from outside the chain to its tapes.
-
-        A stage with a bad input fails, and the chain is dissolved: False. No stage has computed any of the samples yet.
-        """
+    def _take_inputs(self, first: int, samples: int) -> None:
+        """Copy the samples from outside the chain to its tapes."""
         for role, stage in zip(self._roles, self._stages, strict=True):
             for place, (tape, _) in enumerate(stage.inputs):
                 if tape in self._inside:
                     continue
                 written = self._tapes.view(tape, first, samples)
-                try:
-                    taken = role.inputs.take(place, first, samples)
-                except LatheError as error:
-                    self._busy = False
-                    role.node.fail(error)
-                    return False
-                for name, array in taken.items():
+                for name, array in role.inputs.take(place, first, samples).items():
                     written[name][:] = array
-        return True
 
     def leave(self) -> None:
         """Dissolve the chain: each stage goes on alone from its current sample."""

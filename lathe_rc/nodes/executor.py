@@ -9,8 +9,10 @@ from typing import Any, cast
 from rclpy.executors import Executor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 from lathe_rc.messages import ALIVE
+from lathe_rc.nodes.taking import taker
 
 _MOST = 64  # messages of one topic or service at a time: a flood must not starve the others
 # [s] between looks at requests while messages keep coming, by node and at most: a look costs as much as 20 messages of
@@ -19,12 +21,18 @@ _LOOK, _LONGEST_LOOK = 0.02, 0.1
 _SERIES = 0.1  # [s] after a request in which every wait is a look, so that a series of requests is answered at once
 
 
+def _take_typed(inlet: Subscription) -> tuple[Any] | None:
+    found = cast("Any", inlet.handle).take_message(inlet.msg_type, False)  # noqa: FBT003 - it has no names
+    return None if found is None else found[:1]
+
+
 class Events:
     """Executor of the nodes of a process, in place of rclpy's, which cost more than the messages themselves.
 
     The messages that have arrived are taken without a wait. A process without any waits: for messages only if it has
     looked at requests just now, otherwise for these as well. QoS events are not taken, since they can deadlock a node
-    (see `lathe_rc.nodes.graph.unfit`).
+    (see `lathe_rc.nodes.graph.unfit`). The callback of a raw subscription gets each message with the identity of its
+    publisher (see `lathe_rc.nodes.taking`).
 
     Args:
         nodes: nodes of this process; they have no clients, timers and guard conditions.
@@ -64,7 +72,7 @@ class Events:
         self._changed = False
         # Topics of liveliness carry no messages, but each change of liveliness would end a wait.
         self._inlets = [
-            (inlet, partial(cast("Any", inlet.handle).take_message, inlet.msg_type, inlet.raw))
+            (inlet, taker(inlet) if inlet.raw else partial(_take_typed, inlet))
             for node in self._nodes
             for inlet in node.subscriptions
             if not inlet.topic_name.endswith(f"/{ALIVE}")
@@ -83,7 +91,7 @@ class Events:
                 if (found := take()) is None:
                     break
                 any_taken = True
-                inlet.callback(found[0])
+                inlet.callback(*found)
         return any_taken
 
     def _wait(self, wait: float, *, looks: bool) -> None:

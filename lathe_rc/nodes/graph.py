@@ -18,8 +18,9 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import Unknown
 from lathe_rc.errors import InputError, shown
-from lathe_rc.nodes.exchange import Exchange
+from lathe_rc.nodes.taking import GID
 from lathe_rc.protocol import Announcement, MemberProtocol
+from lathe_rc.protocol.exchange import Exchange
 
 _NOT_TOLD_YET = "_NODE_NAME_UNKNOWN_"  # name in the graph of a node whose name is not known yet
 
@@ -29,6 +30,12 @@ Announced = tuple[dict[str, NodeParameters], dict[str, Unknown]]
 def publishers(node: Node, topic: str) -> list[str]:
     """Return the nodes that publish a topic."""
     return sorted(_name(end) for end in node.get_publishers_info_by_topic(topic))
+
+
+def senders(node: Node, topic: str) -> dict[bytes, str]:
+    """Return the names of the nodes that publish a topic, by the identity of their publishers."""
+    ends = node.get_publishers_info_by_topic(topic)
+    return {bytes(end.endpoint_gid[:GID]): _name(end) for end in ends if end.node_name != _NOT_TOLD_YET}
 
 
 def unmatched(

@@ -11,8 +11,8 @@ from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import message_class, signal_qos
+from lathe_rc.protocol.exchange import Run
 
 _OUTSIDE_PERIOD = 0.02  # [s] between checks for readers in other processes
 

@@ -32,23 +32,27 @@ from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.stages.encoder_device import EncoderDevice
 from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
 from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
+from lathe_rc.control import bounded
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.encoder_role import EncoderRole
-from lathe_rc.nodes.exchange import Exchange
 from lathe_rc.nodes.executor import Events
 from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.nodes.stage_role import StageRole
+from lathe_rc.protocol.exchange import Exchange
 
 _MESSAGES = (  # message and service types of the nodes, rclpy's own services included
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),
     *("lifecycle_msgs.srv", "diagnostic_msgs.msg", "rosgraph_msgs.msg", "type_description_interfaces.srv"),
 )
-_PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29  # from <linux/prctl.h>
+_PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_TIMERSLACK = 1, 15, 29  # from <linux/prctl.h>
+_ENDS_WITH_PARENT = "LATHE_ENDS_WITH_PARENT"  # set by cell.launch.py: a launch that SIGTERM ends leaves its nodes alone
 _LONGEST_WAIT = 0.1  # [s] between checks of signals and the harness
+_REPEATED = 1.0  # [s] within which a second signal belongs to the same request
+_ENDED_BY_SIGNAL = 128  # exit code of a shell's command that a signal has ended, less the signal
 
 
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
@@ -71,16 +75,32 @@ def _words(error: RuntimeError) -> str:
     return str(error).splitlines()[0].partition(", at /")[0]
 
 
-class _Stop:
-    """Stop flag, set by SIGINT and SIGTERM."""
+class _End:
+    """Request to end the process, by SIGINT or SIGTERM; a second one, a second later, ends it at once.
+
+    ``ros2 launch`` repeats the SIGINT of a Ctrl-C that has reached its processes already.
+
+    Attributes:
+        reason: name of the signal; empty: no request.
+        new: the request has not been passed on to the nodes yet.
+        at_once: the process ends without its nodes.
+        exit_code: exit code of a process that was ended before its run, as shells have it.
+    """
 
     def __init__(self) -> None:
-        self.signal = 0
+        self.reason, self.new, self.at_once, self.exit_code = "", False, False, 0
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._set)
+            signal.signal(number, self._signal)
 
-    def _set(self, number: int, frame: FrameType | None) -> None:
-        self.signal = number
+    def _signal(self, number: int, _frame: FrameType | None) -> None:
+        self.ask(signal.Signals(number).name, _ENDED_BY_SIGNAL + number)
+
+    def ask(self, reason: str, exit_code: int) -> None:
+        now = time.monotonic()
+        if not self.reason:
+            self.reason, self.new, self.exit_code, self._since = reason, True, exit_code, now
+        elif now - self._since > _REPEATED:
+            self.at_once = True
 
 
 def _start(nodes: Sequence[CellNode], exchange: Exchange) -> None:
@@ -114,9 +134,9 @@ def _tick(nodes: Sequence[CellNode], now: float) -> None:
             node.finish()
 
 
-def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
+def _work(nodes: Sequence[CellNode], end: _End, until: float) -> None:
     """Let the nodes compute until no node has new input, at most until a time [s], so that services get their turn."""
-    while (waiting := [node for node in nodes if node.due]) and not stop.signal:
+    while (waiting := [node for node in nodes if node.due]) and not (end.new or end.at_once):
         for node in waiting:
             node.due = False
             node.work()
@@ -124,10 +144,14 @@ def _work(nodes: Sequence[CellNode], stop: _Stop, until: float) -> None:
             return
 
 
-def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
+def _loop(nodes: Sequence[CellNode], reporter: Reporter, end: _End) -> None:
     events = Events(nodes)
     look = 0.0
-    while not stop.signal:
+    while not end.at_once:
+        if end.new:
+            end.new = False
+            for node in nodes:
+                node.end_by(end.reason)
         now = time.monotonic()
         if _due(nodes, now) <= now:
             _tick(nodes, now)
@@ -137,21 +161,23 @@ def _loop(nodes: Sequence[CellNode], reporter: Reporter, stop: _Stop) -> None:
                 return
             if now >= look:
                 look = now + _LONGEST_WAIT
-                if reporter.orphaned:
-                    return
+                if reporter.orphaned and not end.reason:
+                    end.ask("the end of its harness", LatheError.exit_code)
         due = _due(nodes, now)
         wait = 0.0 if any(node.due for node in nodes) else due - now
         # All messages that have arrived are taken before computing: a burst of inputs becomes a burst of outputs, and
         # neighbours wake up once for all of it. The wake-up is the most expensive part of a hop.
         events.spin(min(max(wait, 0.0), _LONGEST_WAIT))
-        _work(nodes, stop, due)
+        _work(nodes, end, due)
 
 
 def _tune(name: str) -> None:
-    """Set the process name and the timer slack that a cell needs; works without privileges."""
+    """Set name, timer slack and scheduling of the process, without privileges, and the signal if its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
     # Waits end on time, not up to 50 µs later: the executor's polls are waits as well.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    if _ENDS_WITH_PARENT in os.environ:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if THROUGHPUT in os.environ:
         # A woken process does not preempt the process that woke it, so bursts get longer.
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -165,12 +191,14 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
         args: ROS command line, starting at ``--ros-args``.
 
     Returns:
-        Exit code: 0, or the code of the first node that failed or whose cell went to its safe state.
+        Exit code: 0; or the code of the first node that failed or whose cell went to its safe state; or 128 and the
+            number of the signal that has ended the process before the run.
 
     Raises:
         InputError: a namespace is not absolute, or a parameter file in a bag names code that is not allowed, or files
             outside the bag.
     """
+    end = _End()
     arguments.check_namespaces(args)
     for file in arguments.parameter_files(args):
         if allowed_code.bag_around(file.parent) is not None:
@@ -181,13 +209,13 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     _tune(members[0][0])
     reporter = Reporter()
     dds.settle()
+    bounded.prepare()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
         rclpy.init(args=["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         print(f"lathe: --ros-args: {_words(error)}", file=sys.stderr)
         return InputError.exit_code
-    stop = _Stop()
     nodes: list[CellNode] = []
     exchange = Exchange(chain.form)
     try:
@@ -196,15 +224,16 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
             declare.refuse_lost(nodes[-1], args)
             if warning := declare.missing_entry(nodes[-1], args):
                 nodes[-1].get_logger().warning(warning)
-        _start(nodes, exchange)
+        if not end.new:
+            _start(nodes, exchange)
         gc.collect()
         gc.freeze()  # the collector skips existing objects: it would traverse them repeatedly between blocks
         gc.enable()  # the fork server has disabled it
-        _loop(nodes, reporter, stop)
-        if stop.signal:
-            for node in nodes:
-                node.interrupt(signal.Signals(stop.signal).name)
-        return next((node.protocol.exit_code for node in nodes if node.protocol.exit_code), 0)
+        _loop(nodes, reporter, end)
+        for node in nodes if end.at_once else ():
+            node.interrupt(end.reason)
+        early = end.exit_code if any(node.protocol.left_early for node in nodes) else 0
+        return next((node.protocol.exit_code for node in nodes if node.protocol.exit_code), early)
     except LatheError as error:
         print(f"lathe: {error}", file=sys.stderr)
         reporter("error", members[0][0], message=str(error), exit_code=error.exit_code)
@@ -239,6 +268,7 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
         nodes: kind and parameters of each node; nodes with third-party classes load these themselves, since they may
             have changed.
     """
+    bounded.prepare()
     inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
     for package in _MESSAGES:
         for found in vars(importlib.import_module(package)).values():

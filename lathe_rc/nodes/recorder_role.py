@@ -28,11 +28,11 @@ from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes import publisher_info
-from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode, Role
-from lathe_rc.nodes.exchange import Run
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
+from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
+from lathe_rc.protocol.exchange import Run
 
 _HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos(4)}
 _OFFERED = {topic.name: topic for topic in HOST_TOPICS}
@@ -68,7 +68,6 @@ class RecorderRole(Role):
         self._newest: dict[str, bytes] = {}  # newest message of each topic from another process
         self._encoder = cache(Encoder)  # by message type, run, source and step [ns]
         self._merger: Merger | None = None
-        self._ended: set[str] = set()  # topics whose last block has arrived
         self._first = self._blocks = self._samples = self._sound = 0
         self._log_ns = messages.START_NS
         self._flush_due = 0.0
@@ -111,8 +110,7 @@ class RecorderRole(Role):
             full, offered = self.node.topic(topic), _OFFERED[topic]
             durability = cast("Durability", offered.durability.replace(" ", "_"))
             self._open.add_topic(full, offered.type, offered_qos(offered.depth, durability))
-            callback = self.node.guarded(partial(self._on_host, offered.type, full))
-            self.node.create_subscription(message_class(offered.type), full, callback, qos, raw=True)
+            self.node.subscribe(message_class(offered.type), full, partial(self._on_host, offered.type, full), qos)
 
     def clean_up(self) -> None:
         """Reset the role; the bag of a cell that did not begin holds no block and is removed (implements `Role`)."""
@@ -126,7 +124,7 @@ class RecorderRole(Role):
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
-    def _on_host(self, msgtype: str, topic: str, data: bytes) -> None:
+    def _on_host(self, msgtype: str, topic: str, data: bytes, sender: str) -> None:
         if self._writer is None:
             return
         try:
@@ -135,11 +133,15 @@ class RecorderRole(Role):
             return
         # All cells of a domain share /diagnostics.
         if msgtype == messages.CELL_STATE:
-            ours = told.run_id == self.table.run_id
+            ours = told.run_id == self.table.run_id and self._is_master(sender)
         else:
-            ours = any(status.name in self.node.protocol.members for status in told.status)
+            ours = sender in self.node.protocol.members and {status.name for status in told.status} == {sender}
         if ours:
             self._open.write(topic, self._log_ns, data)
+
+    def _is_master(self, name: str) -> bool:
+        master = self.node.protocol.master
+        return master is None or master.name == name
 
     def subscriptions(self) -> list[str]:
         """Return all signal topics of the members."""
@@ -224,6 +226,7 @@ class RecorderRole(Role):
             )
             return
         queue = self._queues[topic] = BlockQueue(topic, msgtype, self.table, [])
+        queue.run_end = lambda: self.node.protocol.end
         begun = self.node.begun()
         queue.expect(source, (begun.sample if begun else 0) if in_cell else None)
         queue.repeats = in_cell and self.node.protocol.restarts(source)
@@ -295,12 +298,17 @@ class RecorderRole(Role):
 
     def tick(self, now: float) -> float:
         """Flush the bag periodically, so that a crash loses a bounded time (implements `Role`)."""
+        if (run_end := self.node.protocol.fixed_end) and self._merger is None:
+            for queue in self._queues.values():
+                queue.end_at(run_end, now)
+            self.node.attempt(self._end_unsorted, run_end)
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
+            self._tell_gaps()
             self.node.attempt(self._writer.flush)
         return self._flush_due
 
-    def _on_message_at(self, topic: str, msgtype: str, data: bytes) -> None:
+    def _on_message_at(self, topic: str, msgtype: str, data: bytes, sender: str) -> None:
         """Check and record a message at a chosen sample from a node in another process."""
         try:
             message = messages.decode(msgtype, data)
@@ -310,6 +318,8 @@ class RecorderRole(Role):
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
+        if sender != source:
+            raise ForeignMessage(topic, source, run_id, f"it is from {sender}")
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._first + (self._merger.samples if self._merger else 0)
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1
@@ -339,11 +349,11 @@ class RecorderRole(Role):
         else:
             self._merger.add_sparse(topic, stamp, data)
 
-    def _on_message(self, queue: BlockQueue, data: bytes) -> None:
+    def _on_message(self, queue: BlockQueue, data: bytes, sender: str) -> None:
         """Record a block from a node in another process."""
         if self.node.protocol.over:
             return
-        block = queue.add(data)
+        block = queue.add(data, sender)
         if block is None:
             return
         self._newest[queue.topic] = data = queue.message
@@ -377,11 +387,24 @@ class RecorderRole(Role):
         """Write a block of a free-running cell in order of arrival: blocks may be missing, so sorting cannot wait."""
         self._write(block.log_ns, queue.topic, data)
         if block.last:
-            self._ended.add(queue.topic)
-        if self._ended == set(self._queues):
-            self._samples = block.first_index + block.samples
+            self._end_unsorted(block.first_index + block.samples)
+
+    @property
+    def _all_ended(self) -> bool:
+        return bool(self._queues) and all(queue.ended for queue in self._queues.values())
+
+    def _end_unsorted(self, end: int) -> None:
+        """Finish once all topics of a free-running cell have ended before sample ``end``."""
+        if self._all_ended and not self.node.protocol.over:
+            self._samples = end
             self._blocks = -(-self._samples // self.table.block_size)
             self._complete()
+
+    def _tell_gaps(self) -> None:
+        """Store in the bag from which sample on blocks of each topic were lost."""
+        gaps = {topic: queue.lost_from for topic, queue in self._queues.items() if queue.lost_from is not None}
+        if gaps:
+            self._open.tell({loss.GAPS: json.dumps(gaps)})
 
     def _complete(self) -> None:
         """Finish after the last block of every topic is written."""
@@ -413,9 +436,11 @@ class RecorderRole(Role):
         """Write the remaining data and close the bag."""
         if self._writer is None:
             return
-        complete = bool(self._queues) and (self._merger.complete if self._merger else self._ended == set(self._queues))
-        if self._snapshots is not None and not complete:
-            cause = f"{self.node.get_name()}: {self.node.protocol.failure or 'interrupted'}"
+        self._tell_gaps()
+        complete = bool(self._queues) and self._merger.complete if self._merger else self._all_ended
+        if self._snapshots is not None and (self.node.protocol.cut or not complete):
+            why = self.node.protocol.failure or self.node.protocol.cut or "interrupted"
+            cause = f"{self.node.get_name()}: {why}"
             self.node.attempt(self._snapshots.interrupt, cause)
         if self._merger is not None:
             self.node.attempt(self._merger.write_rest)
@@ -432,5 +457,5 @@ class RecorderRole(Role):
             whole = "to the end of the safe state; what lost members published is held"
         self.node.get_logger().info(f"bag {self._path} closed: {self._blocks} blocks, {whole}")
         self.node.reporter("closed", self.node.get_name(), bag=str(self._path), blocks=self._blocks, complete=complete)
-        if self._lost:
-            self.node.fail(LossyRunError(f"{self.node.full_name}: lost {self._lost} blocks of a free-running cell"))
+        if losses := explain_losses(self.node.full_name, self._queues.values()):
+            self.node.fail(LossyRunError(losses))

@@ -1,15 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Restart of a node in mid-run: the node stores its state in a file, and a new process resumes from it.
-
-The newest blocks of a process may be lost when it dies, since DDS then repeats no message. No reader is more than one
-window and its feedback delay behind, so the state in the file is at least that old, and the new process sends the
-blocks since then again. The state is at most another window old: publishers, which may be one window ahead, keep a
-little more than three.
-"""
+"""Restart of a node in mid-run: the node stores its state in a file, and a new process resumes from it."""
 
 import os
 import stat
-from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +12,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import new_stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.protocol.kept_states import KeptStates
 
 if TYPE_CHECKING:
     from lathe_rc.nodes.stage_role import StageRole
@@ -33,9 +27,6 @@ class Restart:
         role: role of the stage.
         file: path of the state file.
 
-    Attributes:
-        keep_at: number of blocks after which the state is stored next.
-
     Raises:
         InputError: the cell has no window.
     """
@@ -48,29 +39,28 @@ class Restart:
                 f"{role.node.get_name()}.restart_file with window = 0: nobody waits for a restart; allowed: ''"
             )
         self._start = new_stage(role.node.get_name(), role.node.table)
-        self.keep_at = 0
-        self._behind = self._window  # blocks that a reader may be behind
-        self._states: deque[dict[str, Any]] = deque()  # the newest ones, with the events scheduled since
+        self._kept: KeptStates[dict[str, Any]] = KeptStates(self._window)  # with the events scheduled since
+
+    @property
+    def keep_at(self) -> int:
+        """Return the number of blocks after which the state is stored next."""
+        return self._kept.keep_at
 
     def begin(self, *, joins: bool) -> None:
         """Begin at block 0, or resume from the state of another process."""
         protocol, published = self._node.protocol, self._role.stage.outputs
         assert protocol.master is not None, "it has announced all members"
         cell = Cell(*self._node.announced(protocol.master.members))
-        delays = [port.delay for out in published for port in cell.inputs(remapped(self._node.table, out.topic))]
-        self._behind = self._window + -(-max(delays, default=0) // self._node.table.block_size)
+        table = self._node.table
+        delays = [port.delay for out in published for port in cell.inputs(remapped(table, out.topic))]
+        self._kept.begin(-(-delay // table.block_size) for delay in delays)
         if joins:
             self._resume()
         self.keep()
 
     def keep(self) -> None:
         """Keep the current state in memory, and write one that no reader has passed to the file."""
-        blocks = self._role.blocks
-        self.keep_at = blocks + self._window
-        self._states.append(self._kept())
-        while len(self._states) > 1 and self._states[1]["blocks"] <= blocks - self._behind:
-            self._states.popleft()
-        self._write()
+        self._write(self._kept.keep(self._role.blocks, self._state()))
 
     def keep_event(self, action: str, place: float) -> None:
         """Append a scheduled event to the state file, for a process that resumes.
@@ -79,12 +69,12 @@ class Restart:
             action: the event.
             place: sample at which it takes effect, an int; or number of revolutions, a float.
         """
-        for state in self._states:
+        for state in (states := self._kept.states):
             state["events"].append((action, place))
-        if self._states:
-            self._write()
+        if states:
+            self._write(states[0])
 
-    def _write(self) -> None:
+    def _write(self, state: dict[str, Any]) -> None:
         """Replace the file atomically: a reader sees either state, even if this process is killed.
 
         Raises:
@@ -95,7 +85,7 @@ class Restart:
         try:
             new.unlink(missing_ok=True)
             with open(new, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
-                file.write(data_file.packed(_KIND, self._states[0], level=0))
+                file.write(data_file.packed(_KIND, state, level=0))
             new.replace(path)
         except OSError as error:
             raise LatheError(f"{path}: the state cannot be kept ({error.strerror})") from None
@@ -107,7 +97,7 @@ class Restart:
         assert master is not None, "it has announced all members"
         return [self._node.full_name, self._node.table.run_id, master.host, master.pid]
 
-    def _kept(self) -> dict[str, Any]:
+    def _state(self) -> dict[str, Any]:
         """Return the state that the next block depends on."""
         role = self._role
         return {

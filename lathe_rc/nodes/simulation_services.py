@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Services of simulation_interfaces on a time master: features, state, steps.
+"""Services and the action of simulation_interfaces on a time master: features, state, steps.
 
 A step is as many blocks as lie between two reports of progress of a member, a quarter of the window: only these tell
 the time master that the members have completed it.
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from lathe_rc.errors import InputError
 from lathe_rc.nodes.cell_node import CellNode
+from lathe_rc.nodes.step_action import Later, Send, StepAction, serve
 from lathe_rc.protocol import Pace, Phase, TimeMasterProtocol
 
 _PACKAGE = "simulation_interfaces"
@@ -43,7 +44,9 @@ class SimulationServices:
     def __init__(self, node: CellNode, leads: TimeMasterProtocol, pace: Pace) -> None:
         self._node, self._leads, self._pace, self._step = node, leads, pace, leads.progress_step
         try:
-            self._msg, srv = (importlib.import_module(f"{_PACKAGE}.{kind}") for kind in ("msg", "srv"))
+            self._msg, srv, action = (
+                importlib.import_module(f"{_PACKAGE}.{kind}") for kind in ("msg", "srv", "action")
+            )
         except ImportError:
             raise InputError(
                 f"{node.get_name()}.simulation_services: no package {_PACKAGE} here; allowed: an installation by "
@@ -51,29 +54,15 @@ class SimulationServices:
             ) from None
         self._waiting: list[_Waiting] = []
         self._report_due = 0.0
-        self._held = False  # the answer to the current request waits
+        self._first = 0  # number of blocks at the last request
         for kind, name, callback in (
             (srv.GetSimulatorFeatures, "get_simulator_features", self._on_features),
             (srv.GetSimulationState, "get_simulation_state", self._on_get_state),
             (srv.SetSimulationState, "set_simulation_state", self._on_set_state),
             (srv.StepSimulation, "step_simulation", self._on_step),
         ):
-            self._serve(kind, name, callback)
-
-    def _serve(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """Create a service whose answers may wait: rclpy sends the answer that a callback returns at once."""
-        service: Any = self._node.create_service(kind, name, callback)
-        send = service.send_response
-
-        def send_in_time(response: Any, header: Any) -> None:
-            if self._held:
-                self._held = False
-                self._waiting[-1] = self._waiting[-1]._replace(send=lambda found: send(found, header))
-                self.look()
-            else:
-                send(response, header)
-
-        service.send_response = send_in_time
+            serve(node, kind, name, callback)
+        self._action = StepAction(node, action.SimulateSteps, self._on_step, self._stop, self._is_success)
 
     # ---- requests -----------------------------------------------------------------------------------
 
@@ -85,6 +74,7 @@ class SimulationServices:
             known.SIMULATION_STATE_PAUSE,
             known.STEP_SIMULATION_SINGLE,
             known.STEP_SIMULATION_MULTIPLE,
+            known.STEP_SIMULATION_ACTION,
         ]
         samples = self._step * self._node.table.block_size
         response.features.custom_info = f"a step is {samples} samples, {samples * self._node.table.step:g} s"
@@ -141,12 +131,26 @@ class SimulationServices:
 
     # ---- answers ------------------------------------------------------------------------------------
 
-    def _answer_at(self, blocks: int, response: Any) -> Any:
+    def _answer_at(self, blocks: int, response: Any) -> Later:
         """Hold the run after a total number of blocks, and answer then."""
-        self._held = True
-        self._waiting.append(_Waiting(lambda _: None, response, blocks))
+        self._first = self._leads.blocks
         self._hold(blocks)
-        return response
+
+        def wait(send: Send) -> None:
+            self._waiting.append(_Waiting(send, response, blocks))
+            self.look()
+
+        return wait
+
+    def _is_success(self, response: Any) -> bool:
+        return bool(response.result.result == self._msg.Result.RESULT_OK)
+
+    def _stop(self) -> None:
+        """End the steps of an action after the one under way."""
+        blocks = -(-self._leads.blocks // self._step) * self._step
+        self._waiting = [waiting._replace(blocks=min(blocks, waiting.blocks)) for waiting in self._waiting]
+        self._hold(blocks)
+        self.look()
 
     def _hold(self, blocks: int | None) -> None:
         now = time.monotonic()
@@ -162,10 +166,11 @@ class SimulationServices:
 
     def look(self) -> None:
         """Send the answer whose blocks every member has completed, or which the end of the run overtakes."""
-        if not self._waiting or self._held:
+        if not self._waiting:
             return
         (waiting,) = self._waiting
         leads = self._leads
+        self._action.tell((min(leads.least, waiting.blocks) - self._first) // self._step)
         if leads.least < waiting.blocks and not (leads.over or leads.failure or leads.held_at is None):
             return
         self._waiting.clear()

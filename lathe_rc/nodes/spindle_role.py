@@ -5,14 +5,15 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import cast
+from typing import Any, cast
 
 from lathe_rc_msgs.msg import Progress as ProgressMessage
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
 
 from lathe_rc import messages
-from lathe_rc.cell.latency_histogram import LATENCY, LATENESS
+from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, PERCENT
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
@@ -119,19 +120,35 @@ class SpindleRole(StageRole):
         super().activate()
         node = self.node
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
-        node.create_subscription(ProgressMessage, "progress", node.guarded(self._on_progress), latched_qos())
+        node.subscribe(ProgressMessage, "progress", self._on_progress, latched_qos())
         node.exchange.master = node.guarded(self._reported.append)
+        node.create_service(Trigger, "~/end", self._on_end)
         if self.table.simulation_services:
             self._simulation = SimulationServices(node, self.leads, self.pace)
 
-    def _on_progress(self, message: ProgressMessage) -> None:
-        self.leads.hear_progress(from_ros(message, Progress), time.monotonic())
+    def _on_end(self, _request: Any, response: Any) -> Any:
+        """End the run with the next block."""
+        leads = self.leads
+        if leads.running and not leads.failure:
+            self.node.attempt(leads.end_run, f"{self.node.full_name} was ended by its service", time.monotonic())
+            response.success = True
+            response.message = leads.cut or "the run ends with its safe state"
+        else:
+            response.message = "no run to end: it has not begun, or it is over"
+        return response
+
+    def _on_progress(self, data: bytes, sender: str) -> None:
+        self.leads.hear_progress(from_ros("progress", data, ProgressMessage, Progress), time.monotonic(), sender)
 
     def statistics(self) -> dict[str, object]:
         """Return the time master's figures for the diagnostics (implements `Role`)."""
-        leads = self.leads
+        leads, pace = self.leads, self.pace.figures()
+        lateness = {f"lateness, {percent} % within [s]": late for percent, late in pace.within.items()} if pace else {}
         return {
             **super().statistics(),
+            **lateness,
+            **({"late blocks": pace.late, "worst lateness [s]": pace.worst} if pace else {}),
+            **{f"latency, {percent} % within [s]": leads.latency.within(percent) for percent in PERCENT},
             "blocks in flight": self.blocks - leads.least,
             "slowest member": leads.slowest,
             "schedule slipped [s]": round(self.pace.slipped, 3),
@@ -203,6 +220,7 @@ class SpindleRole(StageRole):
         if self.chain is None and not self.inputs.ports:
             return samples
         ready = self.chain.ready() if self.chain is not None else self.ready()
+        self.leads.starved = not ready
         return min(samples, ready[0]) if ready else 0
 
     def release(self) -> None:
@@ -216,7 +234,7 @@ class SpindleRole(StageRole):
                 break  # a window may hold many blocks: deaths must be noticed meanwhile
             if not (samples := self.possible()):
                 return
-            if self.pace.block and not self._is_due(-(-samples // size)):
+            if self.pace.block and not leads.ends_early and not self._is_due(-(-samples // size)):
                 return
             last = leads.end is not None and leads.end - self.samples <= samples
             if last:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Role of a node with a stage: reads blocks in order, computes alone or in a chain, and publishes."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,12 +17,12 @@ from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals
-from lathe_rc.nodes.block_queue import BlockQueue
 from lathe_rc.nodes.cell_node import CellNode, Role
-from lathe_rc.nodes.inputs import Inputs
 from lathe_rc.nodes.outputs import Memory, Outputs
 from lathe_rc.nodes.restart import Restart
 from lathe_rc.protocol import Announcement, MemberProtocol
+from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
+from lathe_rc.protocol.inputs import Inputs
 
 if TYPE_CHECKING:
     from lathe_rc.nodes.chain import Chain
@@ -89,6 +88,7 @@ class StageRole(Role):
         self.outputs.activate()
         for topic, queue in self.inputs.queues.items():
             queue.inside = self.node.exchange.has(topic)
+            queue.run_end = lambda: self.node.protocol.end
             self.node.listen(topic, queue.type, queue.add, queue.take)
         self.inputs.share()
         self.node.exchange.stages.append(self)
@@ -163,13 +163,10 @@ class StageRole(Role):
         self.outputs.unsound = True
         if self.chain is not None:
             self.chain.leave()
-        for queue in self.inputs.queues.values():
-            if queue.source in lost and queue.held_from is None:
-                queue.hold_newest(end)
+        unlimited = self.inputs.lose(lost, end)
         if not again:
             self.become_safe(first)
-        forward = self.inputs.forward
-        if forward and all(queue.held_from is not None for queue in forward) and self.inputs.reach is None:
+        if unlimited:
             self._follow_the_master(first)
         self.node.due = True
 
@@ -178,21 +175,12 @@ class StageRole(Role):
         self.stage.lose(first)
 
     def _follow_the_master(self, first: int) -> None:
-        """Limit the stage to the spindle's progress; with all inputs lost, it would compute up to the end at once."""
-        node, master = self.node, self.node.protocol.master
+        """Read the spindle's blocks, which limit the stage from sample ``first`` on."""
+        master = self.node.protocol.master
         assert master is not None, "it has declared the safe state"
-        self.inputs.reach = first
         topic = next(topic for topic, sparse in zip(master.publishes, master.sparse, strict=True) if not sparse)
-        pace = BlockQueue(topic, messages.ENCODER, node.table, [])
-        pace.expect(master.name, first)
-        pace.repeats = True
-
-        def come(take: Callable[[Any], object], delivery: Any) -> None:
-            take(delivery)
-            pace.blocks.clear()
-            self.inputs.reach = max(first, pace.end)
-
-        node.listen(topic, messages.ENCODER, partial(come, pace.add), partial(come, pace.take))
+        pace = self.inputs.follow(topic, master.name, first)
+        self.node.listen(topic, pace.type, pace.add, pace.take)
 
     def failed(self) -> None:
         """Dissolve the chain after a failure; its other stages go on alone (implements `Role`)."""
@@ -206,8 +194,12 @@ class StageRole(Role):
             self.node.exchange.stages.remove(self)
 
     def tick(self, now: float) -> float:
-        """Check for readers in other processes; no further call is due (implements `Role`)."""
+        """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
+        if run_end := self.node.protocol.fixed_end:
+            for queue in self.inputs.queues.values():
+                queue.end_at(run_end, now)
+            self.node.due = True
         return float("inf")
 
     def statistics(self) -> dict[str, object]:
@@ -355,8 +347,8 @@ class StageRole(Role):
             self.node.get_logger().warning(f"not reached: {'; '.join(waiting)}")
             self.node.reporter("not_reached", self.node.get_name(), events=waiting)
         self.node.complete_part()
-        if self.lost:
-            raise LossyRunError(f"{self.node.full_name}: lost {self.lost} blocks of a free-running cell")
+        if losses := explain_losses(self.node.full_name, self.inputs.queues.values()):
+            raise LossyRunError(losses)
 
     # ---- in a chain ---------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ Nothing here publishes, waits, reads a clock or starts a thread: so thousands of
 
 from lathe_rc.protocol.block_order import BlockOrder
 from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 from lathe_rc.protocol.pace import Pace
 from lathe_rc.protocol.time_master import Reactions, TimeMasterProtocol
 
@@ -15,6 +15,7 @@ __all__ = [
     "GIVEN_UP",
     "SILENCE",
     "Announcement",
+    "BadBlock",
     "BlockOrder",
     "CellState",
     "ForeignMessage",

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the blocks of one topic: each block once, no gaps, from one source."""
 
-from lathe_rc.errors import LatheError
-from lathe_rc.protocol.messages import ForeignMessage
+from lathe_rc.protocol.messages import BadBlock, ForeignMessage
 
 
 class BlockOrder:
@@ -21,24 +20,39 @@ class BlockOrder:
         end: index after the newest sample; the next block has to begin there unless the order is `open`.
         received: number of blocks so far, lost blocks included.
         lost: number of lost blocks; always 0 unless the cell is free-running.
+        lossy: the source is a device that keeps no messages, so that the first blocks and the last ones may be lost.
+        lost_from: first lost sample; None: none.
         ended: the last block has arrived.
         repeats: blocks may be repeated, since the source can be restarted in another process.
         held_from: sample from which the newest sample of a lost source is held; None: the source is not lost.
+        rejected: a block of the source was bad; all that follow are ignored.
     """
 
     def __init__(self, topic: str, run_id: str, longest_gap: int | None = None) -> None:
         self.topic = topic
         self._run_id, self._longest_gap = run_id, longest_gap
         self.source = ""
-        self.open, self.ended, self.repeats = True, False, False
+        self.open, self.ended, self.repeats, self.rejected = True, False, False, False
         self.received = self.lost = self.end = 0
+        self.lossy = False
+        self.lost_from: int | None = None
         self.held_from: int | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
         """Accept blocks of one node only, starting at sample ``first``; None: at the first block that arrives."""
         self.source, self.open = source, first is None
         self.received = self.lost = 0
-        self.end, self.ended = first or 0, False
+        self.end, self.ended, self.rejected = first or 0, False, False
+
+    @property
+    def ignores(self) -> bool:
+        """Return True if further blocks change nothing: the source is lost, or one of its blocks was bad."""
+        return self.held_from is not None or self.rejected
+
+    def reject(self, source: str, why: str) -> BadBlock:
+        """Ignore the source's blocks from now on; return the error that names it."""
+        self.rejected = True
+        return BadBlock(self.topic, source, why)
 
     def admit(self, run_id: str, source: str) -> None:
         """Reject a block from outside the cell.
@@ -52,23 +66,23 @@ class BlockOrder:
             raise ForeignMessage(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
 
     def missing(self, source: str, first: int, samples: int) -> int | None:
-        """Return the number of samples missing before a block; None for a repeat, or if a held block replaces it.
+        """Return the number of samples missing before a block; None for a repeat, or if it is ignored.
 
         Raises:
-            LatheError: a gap or repeat that is not allowed.
+            BadBlock: a gap or repeat that is not allowed.
         """
-        if self.held_from is not None:
+        if self.ignores:
             return None
         if self.open:
             self.source, self.end, self.open = source, first, False
         if self.repeats and first + samples <= self.end:
             return None
         missing = first - self.end
-        if missing < 0 or (missing and (self._longest_gap is None or not self.received)):
+        if missing < 0 or (missing and (self._longest_gap is None or not (self.received or self.lossy))):
             what = f"{missing} samples are missing" if missing > 0 else "a block came twice"
-            raise LatheError(f"{self.topic}: {source} goes from sample {self.end} to {first}: {what}")
+            raise self.reject(source, f"{source} goes from sample {self.end} to {first}: {what}")
         if missing > (self._longest_gap or 0):
-            raise LatheError(f"{self.topic}: {source} jumps by {missing} samples")
+            raise self.reject(source, f"{source} jumps by {missing} samples")
         return missing
 
     def append(self, end: int, blocks: int = 1, *, last: bool) -> None:

@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.actions import Action
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 
 SILENCE = 0.08  #: [s] without DDS liveliness and progress after which a node counts as silent
 GIVEN_UP = 2.0  #: [s] of silence after which a time master counts as lost in a cell that does not wait
@@ -23,7 +23,11 @@ PATIENCE = 2.0  #: [s] for other nodes to acknowledge the last messages
 _REPEAT_PERIOD = 0.5  # [s] between announcements before the run, in the safe state, and after a failure
 _NAMESAKE = 1.0  # [s] for the announcement of an established namesake to arrive, in a cell that runs already
 _LAST_ANSWER = 1.0  # [s] for the response of a shutdown to arrive: DDS does not confirm it
+_END_BY_MASTER = 1.0  # [s] for a time master that is ended by the same Ctrl-C to announce the end of the run
+LONGEST_MESSAGE = 1024  #: characters of Member.msg and CellState.msg
 _MOST_MEMBERS = 256  # largest number of announced names
+INACTIVE = "inactive"  #: message of a member that is deactivated
+ALL_SENT = "all blocks are sent"  #: message of a free-running cell's state, for readers that lose the last block
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
@@ -47,8 +51,12 @@ class MemberProtocol:
         safe: this member knows that members are lost.
         over: this member's part of the run is complete.
         done: this member may leave.
+        all_sent: the time master has announced that it has sent all blocks of a free-running cell.
+        cut: why the run ends before its planned end; empty: it does not.
+        left_early: this member was ended before the run.
         failure: reason of this member's failure.
         without: lost members.
+        end: end of the run [sample]; None: endless, or not known yet.
         unmatched: topics with missing peers at the last look at the graph, for messages.
         patience: longest wait for acknowledgements [s].
         silent: time since which a member is silent or stopped [s], by name.
@@ -70,11 +78,14 @@ class MemberProtocol:
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
         self._former_peers: tuple[str, ...] = ()
-        self._newest_state: CellState | None = None  # from a time master that is not announced yet
+        self._newest_states: dict[str, CellState] = {}  # by sender, from time masters that are not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
+        self.all_sent, self.cut, self.left_early = False, "", False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
+        self.end: int | None = None
+        self._rejected: dict[str, str] = {}  # members whose blocks are rejected, and why
         self.unmatched: Sequence[str] = ()
         self.patience = PATIENCE
         self.silent: Mapping[str, float] = {}
@@ -85,8 +96,10 @@ class MemberProtocol:
         self._reported_blocks = 0
         self._moved = 0.0  # time of the last block that this member completed
         self._master_stalls = False
+        self._silences: Counter[str] = Counter()  # by member
         self._repeat_due = self._time = 0.0
-        self._join_due = self._leave_due = self._wait_report_due = math.inf
+        self._join_due = self._leave_due = self._wait_report_due = self._end_due = math.inf
+        self._ended_by = ""
         self._wait_report_after: Iterator[float] = iter(())
 
     # ---- lifecycle ----------------------------------------------------------------------------------
@@ -102,13 +115,14 @@ class MemberProtocol:
         self.active = True
         if not self._started:
             self._started = True
-            self._wait_report_after = chain(_WAIT_REPORTS, repeat(_WAIT_REPORTS[-1]))
-            self._wait_report_due = now + next(self._wait_report_after)
+            self._report_waiting_from(now)
         self.announce()
 
     def deactivate(self) -> None:
         """Deactivate the member: node and cell pause."""
         self.active = False
+        if self._started:
+            self.announce()
 
     def clean_up(self) -> None:
         """Leave the cell, which must not begin without this member: its next announcement is a new join."""
@@ -125,13 +139,27 @@ class MemberProtocol:
             self._leave_due = now + _LAST_ANSWER
         self.active = False
 
+    def end_by(self, signal: str, now: float) -> None:
+        """Handle a signal that ends the node's process; in a run, the time master has some time to end the run first.
+
+        Ctrl-C reaches all members: then the time master ends the run for all. If it has not, this member is lost.
+        """
+        if self.takes_part or (self.over and not self.done):
+            self._ended_by, self._end_due = signal, math.inf if self.cut else now + _END_BY_MASTER
+        else:
+            self.interrupt(signal)
+            self.done = True
+
     def interrupt(self, signal: str) -> None:
-        """Handle a signal that ends the node's process."""
+        """Handle a signal after which the node's process ends at once."""
         if self.takes_part:
             self.fail(LatheError(f"{self.own.name} was ended by {signal} in the middle of a run"))
         elif not (self.over or self.failure or self.done):
             self._leave_before_the_run()
-            self._report("interrupted", message=f"{self.own.name} was ended by {signal} before the run began")
+            self.left_early = not self._moved
+            why = f"{self.own.name} was ended by {signal}" + " before the run began" * self.left_early
+            self._log("info", why)
+            self._report("interrupted", message=why)
 
     def _leave_before_the_run(self) -> None:
         """Announce that the cell must not begin without this member."""
@@ -148,7 +176,9 @@ class MemberProtocol:
     def announce(self) -> None:
         """Publish name, topics and state."""
         session = self.own.session if self.own.members else self._session
-        self.own = replace(self.own, state=self._state(), message=str(self.failure or ""), session=session)
+        pauses = INACTIVE if self.ready and not self.active else ""
+        said = str(self.failure) if self.failure else pauses or "\n".join(map(": ".join, self._rejected.items()))
+        self.own = replace(self.own, state=self._state(), message=said[:LONGEST_MESSAGE], session=session)
         self.members[self.own.name] = self.own
         if self.own.members:
             self.master = self.own
@@ -167,15 +197,20 @@ class MemberProtocol:
             return MemberState.READY  # a member that the time master does not name is an observer
         return MemberState.WIRED if self.active and self._wired else MemberState.JOINING
 
-    def hear_member(self, member: Announcement, now: float) -> None:
+    def hear_member(self, member: Announcement, now: float, sender: str = "") -> None:
         """Process a member's announcement.
+
+        Args:
+            member: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
 
         Raises:
             ForeignMessage: the sender is no member of this cell.
         """
         if member.name == self.own.name and member.process == self.own.process:
             return  # this member itself
-        self._check(member)
+        self._check(member, sender)
         if member.name == self.own.name:
             self._meet_namesake(member)
             return
@@ -188,6 +223,8 @@ class MemberProtocol:
             del self.members[next(n for n in reversed(self.members) if n not in peers and n != self.own.name)]
         if member.state == MemberState.FAILED and not self.over and self._is_peer(member.name):
             self.member_failed(member, now)
+        elif member.rejects and self._is_peer(member.name):
+            self.member_rejects(member, now)
         elif known and known.process == member.process and known.state > member.state == MemberState.JOINING:
             self.member_left(member, now)
         self.actions.append(do.MembersChanged())
@@ -198,9 +235,9 @@ class MemberProtocol:
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
-        if (state := self._newest_state) is not None:
-            self._newest_state = None
-            self.hear_cell_state(state, now)
+        for sender in (master.name, ""):
+            if state := self._newest_states.pop(sender, None):
+                self.hear_cell_state(state, now, sender)
 
     def _forget_master(self) -> None:
         """Forget the time master and wait for another; only before the run."""
@@ -212,11 +249,15 @@ class MemberProtocol:
         peers = self.master.members if self.master else self._former_peers
         return name in peers and name != self.own.name and name not in self.without
 
-    def _check(self, member: Announcement) -> None:
+    def _check(self, member: Announcement, sender: str) -> None:
         """Reject an announcement from outside the cell."""
         why, known = "", self.members.get(member.name)
         if self.own.run_id and member.run_id != self.own.run_id:
             why = f"expected run {self.own.run_id!r}"
+        elif sender not in ("", member.name):
+            why = f"it is from {sender}"
+        elif member.state not in tuple(MemberState):
+            why = f"state {member.state}; expected one of its states"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
         elif member.members and not self._may_lead(member):
@@ -278,6 +319,9 @@ class MemberProtocol:
 
     def member_left(self, member: Announcement, now: float) -> None:
         """Handle a member that was ready and is not any more; only a time master does."""
+
+    def member_rejects(self, member: Announcement, now: float) -> None:
+        """Handle the rejection of blocks by a member; only a time master does."""
 
     def abandon(self, member: Announcement) -> None:
         """Fail because another member has failed."""
@@ -348,10 +392,17 @@ class MemberProtocol:
         self._report("ready")
         self.members_changed(now)
 
+    @property
+    def fixed_end(self) -> int | None:
+        """End of the run once no more than the last blocks can be under way [sample]; None before."""
+        return self.end if self.all_sent or self.cut else None
+
     def missing(self) -> list[str]:
-        """Return the members and topics that this member still needs in order to begin; empty if none."""
-        if self.done or self.failure or (self.ready and self.phase not in (None, Phase.WAITING)):
+        """Return the members and topics for which this member waits; empty if there are none."""
+        if self.done or self.failure or self.over or self.phase == Phase.SAFE:
             return []
+        if self.ready and self.phase == Phase.RUNNING:
+            return self.pausing()
         if not self.active:
             return ["its own activation"]
         if self.master is None:
@@ -359,13 +410,16 @@ class MemberProtocol:
             return [*([] if self.alone or not lonely else ["a time master"]), *lonely]
         others = [name for name in self.master.members if name != self.own.name]
         states = {name: self.members[name].state if name in self.members else None for name in others}
-        unheard = [name + self._near(name) for name, state in states.items() if state is None]
-        joining = [f"{name} to join" for name, state in states.items() if state == MemberState.JOINING]
-        if unheard or joining:
-            return [*unheard, *joining]
-        if not self.ready:
-            return list(self.unmatched)
-        return [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
+        absent = [name + self._near(name) for name, state in states.items() if state is None]
+        absent += [f"{name} to join" for name, state in states.items() if state == MemberState.JOINING]
+        if absent:
+            return absent
+        unready = [f"{name} to be ready" for name, state in states.items() if state == MemberState.WIRED]
+        return unready if self.ready else list(self.unmatched)
+
+    def pausing(self) -> list[str]:
+        """Return the members that pause the run: for all but the time master, a time master that is silent."""
+        return [f"{self.master.name}, which is silent"] if self._master_stalls and self.master else []
 
     def _near(self, name: str) -> str:
         """Return a hint at a node with a similar name that the time master does not name."""
@@ -387,24 +441,44 @@ class MemberProtocol:
         """Record that the node resumes in place of another process, after a number of blocks."""
         self._reported_blocks = blocks
 
+    def reject(self, block: BadBlock, now: float) -> None:
+        """Wait for the loss of a member that has sent a bad block; without a cell, nobody can declare it: fail."""
+        if self.master is None or block.source not in self.master.members:
+            self.fail(block)
+        elif block.source not in self.without:
+            self._rejected[block.source] = str(block)
+            self._log("error", f"{block.source} is rejected: {block}")
+            self.announce()
+
     # ---- the state of the cell ----------------------------------------------------------------------
 
-    def hear_cell_state(self, state: CellState, now: float) -> None:
+    def hear_cell_state(self, state: CellState, now: float, sender: str = "") -> None:
         """Process the cell state published by the time master.
 
+        Args:
+            state: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the cell state belongs to another run.
+            ForeignMessage: the cell state belongs to another run, or is not the time master's.
         """
         if state.run_id != self.own.run_id:
             if self.own.run_id:
                 raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
             return
-        if self.master is None:
-            self._newest_state = state
-        elif state.session and state.session != self.master.session:
-            self._newest_state = state  # from a process not announced yet, or from outside the cell
+        if state.state not in tuple(Phase):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
+        led = self.master is not None and sender in ("", self.master.name)
+        if self.master is None or not led or state.session not in (0, self.master.session):
+            self._newest_states[sender] = state  # from a process not announced yet, or from outside the cell
+            if len(self._newest_states) > _MOST_MEMBERS:
+                del self._newest_states[next(iter(self._newest_states))]
+            if self.master is not None and not led:
+                raise ForeignMessage("cell_state", sender, state.run_id, f"the time master is {self.master.name}")
             return
         self.phase = Phase(state.state)
+        self._hear_end(state)
         if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
             # A member that cannot resume gives up, and names its established namesake if there is one.
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
@@ -417,17 +491,26 @@ class MemberProtocol:
         elif self.phase == Phase.SAFE:
             self.go_safe(state)
 
+    def _hear_end(self, state: CellState) -> None:
+        """Take the end of the run: the planned one, or one that has come nearer."""
+        self.end = state.end_index or self.end
+        if state.state == Phase.RUNNING and state.message:
+            self.all_sent, self.cut = state.message == ALL_SENT, "" if state.message == ALL_SENT else state.message
+            self._end_due = math.inf
+            self.active = True  # a deactivated member resumes for the end
+
     def go_safe(self, state: CellState) -> None:
         """Enter the safe state, since members are lost."""
         if self.own.name in state.lost or not self.ready:
-            self.fail(LatheError(f"{self.own.name}: the cell went to its safe state without it"), cause="abandoned")
+            why = f"{self.own.name}: the cell went to its safe state without it: {state.message}"
+            self.fail(LatheError(why), cause="abandoned")
             return
         self.without = frozenset(state.lost)
-        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
         if not self.over:
             self.actions.append(do.Lose(self.without, state.first_index, state.end_index, self.safe))
         self.safe = True
         self.announce()
+        self._log("error", f"safe state from sample {state.first_index} on: {state.message}")
 
     # ---- time ---------------------------------------------------------------------------------------
 
@@ -444,10 +527,14 @@ class MemberProtocol:
         self.silent, self.ended, self.look_due, self._time = silent, ended, math.inf, now
         if now >= self._leave_due:
             self.leave()
+        if now >= self._end_due:
+            self._end_due = math.inf
+            self.interrupt(self._ended_by)
+            self.done = self.done or not self.failure
         if not self._started or self.done:
             return
         self.look_after_others(now)
-        waits = self.phase != Phase.RUNNING or self.failure or not self.ready
+        waits = self.phase != Phase.RUNNING or self.failure or self._rejected or not self.ready
         if (self.master is not None or self.own.members) and waits and now >= self._repeat_due:
             self._repeat_due = now + _REPEAT_PERIOD  # a flood of messages may have displaced the last one
             self.announce()
@@ -455,7 +542,12 @@ class MemberProtocol:
             self._wait_report_due = now + next(self._wait_report_after)
             if missing := self.missing():
                 self._log("warning", f"waits for {'; '.join(missing)}")
-                self._report("waits", missing=missing)
+                self._report("paused" if self.phase == Phase.RUNNING else "waits", missing=missing)
+
+    def _report_waiting_from(self, now: float) -> None:
+        """Begin to wait: the first report comes soon, the next ones later and later."""
+        self._wait_report_after = chain(_WAIT_REPORTS, repeat(_WAIT_REPORTS[-1]))
+        self._wait_report_due = now + next(self._wait_report_after)
 
     def look_after_others(self, now: float) -> None:
         """Report a silent time master, and fail if it is gone, since no further block can follow."""
@@ -495,14 +587,17 @@ class MemberProtocol:
             if now - self._moved < SILENCE:  # blocks in flight are still being computed
                 self.look_due = self._moved + SILENCE
                 return
-            self._tell_stall(name, self._reported_blocks)
+            self._tell_stall(name, self._reported_blocks, now)
         self._master_stalls = silent
 
-    def _tell_stall(self, name: str, blocks: int) -> None:
-        """Report that a member is silent, with the number of blocks that it has completed."""
+    def _tell_stall(self, name: str, blocks: int, now: float) -> None:
+        """Report that a member is silent, with the number of blocks that it has completed; log only the first time."""
         # Report first: the first log message takes some 70 ms.
         self._report("stall", member=name, blocks=blocks)
-        self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
+        self._silences[name] += 1
+        self._report_waiting_from(now)
+        if self._silences[name] == 1:
+            self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms at block {blocks}")
 
     # ---- failure and end ----------------------------------------------------------------------------
 
@@ -549,6 +644,9 @@ class MemberProtocol:
         """Request once that the node leaves, after at most ``patience`` [s] for the acknowledgement of its messages."""
         if not self._leaving:
             self._leaving = True
+            for name, count in self._silences.items():
+                if count > 1:
+                    self._log("warning", f"{name} has been silent for {SILENCE * 1e3:.0f} ms {count} times")
             self.actions.append(do.Leave(patience))
 
     def left(self) -> None:

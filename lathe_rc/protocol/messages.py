@@ -53,6 +53,12 @@ class Announcement:
     session: int = 0
 
     @property
+    def rejects(self) -> dict[str, str]:
+        """Return the members whose blocks this member rejects, with the reasons."""
+        lines = self.message.splitlines() if self.state != MemberState.FAILED else ()
+        return {name: why for name, _, why in (line.partition(": ") for line in lines)}
+
+    @property
     def process(self) -> tuple[str, int]:
         """Return host and process number, which identify the process of the announcement."""
         return self.host, self.pid
@@ -80,6 +86,20 @@ class Progress:
     blocks: int
     samples: int
     session: int = 0
+
+
+class BadBlock(LatheError):  # noqa: N818 - the block, not what went wrong
+    """Error for a block that its source must not send: the source is lost, and its readers go on.
+
+    Args:
+        topic: fully qualified name.
+        source: the member that has sent the block.
+        why: description of the block.
+    """
+
+    def __init__(self, topic: str, source: str, why: str) -> None:
+        super().__init__(f"{topic}: {why}")
+        self.source = source
 
 
 class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wrong

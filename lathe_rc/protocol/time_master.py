@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocol of the time master: starts the run, releases blocks by window, ends it and leads the way to a safe state."""
 
+import math
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -8,10 +9,20 @@ from dataclasses import dataclass
 from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import actions as do
-from lathe_rc.protocol.member import GIVEN_UP, SILENCE, MemberProtocol, given_up, why_failed
-from lathe_rc.protocol.messages import Announcement, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.member import (
+    ALL_SENT,
+    GIVEN_UP,
+    INACTIVE,
+    LONGEST_MESSAGE,
+    SILENCE,
+    MemberProtocol,
+    given_up,
+    why_failed,
+)
+from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
 
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
+_ANNOUNCED = 0.05  # [s] from the announcement of an early end to the last block
 _GONE = 0.2  # [s] to wait for acknowledgements after a member has died
 
 
@@ -36,12 +47,13 @@ class TimeMasterProtocol(MemberProtocol):
 
     Attributes:
         blocks, samples: number released so far, samples including those before the run.
-        end: end of the run [sample]; None: endless, or not known yet.
         blocks_in_run: length of the run in blocks; None: endless, or not known yet.
         running: True from block 0 to the end of the run.
         unsafe: members that have not confirmed the safe state; no block is released until all have.
         completed: number of blocks that each member has completed.
+        ends_early: the run ends with the next block, whatever its pace.
         held_at: total number of blocks after which the run is held; None: it is not held.
+        starved: the time master itself lacks an input for its next block.
         latency: histogram of the time from the release of a block to its completion by every member.
     """
 
@@ -58,17 +70,19 @@ class TimeMasterProtocol(MemberProtocol):
         self._reactions = reactions
         self._first = self.samples = first
         self.blocks = 0
-        self.end: int | None = None
         self.blocks_in_run: int | None = None
         self.running = False
         self.unsafe: frozenset[str] = frozenset()
         self.completed = {name: 0 for name in own.members if name != own.name}
+        self.ends_early = False
         self.held_at: int | None = None
+        self.starved = False
         self.latency = Durations()
         self._released: deque[float] = deque()  # monotonic times at which the blocks in flight were released
-        self._checking = self._declared = False
+        self._checking = self._declared = self._short = False
         self._why = ""
         self._heard = self._looked = 0.0
+        self._last_due = math.inf  # monotonic time at which the last block of an early end is released
         self._members_moved: dict[str, float] = {}  # monotonic time at which each has last completed a block
         self._stalled: frozenset[str] = frozenset()
         self._dead: dict[str, float] = {}  # monotonic time until which a member may be restarted
@@ -150,18 +164,23 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions += [do.Start(), do.Release()]
 
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
-        end, lost = (self.end or 0, tuple(sorted(self.without))) if self._declared else (0, ())
+        lost, end, session = tuple(sorted(self.without)), self.end or 0, self.own.session
         self.phase = phase
-        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
+        self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:LONGEST_MESSAGE], end, lost, session)))
 
-    def hear_cell_state(self, state: CellState, now: float) -> None:
+    def hear_cell_state(self, state: CellState, now: float, sender: str = "") -> None:
         """Reject cell states that are not the time master's own.
 
         Raises:
             ForeignMessage: the cell state was published by another time master.
         """
-        if (state.run_id, state.session) != (self.own.run_id, self.own.session):
-            raise ForeignMessage("cell_state", "", state.run_id, f"this node, {self.own.name}, is the time master")
+        if (state.run_id, state.session) != (self.own.run_id, self.own.session) or sender not in ("", self.own.name):
+            raise ForeignMessage("cell_state", sender, state.run_id, f"this node, {self.own.name}, is the time master")
+
+    def deactivate(self) -> None:
+        """Pause the cell (extends `MemberProtocol`)."""
+        super().deactivate()
+        self._report_waiting_from(self._time)
 
     # ---- progress -----------------------------------------------------------------------------------
 
@@ -175,15 +194,22 @@ class TimeMasterProtocol(MemberProtocol):
         self.blocks, self.samples = blocks, samples
         super().computed(blocks, samples, now, last=last)
 
-    def hear_progress(self, progress: Progress, now: float) -> None:
+    def hear_progress(self, progress: Progress, now: float, sender: str = "") -> None:
         """Process the progress of a member.
 
+        Args:
+            progress: the message.
+            now: monotonic time [s].
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the progress belongs to another run.
+            ForeignMessage: the progress belongs to another run, or is another node's.
         """
         if progress.run_id != self.own.run_id:
             raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
         name = progress.name
+        if sender not in ("", name):
+            raise ForeignMessage("progress", name, progress.run_id, f"it is from {sender}")
         if name == self.own.name and progress.session in (0, self.own.session):
             return  # a process publishes the progress of all its nodes, which reaches them too
         if not self.running:
@@ -237,6 +263,34 @@ class TimeMasterProtocol(MemberProtocol):
         """Record that the last block is released; the run ends when all members have completed it."""
         if not self.completed:
             self.finish_run()
+        elif not self.window and self.running:
+            self._say(Phase.RUNNING, self._first, self.cut or ALL_SENT)
+
+    def end_by(self, signal: str, now: float) -> None:
+        """End the run for all members with the next block (extends `MemberProtocol`)."""
+        if self.running:
+            self.end_run(f"{self.own.name} was ended by {signal} in the middle of a run", now)
+        else:
+            super().end_by(signal, now)
+
+    def end_run(self, why: str, now: float) -> None:
+        """End a run with the next block, as fast as the members follow; a safe state comes to its own end.
+
+        A run with a planned end fails after it, since it has not come to this end.
+        """
+        planned, self.ends_early, self.active, self.held_at, self._heard = self.end, True, True, None, now
+        if not (self._declared or self.cut):
+            end = self.samples + self._reactions.block_size
+            if planned is None or end < planned:
+                self._set_end(end)
+                self.cut = f"{why}; it ends at sample {end}" + (f" of {planned}" if planned is not None else "")
+                self._short = planned is not None
+                self._log("info", self.cut)
+                self._say(Phase.RUNNING, self._first, self.cut)
+                # The last block comes on another topic: readers that know of no earlier end would reject it.
+                self.held_at, self._last_due = self.blocks, now + _ANNOUNCED
+                return
+        self.actions.append(do.Release())
 
     def finish_run(self) -> None:
         """End the run after all members have completed the last block."""
@@ -244,8 +298,8 @@ class TimeMasterProtocol(MemberProtocol):
         self._say(Phase.ENDED, self.samples, self._why)
         self._log("info", f"run ended: {self.blocks} blocks, {self.samples} samples")
         self.over, self.running = True, False
-        if self._declared:
-            super().fail(LatheError(self._why))
+        if self._declared or self._short:
+            super().fail(LatheError(self._why or self.cut))
         self.leave(self.patience)
 
     def fail(self, error: LatheError, *, cause: str = "error") -> None:
@@ -270,6 +324,12 @@ class TimeMasterProtocol(MemberProtocol):
             return
         self._forgive(now - self._looked)
         self._looked = now
+        if now >= self._last_due:
+            self._last_due, self.held_at = math.inf, None
+            self.actions.append(do.Release())
+        if self.ends_early and now - self._heard > GIVEN_UP:
+            self.fail(LatheError(f"{self.cut or self._why}; {self.slowest} has not completed its blocks"))
+            return
         for name in [each for each in self.completed if each in self.ended and each not in self._dead]:
             restarts, self.patience = self.restarts(name) and not self._declared, _GONE
             self._dead[name] = now + (self._reactions.restart_time if restarts else 0.0)
@@ -291,16 +351,28 @@ class TimeMasterProtocol(MemberProtocol):
     def _look_at_the_silent(self, now: float) -> None:
         silent = self.silent.keys() & self.completed.keys()
         stopped = {name for name in silent if now - self._members_moved[name] > SILENCE}
-        stands = (self.unsafe or self._room <= 0) and now - self._heard > SILENCE
-        if stands:
+        quiet = now - max(self._heard, self._moved)
+        waits = self.unsafe or self._room <= 0 or (self.starved and self.held_at is None)
+        if waits and quiet > SILENCE:
             # Waiting members lag as much as the stalled one: members without DDS liveliness are named first.
-            self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}))
+            self._name_the_silent(frozenset(silent or self.unsafe or {self.slowest}), now)
         elif stopped:
-            self._name_the_silent(frozenset(stopped) | self._stalled)
-        if stands and self._reactions.stall_reaction == "safe" and now - self._heard > self._reactions.stall_time:
-            late = now - self._reactions.stall_time
-            lost = {name for name, since in self.silent.items() if since < late} & self.completed.keys()
+            self._name_the_silent(frozenset(stopped) | self._stalled, now)
+        if self._reactions.stall_reaction != "safe":
+            return
+        # In the safe state a drive that is only slow must not be given up: it alone can retract its tool.
+        late = now - (max(self._reactions.stall_time, GIVEN_UP) if self._declared else self._reactions.stall_time)
+        lost = {name for name in stopped if max(self.silent[name], self._members_moved[name]) < late}
+        if waits and now - quiet < late:
             self._lose(dict.fromkeys(lost or self._stalled, "fell silent"), now)
+        elif lost := {name for name in lost if self._owed_since(name) < late}:
+            self._lose(dict.fromkeys(lost, "fell silent"), now)
+
+    def _owed_since(self, name: str) -> float:
+        """Return the time of release of the blocks that a member has to report next [s]; inf: not released yet."""
+        done = self.completed[name]
+        due = min((done // self.progress_step + 1) * self.progress_step, self.blocks_in_run or math.inf)
+        return self._released[int(due) - self.least - 1] if done < due <= self.blocks else math.inf
 
     def _forgive(self, passed: float) -> None:
         """Extend all silence deadlines by the time ``passed`` [s] during which this node itself was stopped.
@@ -314,10 +386,16 @@ class TimeMasterProtocol(MemberProtocol):
             self._members_moved = {name: moved + passed for name, moved in self._members_moved.items()}
             self.silent = {name: since + passed for name, since in self.silent.items()}
 
-    def _name_the_silent(self, names: frozenset[str]) -> None:
+    def _name_the_silent(self, names: frozenset[str], now: float) -> None:
         new, self._stalled = names - self._stalled, names
         for name in sorted(new):
-            self._tell_stall(name, self.completed[name])
+            self._tell_stall(name, self.completed[name], now)
+
+    def pausing(self) -> list[str]:
+        """Return the members that pause the run: inactive ones, and silent ones once the window is exhausted."""
+        why = dict.fromkeys(self.silent.keys() & self.completed.keys() if self._room <= 0 else (), "silent")
+        why |= {name: INACTIVE for name in self.own.members if self.members[name].message == INACTIVE}
+        return [f"{name}, which is {how}" for name, how in sorted(why.items())]
 
     def member_failed(self, member: Announcement, now: float) -> None:
         """Handle the failure of a member: the others go to the safe state if there is a window, else the cell fails."""
@@ -326,6 +404,21 @@ class TimeMasterProtocol(MemberProtocol):
             self.fail(LatheError(why))
         else:
             self._give_up_on(member.name, why_failed(member), now)
+
+    def member_rejects(self, member: Announcement, now: float) -> None:
+        """Give up members whose blocks another member rejects; a time master that sends such blocks fails."""
+        for name, why in member.rejects.items():
+            if name == self.own.name:
+                self.fail(LatheError(f"{member.name} rejects {why}"))
+            elif name in self.completed:
+                self._give_up_on(name, f"is rejected by {member.name}: {why}", now)
+
+    def reject(self, block: BadBlock, now: float) -> None:
+        """Give up a member that has sent this time master a bad block (extends `MemberProtocol`)."""
+        if block.source in self.completed:
+            self._give_up_on(block.source, f"is rejected: {block}", now)
+        else:
+            super().reject(block, now)
 
     def member_left(self, member: Announcement, now: float) -> None:
         """Give up a member that has left when the run had begun, before it was informed of that."""
@@ -374,7 +467,7 @@ class TimeMasterProtocol(MemberProtocol):
             self.unsafe = frozenset(self.completed)
         self._say(Phase.SAFE, self.samples, self._why)
         assert self.end is not None, "a safe state has an end"
-        self._log("error", self._why)
-        self._report("safe", sample=self.samples, end=self.end, lost=sorted(self.without), why=self._why)
         self.actions.append(do.Lose(self.without, self.samples, self.end, again))
+        self._report("safe", sample=self.samples, end=self.end, lost=sorted(self.without), why=self._why)
+        self._log("error", self._why)  # last: the first log message takes some 70 ms
         self._heard = now

@@ -24,7 +24,7 @@ import scipy
 from lathe_rc import extras, files
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.signals.table import number
+from lathe_rc.signals import table
 
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 25.4e-3}
 _LENGTH = {**_LENGTHS, "": 1.0, "1": 1.0}
@@ -343,12 +343,17 @@ class Measurement:
 
 
 class _Csv(Source):
-    """CSV file: comma, semicolon or tabulator between columns; lines that start with # are comments."""
+    """CSV file in any dialect (see `lathe_rc.signals.table`); lines that start with # are comments."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        try:
+            with open(path, "rb", opener=files.open_file) as stream:
+                self._encoding = table.encoding(stream.read(_LONGEST_HEADER), path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
         self._skipped, header, first = self._beginning()
-        self._delimiter = next((mark for mark in (";", "\t") if mark in header), ",")
+        self._delimiter = table.delimiter_of(header)
         self._decimal = "," if self._delimiter != "," and "," in first else "."
         names = next(csv.reader([header], delimiter=self._delimiter), [])
         self._names = [name.strip() for name in names]
@@ -360,16 +365,14 @@ class _Csv(Source):
     def _lines(self) -> Iterator[tuple[int, str]]:
         """Yield the lines that are not empty or comments, with their numbers from 1."""
         try:
-            with open(self._path, encoding="utf-8-sig", newline=None, opener=files.open_file) as stream:
+            with open(self._path, encoding=self._encoding, newline=None, opener=files.open_file) as stream:
                 number = 0
                 while line := stream.readline(_LONGEST_HEADER):
                     number += 1
                     if line.strip() and line.lstrip()[0] != "#":
                         yield number, line.rstrip("\n")
-        except OSError as error:
-            raise InputError(f"{self._path}: cannot be read ({error.strerror}); check the path") from None
         except UnicodeDecodeError:
-            raise InputError(f"{self._path}: not a text file; allowed: CSV in UTF-8") from None
+            raise table.not_text(self._path) from None
 
     def _beginning(self) -> tuple[int, str, str]:
         """Return the number of lines up to the header, the header, and the line after it."""
@@ -382,7 +385,9 @@ class _Csv(Source):
         from pyarrow import csv as arrow_csv
 
         options = {
-            "read_options": arrow_csv.ReadOptions(column_names=self._names, skip_rows=self._skipped),
+            "read_options": arrow_csv.ReadOptions(
+                column_names=self._names, skip_rows=self._skipped, encoding=self._encoding.removesuffix("-sig")
+            ),
             "parse_options": arrow_csv.ParseOptions(delimiter=self._delimiter),
             "convert_options": arrow_csv.ConvertOptions(
                 include_columns=list(names),
@@ -391,10 +396,10 @@ class _Csv(Source):
             ),
         }
         try:
-            table = arrow_csv.read_csv(self._path, **options)
+            found = arrow_csv.read_csv(self._path, **options)
         except pa.ArrowInvalid:  # comments among the rows, or an error whose line only the second reading knows
             return self._read_by_line(names, gaps)
-        arrays = {name: table.column(name).to_numpy() for name in names}
+        arrays = {name: found.column(name).to_numpy() for name in names}
         if not all(np.isfinite(array).all() for array in arrays.values()):
             return self._read_by_line(names, gaps)
         return arrays
@@ -404,27 +409,18 @@ class _Csv(Source):
         places = [self._names.index(name) for name in names]
         lines = self._lines()
         next(lines)
-        rows = []
-        for line, text in lines:
-            try:
-                row = next(csv.reader([text], delimiter=self._delimiter, strict=True))
-            except csv.Error as error:
-                raise InputError(f"{self._path}:{line}: not CSV ({error})") from None
-            if len(row) != len(self._names):
-                decimals = " (decimals with a point)" if len(row) > len(self._names) else ""
-                raise InputError(
-                    f"{self._path}:{line}: {len(row)} values; allowed: {len(self._names)}, as in the header{decimals}"
-                )
-            point = "," if self._delimiter != "," else "."  # also if the first row has whole numbers
-            rows.append(
+        found = []
+        for line, row in table.rows(lines, self._path, self._delimiter):
+            table.check_width(self._path, line, len(row), len(self._names))
+            found.append(
                 [
                     np.nan
                     if name in gaps and row[place].strip().casefold() in _MISSING
-                    else number(row[place].replace(point, "."), self._path, line)
+                    else table.number(table.pointed(row[place], self._delimiter), self._path, line)
                     for name, place in zip(names, places, strict=True)
                 ]
             )
-        return dict(zip(names, np.array(rows).reshape(-1, len(names)).T, strict=True))
+        return dict(zip(names, np.array(found).reshape(-1, len(names)).T, strict=True))
 
 
 class _Parquet(Source):

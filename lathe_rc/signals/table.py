@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers in CSV files, with uniform error messages for all readers."""
+"""Tables of numbers in CSV files of any dialect, with uniform error messages for all readers.
 
+Encoding: UTF-8, UTF-16 with a byte order mark, otherwise Windows-1252. Between columns: semicolon or tabulator if the
+header has one, otherwise comma; numbers then have a decimal comma or a point, beside commas a point.
+"""
+
+import codecs
 import csv
 import errno
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -15,6 +20,64 @@ from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 
 
+def encoding(begin: bytes, path: Path) -> str:
+    """Return the encoding of a text file by its first bytes, which may end within a character.
+
+    Raises:
+        InputError: the file is not a text file.
+    """
+    if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(begin)
+    except UnicodeDecodeError:
+        found = "cp1252"
+    else:
+        found = "utf-8-sig"
+    if b"\0" in begin:
+        raise not_text(path)
+    return found
+
+
+def not_text(path: Path) -> InputError:
+    """Return the error for a file that is not a text file."""
+    return InputError(f"{path}: not a text file; allowed: CSV in UTF-8, UTF-16 or Windows-1252")
+
+
+def delimiter_of(header: str) -> str:
+    """Return the mark between the columns of a table with this header."""
+    return next((mark for mark in (";", "\t") if mark in header), ",")
+
+
+def pointed(text: str, delimiter: str) -> str:
+    """Return a number with a decimal point, in a table with this mark between columns."""
+    return text if delimiter == "," else text.replace(",", ".")
+
+
+def rows(lines: Iterable[tuple[int, str]], path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield line number and fields of lines with their numbers.
+
+    Raises:
+        InputError: a line is not CSV.
+    """
+    for n, line in lines:
+        try:
+            yield n, next(csv.reader([line], delimiter=delimiter, strict=True), [])
+        except csv.Error as error:
+            raise InputError(f"{path}:{n}: not CSV ({error})") from None
+
+
+def check_width(path: Path, line: int, found: int, wanted: int) -> None:
+    """Check that a row is as wide as the header.
+
+    Raises:
+        InputError: it is not.
+    """
+    if found != wanted:
+        decimals = " (between columns a semicolon, or decimals with a point)" if found > wanted else ""
+        raise InputError(f"{path}:{line}: {found} values; allowed: {wanted}, as in the header{decimals}")
+
+
 def read_text(path: Path, what: str) -> str:
     """Return the text of a CSV file; ``what`` names the content in error messages.
 
@@ -22,13 +85,19 @@ def read_text(path: Path, what: str) -> str:
         InputError: the file is missing, far too large, or not a text file.
     """
     try:
-        return files.contents(path).decode("utf-8-sig")
+        content = files.contents(path)
+        return content.decode(encoding(content, path))
     except OSError as error:
         if error.errno == errno.EFBIG:
             raise InputError(f"{path}: larger than {files.MOST // 2**20} MiB; thin the points out") from None
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path of the {what}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; allowed: CSV in UTF-8") from None
+        raise not_text(path) from None
+
+
+def lines_of(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a table that are neither empty nor comments, with their numbers from 1."""
+    return [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"]
 
 
 def number(text: str, path: Path, line: int) -> float:
@@ -75,28 +144,21 @@ def parse_table(
     Raises:
         InputError: the file is malformed, or contains a number that is not finite.
     """
-    rows: list[tuple[int, list[str]]] = []
-    for n, line in enumerate(text.splitlines(), 1):
-        if line.strip() and line.lstrip()[0] != "#":
-            try:
-                rows += [(n, row) for row in csv.reader([line], strict=True)]
-            except csv.Error as error:
-                raise InputError(f"{path}:{n}: not CSV ({error})") from None
-    header = [name.strip() for name in rows[0][1]] if rows else []
+    lines = lines_of(text)
+    delimiter = delimiter_of(lines[0][1]) if lines else ","
+    (_, names), *found = [*rows(lines, path, delimiter)] or [(0, [])]
+    header = [name.strip() for name in names]
     if header not in [list(known) for known in headers]:
         allowed = " or ".join(",".join(known) for known in headers)
-        parted = " (parted by commas, decimals with a point)" if {";", "\t"} & set("".join(header)) else ""
-        raise InputError(f"{path}: header {','.join(header)!r}; allowed: {allowed}{parted}")
+        raise InputError(f"{path}: header {delimiter.join(header)!r}; allowed: {allowed}")
     numbers = []
-    for n, row in rows[1:]:
-        if len(row) != len(header):
-            decimals = " (decimals with a point)" if len(row) > len(header) else ""
-            raise InputError(f"{path}:{n}: {len(row)} values; allowed: {len(header)}, as in the header{decimals}")
-        numbers.append([number(text, path, n) for text in row])
+    for n, row in found:
+        check_width(path, n, len(row), len(header))
+        numbers.append([number(pointed(each, delimiter), path, n) for each in row])
     if since_first and numbers:
-        first = Decimal(rows[1][1][0])
-        for taken, (_, row) in zip(numbers, rows[1:], strict=True):
-            taken[0] = float(Decimal(row[0]) - first)
+        times = [Decimal(pointed(row[0], delimiter)) for _, row in found]
+        for taken, time in zip(numbers, times, strict=True):
+            taken[0] = float(time - times[0])
     return header, np.array(numbers).reshape(-1, len(header))
 
 

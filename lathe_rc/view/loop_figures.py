@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of drives and cuts beside their loops: Bode diagrams, stability charts, and margins along a setting."""
+"""Figures of drives beside their loops: Bode diagrams, and margins along a setting."""
 
 import json
 from collections.abc import Sequence
 
 import numpy as np
 
-from lathe_rc.cell.varied_loop import Along, Chart, DriveCurve
+from lathe_rc.cell.varied_loop import Along, DriveCurve
 from lathe_rc.messages import Samples
 from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
-from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure, limit_line
-from lathe_rc.view.report_loop import diamond
+from lathe_rc.view.report_figures import BOX, colours, figure
 
 _MOST = 5  # responses of a controller
 _LOWEST, _HIGHEST = -60.0, 20.0  # [dB] ends of the axis
-_RPM = 60.0 / (2.0 * np.pi)
-_WIDER = 1.8  # fastest speed of a chart over the worst one of the first lobe
-_ABOVE = 4.0  # largest stiffness of a chart over its least limit
 
 
 def bode(drives: Sequence[DriveCurve]) -> list[Spec]:
@@ -63,43 +59,6 @@ def _over_frequency(title: str, data: Rows, labels: list[str], ends: tuple[float
         mark = {"type": "point", "filled": True, "size": 18, "clip": True}
         layer.append({"transform": [{"filter": "datum.dot"}], "mark": mark})
     return figure(260, data={"values": data}, encoding=encoding, layer=layer)
-
-
-def chatter(chart: Chart) -> Spec:
-    """Return the stability chart: stiffness of the cut over the speed, lobe by lobe."""
-    data: Rows = []
-    fastest = max([2.0 * chart.speed, *(_WIDER * speed[np.argmin(k)] for speed, k in chart.lobes[:1] if k.size)])
-    for number, (speed, stiffness) in enumerate(chart.lobes):
-        kept = (stiffness < _ABOVE * chart.limit) & (speed < fastest)
-        order = np.arange(kept.sum())
-        data += rows(n=speed[kept] * _RPM, v=stiffness[kept] * 1e-3, k=order, l="lobe", d=number)
-    top = 1.05 * max(_ABOVE * chart.limit, 0.0 if np.isnan(chart.stiffness) else chart.stiffness) * 1e-3
-    shade = colours({"lobe": LAST, "cut": FIRST}, legend=False)
-    layer: Rows = [
-        {
-            "params": [BOX],
-            "data": {"values": data},
-            "mark": {"type": "line", "clip": True, "strokeWidth": 1.6},
-            "encoding": {
-                "order": {"field": "k"},
-                "detail": {"field": "d"},
-                "color": shade,
-                "tooltip": tip(n="speed [1/min]", v="stiffness [N/mm]"),
-            },
-        },
-        *limit_line(chart.limit * 1e-3, f"no chatter at any speed below {chart.limit * 1e-3:.4g} N/mm", dy=12),
-    ]
-    if not np.isnan(chart.stiffness):
-        own = rows(n=chart.speed * _RPM, v=np.array([chart.stiffness * 1e-3]), l="cut", t="cut of the scenario")
-        layer += diamond(own, shade, align="left", dx=10)
-    return figure(
-        300,
-        encoding={
-            "x": quantity("n", "spindle speed [1/min]", scale=axis_scale(ends=(0.0, fastest * _RPM))),
-            "y": quantity("v", "cutting stiffness K [N/mm]", scale=axis_scale(ends=(0.0, top)), axis={"tickCount": 5}),
-        },
-        layer=layer,
-    )
 
 
 def strip(along: Along, value: float) -> str:

@@ -7,13 +7,11 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import numpy as np
-
 from lathe_rc import __version__, files
 from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell import part
-from lathe_rc.cell.varied_loop import Along, LoopState, Setting, VariedLoop, chatter_charts, drive_curves
+from lathe_rc.cell.varied_loop import Along, LoopState, Setting, VariedLoop, drive_curves
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead
 from lathe_rc.view import block_diagram, loop_figures, report_loop
@@ -38,15 +36,15 @@ class LoopPage:
         self._strips: dict[str, tuple[dict[str, float], Along]] = {}  # newest of each setting, with the others' values
         self._settings = {each.target: each for each in loop.settings()}
         self._charts = Charts()
-        self._state, self._cuts = loop.state({}), chatter_charts(loop.cell)
+        self._state = loop.state({})
         self._places = {name: self._charts.place(specs) for name, specs in self._figures().items()}
 
     def _figures(self) -> dict[str, list[Spec]]:
-        """Return the figures of the scenario by what they show: loops, drives and cuts."""
+        """Return the figures of the scenario by what they show: loops and drives."""
         found, drives = _loops(self._state), drive_curves(self._loop.cell)
         for name in dict.fromkeys(each.node for each in drives):
             found[f"bode {name}"] = loop_figures.bode([each for each in drives if each.node == name])
-        return found | {f"chatter {cut.node}": [loop_figures.chatter(cut)] for cut in self._cuts}
+        return found
 
     # ---- answers to the page ------------------------------------------------------------------------
 
@@ -147,15 +145,6 @@ class LoopPage:
             "place": self._place,
             "controllers": [
                 {"name": name, "loop": places.get(f"loop {name}"), "bode": places.get(f"bode {name}")} for name in names
-            ],
-            "lobes": [
-                {
-                    "name": cut.node,
-                    "places": places[f"chatter {cut.node}"],
-                    "off": cut.off,
-                    "marked": not np.isnan(cut.stiffness),
-                }
-                for cut in self._cuts
             ],
         }
 

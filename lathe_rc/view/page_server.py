@@ -38,21 +38,6 @@ _LOOSE = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Cont
 
 
 @dataclass(frozen=True)
-class Download:
-    """Answer that the browser saves as a file.
-
-    Attributes:
-        name: name of the file.
-        type: media type.
-        content: its bytes.
-    """
-
-    name: str
-    type: str
-    content: bytes
-
-
-@dataclass(frozen=True)
 class Page:
     """Page of a site; `page_server.js` and page.css are part of each.
 
@@ -69,7 +54,7 @@ class Page:
     scripts: Sequence[str] = ()
 
 
-Answer = Callable[[Mapping[str, Any]], object]  #: answer to a question of a page: JSON data, or a `Download`
+Answer = Callable[[Mapping[str, Any]], object]  #: answer to a question of a page: JSON data
 
 
 @dataclass(frozen=True)
@@ -151,9 +136,6 @@ async def _told(answer: Answer, request: Request) -> Response:
         return JSONResponse({"error": str(error)}, 400)
     except LatheError as error:
         return JSONResponse({"error": str(error)}, 500)
-    if isinstance(found, Download):
-        named = {"Content-Disposition": f'attachment; filename="{found.name}"'}
-        return Response(found.content, media_type=found.type, headers={**_LOOSE, **named})
     return JSONResponse(found, headers=_LOOSE)
 
 

@@ -483,7 +483,13 @@ $("step").addEventListener("click", () => tell("step"));
 $("restart").addEventListener("click", () => tell("change", { values: {}, here: false }));
 $("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pace").value) }); $("pace").blur(); });
 $("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
-for (const format of ["stl", "glb"]) $(format).addEventListener("click", () => tell("part", { format, enlarged: Number($("enlarged").value) }));
+function save(name, blob) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
 $("picture").addEventListener("click", async () => {
   draw(true, false);
   const picture = await drawn();

@@ -12,7 +12,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 from lathe_rc.safety import faults
-from lathe_rc.view.page_server import Answer, Download, Page, Site
+from lathe_rc.view.page_server import Answer, Page, Site
 from lathe_rc.view.pages import own_file
 from lathe_rc.view.panel_player import Player
 from lathe_rc.view.panel_run import Driver, LiveCell
@@ -100,24 +100,8 @@ def attached_site(view: View, cell: Cell, commands: Attached) -> Site:
 
 
 def _watching(view: View) -> dict[str, Answer]:
-    """Return the answers that every run has: news, and the part as a file."""
-
-    def frame(question: Mapping[str, Any]) -> object:
-        return news(view, Have.of(question), _PATIENCE)
-
-    def part(question: Mapping[str, Any]) -> object:
-        from lathe_rc.view import panel_part
-
-        ending, enlarged = _text(question, "format"), _number(question, "enlarged")
-        if not 0.0 < enlarged <= 1000.0:
-            raise InputError(f"enlarged = {enlarged:g}; allowed: above 0, up to 1000")
-        outlook = view.outlook
-        limit = outlook["tolerance"] * 2e-6 or 10e-6
-        mesh = panel_part.body(view.revolutions, outlook["radius"] * 1e-3, enlarged, limit)
-        name = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in outlook["name"])
-        return Download(f"{name}.{ending}", panel_part.TYPES.get(ending, ""), panel_part.file(mesh, ending))
-
-    return {"frame": frame, "part": part}
+    """Return the answer that every run has: news."""
+    return {"frame": lambda question: news(view, Have.of(question), _PATIENCE)}
 
 
 def _done(command: Callable[[Mapping[str, Any]], object]) -> Answer:

@@ -193,11 +193,6 @@ class View:
         self._history: list[tuple[int, float, float]] = []
 
     @property
-    def revolutions(self) -> Sequence[Revolution]:
-        """Revolutions in the map."""
-        return [row.revolution for row in self._rows]
-
-    @property
     def reached(self) -> int:
         """Sample after the newest."""
         return int(self._now.get("sample", 0))

@@ -5,6 +5,7 @@ Its Python need not have what lathe_rc needs. ROS 2 that is sourced has all of i
 public sources of ros2cli, launch and launch_ros.
 """
 
+import json
 import os
 import re
 import shutil
@@ -60,6 +61,44 @@ def test_two_included_cells_are_in_the_namespaces_that_are_pushed_and_end():
     for bag, namespace in (("right_bag", "/shop"), ("left_bag", "/shop/left")):
         recording = reader.read_bag(Path(bag))
         assert all(topic.startswith(f"{namespace}/") for topic in recording.dense)
+
+
+def signalled(line, number, *, group, pids):
+    """Exit code and output of a launch of an endless cell, signalled at a line; ``group``: as Ctrl-C does."""
+    command = [ROS2, "launch", "lathe_rc", "cell.launch.py", "bag:=bag", "spindle_encoder.revolutions:=0.0"]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    ) as launch:
+        said = ""
+        for text in launch.stdout:
+            said += text
+            pids |= {
+                name: int(pid) for name, pid in re.findall(r"\[(\w+)-\d\]: process started with pid \[(\d+)\]", text)
+            }
+            if re.search(line, text):
+                line = "(?!)"
+                os.killpg(launch.pid, number) if group else os.kill(pids["tool"], number)
+        return launch.wait(), said
+
+
+def test_ctrl_c_ends_an_endless_cell_with_a_whole_bag_and_no_error():
+    code, said = signalled("begins with", signal.SIGINT, group=True, pids={})
+    assert code == 0
+    assert said.count("process has finished cleanly") == 5
+    assert not re.search("ERROR|Traceback|died", said)
+    assert reader.read_bag(Path("bag")).digests() == json.loads(Path("bag", "digests.json").read_text())["digest"]
+
+
+@pytest.mark.parametrize("line", [r"tool-\d]: process started", r"tool]: unconfigured"])
+def test_a_member_that_a_signal_ends_before_the_run_ends_the_others(line):
+    code, said = signalled(line, signal.SIGTERM, group=False, pids={})
+    assert code == 1
+    assert re.search(r"tool-\d (was killed by SIGTERM|ended with exit code 143)", said)
 
 
 DICTIONARY = """

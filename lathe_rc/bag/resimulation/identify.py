@@ -21,6 +21,7 @@ from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator,
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
 
+_BEYOND = ("mode_frequency", "lag_time")  # parameters of which the identified model has none
 _FORM_POINTS = 720
 
 
@@ -47,7 +48,8 @@ def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
     """Identify the electrodynamic drives of a scenario or, without a scenario, the drive on the default topics.
 
     Raises:
-        InputError: there is no such drive, the bag lacks its command or position, or the signals are insufficient.
+        InputError: there is no such drive, it is not of second order with a gain of 1, the bag lacks its command or
+            position, or the signals are insufficient.
         LatheError: samples are missing or not finite.
     """
     kind = ElectrodynamicActuator.kind
@@ -64,6 +66,14 @@ def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
 
 def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool) -> Identified:
     assert isinstance(table, ElectrodynamicActuatorParameters), "of_kind() says so"
+    beyond = {"gain": table.gain} if table.gain != 1.0 else {}
+    beyond |= {name: values for name in _BEYOND if (values := getattr(table, name))}
+    if known and beyond:
+        has = ", ".join(f"{name} = {value}" for name, value in beyond.items())
+        raise InputError(
+            f"--identify: {node} has {has}; allowed: a drive of second order with a gain of 1 (lathe fit drive "
+            f"{recorded.path} fits the others, too)"
+        )
     names = {what: remapped(table, f"coarse/{what}") for what in ("command", "state")}
     command = recorded.find(names["command"], messages.COMMAND)
     state = recorded.find(names["state"], messages.STATE)

@@ -36,7 +36,6 @@ from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.cell.stages.drive import BoundedParameters, Drive
 from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.cell.stages.obedience import Obedience, Obedient
-from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Takeover
 from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.extensions import code_of_others
@@ -354,7 +353,6 @@ class Learner(Obedient):
         parameters = self.parameters
         if not parameters.reaction_delay:
             return None
-        bounded.prepare()
         bounds = parameters.bounds()
         reach = bounds.reach(parameters.retract_time)
         takeover = Takeover(bounds, parameters.retract_position, parameters.step, reach=reach)

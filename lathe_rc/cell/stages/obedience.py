@@ -11,7 +11,6 @@ from lathe_rc import messages
 from lathe_rc.arrays import Array, Integers
 from lathe_rc.cell.parameters import ObedientParameters, Positive, parameter
 from lathe_rc.cell.stage import Input, Sparse, Stage
-from lathe_rc.control import bounded
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -63,8 +62,6 @@ class FeedObedientParameters(ObedientParameters):
                 f"in that, and from one end of command_limit to the other it is {needed:.3g}; allowed: a longer "
                 "stop_time, or larger rates"
             )
-        if self.reaction_delay:
-            bounded.prepare()
         rest = Mode.RETRACT if speed else Mode.HOLD
         takeover = Takeover(bounds, 0.0, self.step, reach=reach, carries=False)
         return Obedience(name, takeover, settled=settled, hold=rest, retract=rest)

@@ -2,7 +2,7 @@
 """Queue of the blocks of one topic that a node reads: checked, and in order."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import astuple, replace
 from typing import Any
 
@@ -15,8 +15,11 @@ from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.nodes.exchange import Run
-from lathe_rc.protocol import BlockOrder, ForeignMessage
+from lathe_rc.protocol.block_order import BlockOrder
+from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.messages import ForeignMessage
+
+_QUIET = 1.0  # [s] after which the last blocks of a device that loses blocks count as lost
 
 
 class BlockQueue(BlockOrder):
@@ -31,17 +34,20 @@ class BlockQueue(BlockOrder):
     Attributes:
         blocks: checked blocks, not used yet.
         inside: the blocks come from a node of this process.
+        run_end: returns the end of the run [sample]; None while it is not known.
     """
 
     def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
         self._limit, self._size = 8 * signal_depth(parameters), parameters.block_size
         super().__init__(topic, parameters.run_id, None if parameters.window else self._limit * self._size)
-        self.type = msgtype
+        self.type, self.lossy = msgtype, not parameters.window and topic in parameters.volatile_inputs
+        self._quiet = (0, 0.0)  # end of the newest block, and the monotonic time at which it was first seen
         self.blocks: deque[Block] = deque()
         self.inside = False
+        self.run_end: Callable[[], int | None] = lambda: None
         self._decoder = Decoder(msgtype, fields, self.admit)
         self._decoder.prepare()
-        self._step_ns = parameters.step_ns
+        self._step_ns, self._window = parameters.step_ns, parameters.window
         self._newest: Block | None = None
 
     def expect(self, source: str, first: int | None = 0) -> None:
@@ -50,29 +56,40 @@ class BlockQueue(BlockOrder):
         self.blocks.clear()
         self._newest = None
 
-    def add(self, data: bytes) -> Block | None:
+    def add(self, data: bytes, sender: str = "") -> Block | None:
         """Check and queue an encoded block; return None for a repeat, or if a held block (see `hold`) replaces it.
 
+        Args:
+            data: the encoded block.
+            sender: node that has published it, as DDS knows it; empty: not known.
+
         Raises:
-            ForeignMessage: the block has another source or run id, or the message is not a block.
-            LatheError: wrong step, time stamp that does not match the samples, gap, repeat, arrays of different
-                lengths, or far more waiting blocks than the window allows.
+            ForeignMessage: the block has another source, sender or run id, or the message is not a block.
+            BadBlock: wrong step or length, time stamp that does not match the samples, numbers that are not finite,
+                gap, repeat, wrong end of the run, or far more waiting blocks than the window allows.
+            LatheError: far more waiting blocks in a free-running cell.
         """
-        if self.held_from is not None:
+        if self.ignores:
             return None
         try:
             block = self._decoder.decode(data)
+            self.admit(block.run_id, block.source)
+            if sender not in ("", block.source):
+                raise ForeignMessage(self.topic, block.source, block.run_id, f"it is from {sender}")
+            self._decoder.check()
         except NoBlockError as error:
             raise ForeignMessage(self.topic, "", "", str(error)) from None
         except ValueError as error:
-            raise LatheError(f"{self.topic}: {error}") from None
-        return self.accept(block)
+            if sender not in ("", self.source):
+                raise ForeignMessage(self.topic, self.source, self._run_id, f"it is from {sender}") from None
+            raise self.reject(self.source, str(error)) from None
+        return self._queue(block)
 
     def take(self, run: Run) -> None:
-        """Queue blocks that a node of this process has handed over.
+        """Queue blocks that a node of this process has handed over, which has checked their numbers.
 
         Raises:
-            LatheError: see `add`.
+            BadBlock, LatheError: see `add`.
         """
         if self.open or run.block.first_index != self.end:
             for each in run.blocks(self._size):
@@ -87,29 +104,57 @@ class BlockQueue(BlockOrder):
         return self._decoder.message
 
     def accept(self, block: Block) -> Block | None:
-        """Check a decoded block and queue it (see `add`)."""
+        """Check a decoded block of finite numbers and queue it (see `add`)."""
         self.admit(block.run_id, block.source)
-        if block.step_ns != self._step_ns:
-            raise LatheError(f"{self.topic}: {block.source} has a step of {block.step_ns} ns; expected {self._step_ns}")
-        if block.samples > self._size:
-            raise LatheError(
-                f"{self.topic}: {block.source} sends {block.samples} samples in a block; expected {self._size} at most"
-            )
-        stamp = messages.START_NS + (block.first_index + block.samples - 1) * self._step_ns
-        if block.log_ns != stamp:
-            raise LatheError(
-                f"{self.topic}: {block.source} stamps the block from sample {block.first_index} on with "
-                f"{block.log_ns} ns; expected {stamp} ns, the time of its last sample"
-            )
+        return self._queue(block)
+
+    def _queue(self, block: Block) -> Block | None:
+        if self.ignores:
+            return None
+        if why := self._fault(block):
+            raise self.reject(block.source, f"{block.source} {why}")
         missing = self.missing(block.source, block.first_index, block.samples)
         if missing is None:
             return None
         if missing:  # a free-running cell holds the last sample, and counts the lost blocks
-            for held in self._held(self._last(), self.end, block.first_index):
-                self.blocks.append(held)
-                self.received += 1
-                self.lost += 1
+            self._lose(block.first_index)
         return self._append(block)
+
+    def _lose(self, end: int, *, last: bool = False) -> None:
+        """Hold and count the lost blocks of a free-running cell, which end before sample ``end``."""
+        self.lost_from = self.end if self.lost_from is None else self.lost_from
+        for held in self._held(self._last(), self.end, end):
+            held.last = last and held.first_index + held.samples == end
+            self.blocks.append(held)
+            self.received += 1
+            self.lost += 1
+
+    def end_at(self, end: int, now: float) -> None:
+        """Hold the newest sample up to the end of the run once a device that loses blocks is quiet; ``now`` [s]."""
+        if not self.lossy or self.ended:
+            return
+        if self._quiet[0] != self.end or not self._quiet[1]:
+            self._quiet = (self.end, now)
+        elif now - self._quiet[1] > _QUIET:
+            self._lose(end, last=True)
+            self.hold(end)
+
+    def _fault(self, block: Block) -> str:
+        """Return what is wrong with a block by itself; empty if nothing is."""
+        if block.step_ns != self._step_ns:
+            return f"has a step of {block.step_ns} ns; expected {self._step_ns}"
+        if block.samples > self._size or (block.samples < self._size and not block.last):
+            return f"sends {block.samples} samples in a block; expected {self._size}, fewer only at the end of the run"
+        end = block.first_index + block.samples
+        stamp = messages.START_NS + (end - 1) * self._step_ns
+        if block.log_ns != stamp:
+            return (
+                f"stamps the block from sample {block.first_index} on with {block.log_ns} ns; expected {stamp} ns, the "
+                "time of its last sample"
+            )
+        if (run_end := self.run_end()) is not None and block.last != (end >= run_end):
+            return f"{'ends the run at' if block.last else 'goes on after'} sample {end}; it ends at {run_end}"
+        return ""
 
     def until(self, end: int) -> Iterator[Block]:
         """Remove and yield the queued samples before ``end``."""
@@ -180,5 +225,13 @@ class BlockQueue(BlockOrder):
         self._newest = block
         self.blocks.append(block)
         if len(self.blocks) > self._limit:
-            raise LatheError(f"{self.topic}: {len(self.blocks)} blocks wait; the node cannot keep up")
+            why = f"{len(self.blocks)} blocks wait; the node cannot keep up"
+            raise self.reject(block.source, why) if self._window else LatheError(f"{self.topic}: {why}")
         return block
+
+
+def explain_losses(node: str, queues: Collection[BlockQueue]) -> str:
+    """Say how many blocks of a free-running cell a node has lost, and from which sample on; empty if none."""
+    lost = [f"{queue.lost} of {queue.topic} from sample {queue.lost_from} on" for queue in queues if queue.lost]
+    total = sum(queue.lost for queue in queues)
+    return f"{node}: lost {total} blocks of a free-running cell: {', '.join(lost)}" if lost else ""

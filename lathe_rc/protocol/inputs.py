@@ -4,12 +4,13 @@
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 
+from lathe_rc import messages
 from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays, past_of
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import Input
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.nodes.block_queue import BlockQueue
+from lathe_rc.protocol.block_queue import BlockQueue
 
 
 class Inputs:
@@ -24,12 +25,12 @@ class Inputs:
         ports: see the arguments.
         queues: block queue of each topic.
         forward: queues of the inputs whose block k is needed for block k of the outputs; all other inputs are feedback.
-        reach: sample up to which the stage may compute if no input limits it; None: no limit.
+        pace: blocks of the time master that limit the stage if no input does; None: they do not.
     """
 
     def __init__(self, ports: Sequence[tuple[str, Input]], parameters: NodeParameters, together: int) -> None:
         self.ports = ports
-        self._size, self._window = parameters.block_size, parameters.window
+        self._parameters, self._size, self._window = parameters, parameters.block_size, parameters.window
         self.queues: dict[str, BlockQueue] = {}
         self.buffers: dict[str, DelayBuffer] = {}
         for topic, port in ports:
@@ -37,7 +38,7 @@ class Inputs:
             self.queues[topic] = BlockQueue(topic, port.type, parameters, sorted(delays))
             self.buffers[topic] = DelayBuffer(port.type, delays, together * self._size)
         self._shared: list[BlockQueue] = []
-        self.reach: int | None = None
+        self.pace: BlockQueue | None = None
         self.wire()
 
     def wire(self, without: Collection[str] = ()) -> None:
@@ -99,8 +100,9 @@ class Inputs:
             # The block may be needed much later, but unread messages would pile up until DDS drops them.
             if in_cell and self._window and queue.received + self._window < blocks:
                 return None
-        if self.reach is not None:
-            end = min(end, self.reach)
+        if self.pace is not None:
+            self.pace.blocks.clear()
+            end = min(end, self.pace.end)
         for queue, buffer, delay in self._delayed:
             _load(queue, buffer, end - delay)
             end = min(end, buffer.end + delay)
@@ -140,6 +142,23 @@ class Inputs:
         _load(queue, buffer, first + samples - delay)
         return buffer.view(first - delay, samples)
 
+    def lose(self, lost: Collection[str], end: int) -> bool:
+        """Hold the newest samples of lost sources up to ``end``; return True if no input limits the stage any more.
+
+        The stage then has to `follow` the time master: it would compute up to the end at once.
+        """
+        for queue in self.queues.values():
+            if queue.source in lost and queue.held_from is None:
+                queue.hold_newest(end)
+        return bool(self.forward) and all(queue.held_from is not None for queue in self.forward) and self.pace is None
+
+    def follow(self, topic: str, master: str, first: int) -> BlockQueue:
+        """Limit the stage to the time master's blocks from sample ``first`` on; return the queue that takes them."""
+        self.pace = BlockQueue(topic, messages.ENCODER, self._parameters, [])
+        self.pace.expect(master, first)
+        self.pace.repeats = True
+        return self.pace
+
     # ---- in a chain ---------------------------------------------------------------------------------
 
     def join_chain(self, inside: Collection[str]) -> None:
@@ -169,8 +188,5 @@ def _load(queue: BlockQueue, buffer: DelayBuffer, until: int) -> None:
     """Move queued blocks into the topic's buffer up to sample ``until``, as far as blocks have arrived."""
     while buffer.end < until and queue.blocks:
         block = queue.blocks.popleft()
-        try:
-            # The publisher of a block in this process has checked it.
-            block.copy_to(buffer.extend(block.samples), check=not queue.inside)
-        except ValueError as error:
-            raise LatheError(f"{queue.topic}: {error}") from None
+        for name, array in buffer.extend(block.samples).items():
+            array[:] = block.signals[name]
