@@ -76,11 +76,11 @@ class PluginRegistry(Mapping[str, V], Generic[V]):
         return self._found[name]
 
     def _import(self, name: str) -> Any:
-        module, colon, attribute = name.partition(":")
+        module, colon, place = name.partition(":")
         if colon:
-            return _attribute(module, attribute, f"{self._what} {shown(name)!r}")
+            return attribute(module, place, f"{self._what} {shown(name)!r}")
         point = _offered(self.group)[name]
-        return _attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
+        return attribute(point.module, point.attr, f"{self._what} {name!r} of {_distribution(point.dist)}")
 
     def permits(self, name: str) -> bool:
         """Return whether a name may be looked up; a location must be offered by a package or allowed by the user."""
@@ -175,7 +175,17 @@ def code_of_others(what: str) -> Iterator[None]:
         raise InputError(f"{what}: {type(error).__name__} in {where}: {shown(error)}") from error
 
 
-def _attribute(module: str, attribute: str, what: str) -> Any:
+def attribute(module: str, name: str, what: str) -> Any:
+    """Import an object of a third-party module.
+
+    Args:
+        module: the module.
+        name: name of the object in it.
+        what: the object in words, for messages.
+
+    Raises:
+        InputError: the module cannot be imported, or has no such object.
+    """
     try:
         with allowed_code.importing(module):
             found = importlib.import_module(module)
@@ -186,9 +196,9 @@ def _attribute(module: str, attribute: str, what: str) -> Any:
                 f"; allowed: install it, or {allowed_code.OPTION} {shown(error.name)} if it lies in the current folder"
             )
         raise InputError(told) from error
-    for part in attribute.split("."):
+    for part in name.split("."):
         if not hasattr(found, part):
-            raise InputError(f"{what}: {module} has no {attribute!r}")
+            raise InputError(f"{what}: {module} has no {name!r}")
         found = getattr(found, part)
     return found
 

@@ -407,7 +407,7 @@ class TestPage:
 
 def test_the_docs_name_every_column():
     text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
-    columns = row.schema({}, []).names
+    columns = row.schema({}, [], []).names
     assert [name for name in columns if f"`{name}`" not in text] == []
 
 

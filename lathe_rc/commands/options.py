@@ -2,8 +2,9 @@
 """Arguments and options shared by several commands; this module imports only Click."""
 
 from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import click
 
@@ -100,6 +101,46 @@ length = click.option("--revolutions", type=POSITIVE, help="length of each run")
 # --- sweep and tuning
 
 tie = of_targets("--tie", metavar="NODE.PARAM=FORMULA", help="such as fine_controller.q_time*1.1")
+
+
+class Sampling(NamedTuple):
+    """Sample of ranges and distributions, as the options of `sampling` give it.
+
+    Attributes:
+        sample: sampler and number of points.
+        seed: random seed.
+        correlated: texts ``TARGET,TARGET=NUMBER``.
+    """
+
+    sample: str
+    seed: int
+    correlated: tuple[str, ...]
+
+
+def sampling(command: F) -> F:
+    """Add the options of a sample to a command, which gets them as ``sampling``."""
+
+    @wraps(command)
+    def with_sampling(sample: str, sample_seed: int, correlate: tuple[str, ...], **more: Any) -> Any:
+        return command(sampling=Sampling(sample, sample_seed, correlate), **more)
+
+    own = [
+        click.option(
+            "--sample",
+            default="",
+            metavar="SAMPLER:N",
+            help="points of ranges LOW:HIGH and of laws: sobol, halton, latin, random, saltelli",
+        ),
+        click.option("--sample-seed", type=click.IntRange(0), default=0, show_default=True, help="of the sample"),
+        click.option(
+            "--correlate", multiple=True, metavar="TARGET,TARGET=NUMBER", help="correlation of two drawn parameters"
+        ),
+    ]
+    found: Any = with_sampling
+    for option in reversed(own):
+        found = option(found)
+    return cast("F", found)
+
 
 seeds = click.option(
     "--seeds", type=click.IntRange(1), default=1, show_default=True, help="each cell with so many seeds"

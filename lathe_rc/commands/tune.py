@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from lathe_rc.sweep.tuning import Trial, Tuning
 
-_LAWS = ("normal:", "uniform:")
 _STEPS = 5  # number of displayed steps of the history
 
 
@@ -33,16 +32,16 @@ _STEPS = 5  # number of displayed steps of the history
     multiple=True,
     metavar="COLUMN",
     help=f"as small as it can be, -COLUMN: as large: {', '.join(NUMBERS)}, NODE.FIGURE or TOPIC.FIELD:STATISTIC "
-    "as of --measure; repeatable",
+    "as of --measure, or a formula of these; repeatable",
 )
-@click.option("--subject", "subjects", multiple=True, metavar="COLUMN>=NUMBER", help="also <=; has to be met")
+@click.option("--subject", "subjects", multiple=True, metavar="COLUMN>=NUMBER", help="also <=, and formulas of columns")
 @options.of_targets(
     "--over",
     metavar="NODE.PARAM=LAW",
     help="plants and spindles that the goal is over: ranges, lists and laws as of lathe sweep --vary and --draw",
 )
 @options.tie
-@click.option("--sample", default="", metavar="SAMPLER:N", help="points of --over: sobol, halton, latin, random")
+@options.sampling
 @options.seeds
 @click.option("--worst", is_flag=True, help="of --over the worst counts (default)")
 @click.option("--percentile", type=float, help="of --over this percentile counts, such as 95")
@@ -65,7 +64,7 @@ def tune(
     goals: tuple[str, ...],
     over: tuple[str, ...],
     tie: tuple[str, ...],
-    sample: str,
+    sampling: options.Sampling,
     seeds: int,
     percentile: float | None,
     trials: int,
@@ -85,6 +84,7 @@ def tune(
     from lathe_rc.commands import scenario as scenarios
     from lathe_rc.commands.progress import SweepWatch
     from lathe_rc.sweep import history
+    from lathe_rc.sweep.distributions import is_law
 
     check_crew(scheduler, workers)
     if worst and percentile is not None:
@@ -92,7 +92,7 @@ def tune(
     if (worst or percentile is not None) and not over and seeds == 1:
         raise InputError(f"{'--worst' if worst else '--percentile'} of one cell; allowed: with --over or --seeds")
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
-    drawn = [text for text in over if text.partition("=")[2].strip().startswith(_LAWS)]
+    drawn = [text for text in over if is_law(text.partition("=")[2].strip())]
     varied = [text for text in over if text not in drawn]
     place = out or Path(f"tune-{loaded.name}")
     with SweepWatch(place, trials=trials, quiet=as_json) as watch:
@@ -101,7 +101,7 @@ def tune(
             pairs("--free", free, "NODE.PARAM=LOW:HIGH, =LOW:HIGH:log or =A,B,C"),
             goals,
             place,
-            over=space_of(varied, drawn, tie, sample, seeds, None),
+            over=space_of(varied, drawn, tie, seeds, sampling),
             percentile=100.0 if percentile is None else percentile,
             trials=trials,
             ask_formulas=not no_formulas,
@@ -142,7 +142,7 @@ def _show(tuning: "Tuning", picture: Path) -> None:
         reasons = Counter(filter(None, tuning.folder.table(["reason"]).column("reason").to_pylist()))
         for reason, count in reasons.most_common(1):
             out.print(f"{count} cells did not run to their end, as this one: {reason}")
-    out.print(f"history: {picture}, {picture.with_suffix('.html')}")
+    out.print(f"history: {picture}")
     shown = best or start
     out.print(f"rows:    lathe sweep show {folder} --cell {shown.number * tuning.cells if shown else 0}")
 

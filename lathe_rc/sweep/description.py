@@ -31,6 +31,11 @@ class Target:
     unit: str
     value: Value
 
+    @property
+    def is_number(self) -> bool:
+        """Whether the value is one number."""
+        return self.type in ("int", "float") and not self.is_list
+
 
 @dataclass(frozen=True)
 class Description:

@@ -34,7 +34,7 @@ from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.sweep import inputs, row
+from lathe_rc.sweep import NUMBERS, inputs, row
 from lathe_rc.sweep.description import Description, describe
 from lathe_rc.sweep.row import Measure
 from lathe_rc.sweep.space import Space
@@ -172,12 +172,14 @@ class Folder:
                 raise InputError(f"{path} holds {_difference(there.tuning, tuning)}; allowed: a new folder")
         if space is not None and (space := Space(**space.to_json())) not in spaces:
             spaces.append(space)
-        used = inputs.of_spaces(scenario, [*spaces, *([tuning.over] if tuning else [])], tuning.free if tuning else {})
+        used = inputs.of_cell(scenario, measures)
+        used |= inputs.of_spaces(scenario, [*spaces, *([tuning.over] if tuning else [])], tuning.free if tuning else {})
         if not new and (differing := inputs.changes(there.inputs, used)):
             raise InputError(f"{path}: {differing[0]}; allowed: as it was, or a new folder")
         # scenario.yaml is written first: a folder with a sweep.json is complete.
         contents = _Contents(_FORMAT, scenario.name, scenario.identity, list(measures), spaces, tuning)
         about = describe(scenario, _targets(spaces, tuning), measures)
+        row.schema(about.targets, _carried(spaces), measures)  # rejects a carried column of that name
         told = asdict(replace(contents, description=about, inputs=used))
         with writing(path):
             if new:
@@ -205,10 +207,21 @@ class Folder:
         """Parameters that differ between the cells."""
         return _targets(self.spaces, self.tuning)
 
+    @property
+    def numbers(self) -> list[str]:
+        """Columns of numbers that a goal can have."""
+        targets = (name for name, target in self.description.targets.items() if target.is_number)
+        return [*NUMBERS, *(each.name for each in self.measures), *targets]
+
+    @property
+    def carried(self) -> list[str]:
+        """Columns of given cells that are no parameters."""
+        return _carried(self.spaces)
+
     @cached_property
     def schema(self) -> pa.Schema:
         """Arrow schema of the rows."""
-        return row.schema(self.description.targets, self.measures)
+        return row.schema(self.description.targets, self.carried, self.measures)
 
     def versions(self) -> dict[str, str]:
         """Return the version of lathe_rc that computed each cell, by key."""
@@ -339,6 +352,10 @@ def _targets(spaces: Sequence[Space], tuning: Request | None) -> list[str]:
     tuned = tuning.targets if tuning else ()
     named = [*tuned, *(target for space in spaces for target in space.targets())]
     return [target for target in dict.fromkeys(named) if target != "seed"]
+
+
+def _carried(spaces: Sequence[Space]) -> list[str]:
+    return list(dict.fromkeys(name for space in spaces for name in space.carried))
 
 
 def _given(values: dict[str, Any]) -> dict[str, Value]:

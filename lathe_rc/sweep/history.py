@@ -7,11 +7,9 @@ from typing import Any, cast
 
 import altair as alt
 
-from lathe_rc import __version__
 from lathe_rc.sweep.folder import writing
 from lathe_rc.sweep.row import unit
 from lathe_rc.sweep.tuning import Tuning
-from lathe_rc.view.charts import Charts, page_template
 
 _WIDTH, _HEIGHT = 560, 300
 _START, _FEASIBLE, _OTHER, _BEST = "#e08e0b", "#2f8fb0", "#8f979b", "#c0392b"
@@ -91,36 +89,15 @@ def _scale(rows: list[dict[str, Any]], name: str) -> alt.Scale:
 
 
 def write(tuning: Tuning) -> Path:
-    """Write the figure into the tuning's folder: history.png, and an interactive history.html that works offline.
+    """Write the figure into the tuning's folder as history.png.
 
     Returns:
         The path of the PNG.
 
     Raises:
-        LatheError: the files cannot be written.
+        LatheError: the file cannot be written.
     """
-    made, folder = chart(tuning), tuning.folder.path
-    with writing(folder):
-        made.save(str(folder / "history.png"), scale_factor=2.0)
-        (folder / "history.html").write_text(_page(tuning, made), encoding="utf-8")
-    return folder / "history.png"
-
-
-def _page(tuning: Tuning, made: alt.LayerChart) -> str:
-    """Return the page: the figure in the page's colours, and a table of start, best trial and formulas."""
-    spec, charts = made.to_dict(), Charts()
-    charts.data.update(spec.pop("datasets", {}))
-    spec.pop("config", None)
-    charts.add("history", {"": {**spec, "autosize": {"type": "fit-x", "contains": "padding"}}})
-    columns, values, results = tuning.compared()
-    return page_template(Path(__file__).with_name("history.html.j2")).render(
-        title=f"Tuning of {tuning.folder.scenario.name}",
-        charts=charts,
-        columns=columns,
-        rows=[*values, *results],
-        best=tuning.best,
-        front=[[str(trial.number), *tuning.results(trial).values()] for trial in tuning.front],
-        front_columns=["trial", *(tuning.results(tuning.front[0]) if tuning.front else ())],
-        folder=tuning.folder.path,
-        version=__version__,
-    )
+    path = tuning.folder.path / "history.png"
+    with writing(tuning.folder.path):
+        chart(tuning).save(str(path), scale_factor=2.0)
+    return path

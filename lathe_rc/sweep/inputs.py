@@ -17,6 +17,7 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario, content
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import source_hash
+from lathe_rc.sweep.row import Measure
 from lathe_rc.sweep.search_space import search_space
 from lathe_rc.sweep.space import Space, axis
 
@@ -25,9 +26,10 @@ Inputs = Mapping[str, str]  #: hash by ``package.module:Class`` or path
 _SHOWN = 12  # displayed characters of a hash
 
 
-def of_cell(scenario: Scenario) -> dict[str, str]:
-    """Return the third-party classes of a cell and the files that it reads."""
+def of_cell(scenario: Scenario, measures: Iterable[Measure] = ()) -> dict[str, str]:
+    """Return the third-party classes of a cell, the files that it reads, and the functions that measure it."""
     found = {name: str(origin["source"]) for name, origin in origins_of(scenario.nodes).items()}
+    found |= {each.name: source_hash(each.name.partition(":")[0]) for each in measures if not each.topic}
     for table in scenario.nodes.values():
         for row in type(table).rows().values():
             if row.is_path and (path := str(getattr(table, row.name))):
@@ -65,7 +67,7 @@ def of_spaces(scenario: Scenario, spaces: Iterable[Space], free: Mapping[str, st
                 if names_inputs(scenario, target):
                     yield from ((target, value) for value in axis(scenario, target, told))
             for cell in space.given:
-                yield from cell.items()
+                yield from ((target, value) for target, value in cell.items() if target not in space.carried)
 
     found = of_cell(scenario)
     for target, value in values():

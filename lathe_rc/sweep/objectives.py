@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objectives of a tuning: goals, constraints, and the percentile of the cells that counts.
 
-A goal is a column of a row (`lathe_rc.sweep.row`) to be minimised, or to be maximised if a minus precedes it. A
-constraint is a limit of a column. With several cells (plants and spindles), the worst one or a percentile counts. A
-cell with the status refused, diverged or failed has an infinite cost.
+A goal is a column of a row (`lathe_rc.sweep.row`) or a formula of columns to be minimised; a column is maximised if a
+minus precedes it. A constraint is a limit of a column or of a formula. With several cells (plants and spindles), the
+worst one or a percentile counts. A cell with the status refused, diverged or failed has an infinite cost.
 """
 
 import math
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
 
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.learner import Learner
@@ -20,29 +22,44 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS, OF_LEARNING, row
+from lathe_rc.sweep.expression import Expression
 from lathe_rc.sweep.row import Measure
 
 _CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
 
 
 class Goal(NamedTuple):
-    """Goal of a tuning: a column that is minimised, or maximised if ``largest``."""
+    """Goal of a tuning: a column or a formula of columns that is minimised, or maximised if ``largest``."""
 
-    column: str
+    formula: Expression
     largest: bool
+
+    @property
+    def column(self) -> str:
+        """Column or formula as text."""
+        return self.formula.text
 
     @property
     def sign(self) -> float:
         """Sign of the column in the cost; the cost is minimised."""
         return -1.0 if self.largest else 1.0
 
+    def values(self, table: pa.Table) -> NDArray[np.float64]:
+        """Return the value in each row of a table, shape (n,); NaN where there is none."""
+        return self.formula.numbers(table)
+
 
 class Constraint(NamedTuple):
-    """Constraint of a tuning: a lower limit of a column if ``below``, else an upper limit."""
+    """Constraint of a tuning: a lower limit of a column or of a formula if ``below``, else an upper limit."""
 
-    column: str
+    formula: Expression
     below: bool
     bound: float
+
+    @property
+    def column(self) -> str:
+        """Column or formula as text."""
+        return self.formula.text
 
     def violation(self, value: float) -> float:
         """Return the violation relative to the limit; 0 or negative if the value is within the limit."""
@@ -88,7 +105,8 @@ class Objectives:
     @property
     def columns(self) -> list[str]:
         """Columns needed to compute a score."""
-        named = [goal.column for goal in self.goals] + [limit.column for limit in self.constraints]
+        formulas = [goal.formula for goal in self.goals] + [limit.formula for limit in self.constraints]
+        named = [name for formula in formulas for name in formula.names]
         return list(dict.fromkeys(["status", "margin", *named]))
 
     def score(self, rows: Iterable[Mapping[str, Any]]) -> Score:
@@ -111,21 +129,17 @@ class Objectives:
         return float(np.percentile(list(values), self.percentile, method="inverted_cdf"))
 
 
-def _known(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
-
-
 def _cost(cell: Mapping[str, Any], goal: Goal) -> float:
-    value = cell[goal.column]
-    return goal.sign * value if cell["status"] == row.DONE and _known(value) else math.inf
+    value = goal.formula.number(cell)
+    return goal.sign * value if cell["status"] == row.DONE and math.isfinite(value) else math.inf
 
 
 def _stops(cell: Mapping[str, Any], goals: Sequence[Goal]) -> float:
     """Return the violation of completing the run with all goals; for an unstable refused cell, its negative margin."""
     if cell["status"] == row.DONE:
-        return 0.0 if all(_known(cell[goal.column]) for goal in goals) else 1.0
+        return 0.0 if all(math.isfinite(goal.formula.number(cell)) for goal in goals) else 1.0
     margin = cell["margin"]
-    return -margin if _known(margin) and margin < 0.0 else 1.0
+    return -margin if margin is not None and margin < 0.0 else 1.0
 
 
 def _violation(cell: Mapping[str, Any], limit: Constraint) -> float:
@@ -133,8 +147,8 @@ def _violation(cell: Mapping[str, Any], limit: Constraint) -> float:
 
     A refused cell may have a margin; other missing values of an incomplete cell are already covered by `_stops`.
     """
-    value = cell[limit.column]
-    if _known(value):
+    value = limit.formula.number(cell)
+    if math.isfinite(value):
         return limit.violation(value)
     return 0.0 if cell["status"] != row.DONE else 1.0
 
@@ -151,8 +165,9 @@ def objectives(
 
     Args:
         scenario: scenario to be tuned.
-        goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE``.
-        constraints: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
+        goals: ``COLUMN`` or ``-COLUMN``; a column may be ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE``; or a formula of
+            columns that is minimised, in which columns with other characters stand in quotes.
+        constraints: ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``, also with a formula of columns.
         measures: further columns.
         percentile: see `Objectives`.
 
@@ -163,13 +178,14 @@ def objectives(
         raise InputError(f"no goal; allowed: --goal COLUMN, of {', '.join(NUMBERS)} or TOPIC.FIELD:STATISTIC")
     if not 0.0 < percentile <= 100.0:
         raise InputError(f"percentile {percentile:g}; allowed: above 0 up to 100, which is the worst")
-    wanted = [Goal(text.strip().removeprefix("-"), text.strip().startswith("-")) for text in goals]
+    wanted = [goal(text) for text in goals]
     limits = [_constraint(text) for text in constraints]
     measured = dict.fromkeys(row.measure(text, scenario) for text in measures)
     cell = Cell(scenario.nodes)
     learns = any(isinstance(stage, Learner) for stage in cell.stages.values())
     has_tool, of_loops = row.has_tool(scenario), row.figures(scenario)
-    for what, column in [("goal", goal.column) for goal in wanted] + [("subject", limit.column) for limit in limits]:
+    used = [("goal", goal.formula) for goal in wanted] + [("subject", limit.formula) for limit in limits]
+    for what, column in ((what, name) for what, formula in used for name in formula.names):
         if ":" in column or column in of_loops:
             measured[row.measure(column, scenario)] = None
         elif column not in NUMBERS:
@@ -187,6 +203,54 @@ def objectives(
     return Objectives(wanted, limits, percentile, list(measured))
 
 
+def goal(text: str) -> Goal:
+    """Parse a goal, ``COLUMN``, ``-COLUMN`` or a formula of columns.
+
+    Raises:
+        InputError: the text is no formula, or has no column.
+    """
+    formula = Expression(text)
+    if formula.text.startswith("-"):
+        largest = Expression(formula.text[1:])
+        if largest.is_column:
+            return Goal(largest, largest=True)
+    if not formula.names:
+        raise InputError(f"goal {shown(text)!r}: no column in it; allowed: COLUMN, -COLUMN or a formula of columns")
+    return Goal(formula, largest=False)
+
+
+def goal_among(text: str, numbers: Sequence[str]) -> Goal:
+    """Parse a goal over the columns of a sweep; a margin is maximised.
+
+    Raises:
+        InputError: the text is no formula, or has another column.
+    """
+    found = goal(text)
+    if unknown := [name for name in found.formula.names if name not in numbers]:
+        raise InputError(
+            f"--goal {shown(text)!r}: no such number in a row: {shown(unknown[0])}; {instead(unknown[0], numbers)}"
+        )
+    return found._replace(largest=found.largest or found.column in OF_LEARNING)
+
+
+def front(costs: NDArray[np.float64]) -> list[int]:
+    """Return the Pareto front of points: those that no other point equals or betters in all costs.
+
+    Args:
+        costs: costs of the points, to be minimised, shape (n, goals); NaN: the point is not on the front.
+
+    Returns:
+        Indices of the points, by the first cost; of equal points the first.
+    """
+    found: list[int] = []
+    # In this order, only a point already on the front can be at least as good in all costs.
+    for place in np.lexsort(costs.T[::-1]).tolist():
+        known = not np.isnan(costs[place]).any()
+        if known and not (costs[found] <= costs[place]).all(axis=1).any():
+            found.append(place)
+    return found
+
+
 def _constraint(text: str) -> Constraint:
     found = _CONSTRAINT.fullmatch(text.strip())
     allowed = "allowed: COLUMN>=NUMBER or COLUMN<=NUMBER, such as margin>=0.2"
@@ -198,4 +262,4 @@ def _constraint(text: str) -> Constraint:
         bound = math.nan
     if not math.isfinite(bound):
         raise InputError(f"subject {shown(text)!r}: {shown(found['bound'])!r} is no number; {allowed}")
-    return Constraint(found["column"], found["sense"] == ">=", bound)
+    return Constraint(Expression(found["column"]), found["sense"] == ">=", bound)

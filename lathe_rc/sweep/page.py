@@ -156,11 +156,11 @@ def _limits(seen: PageData) -> str:
 
 def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
     """Return the template's sections for cells with a goal value, and add their figures."""
-    weighed = zip(seen.axes, _effects(seen, [seen.goal], seen.axes)[seen.goal.name], strict=True)
+    weighed = zip(seen.axes, effects_of(seen, [seen.goal], seen.axes)[seen.goal.name], strict=True)
     axes = [axis for axis, _ in sorted(weighed, key=lambda each: _weight(*each))]
     none = Goal(_NONE, _NONE, "", np.isnan(seen.goal.values).astype(np.float64))
     goals = [*seen.goals, *([none] if none.values.any() else [])]
-    effects = _effects(seen, goals, axes)
+    effects = effects_of(seen, goals, axes)
     mine = effects[seen.goal.name]
     told = parallel_note = ""
     if axes:
@@ -194,8 +194,8 @@ def _sections(seen: PageData, done: Yield, drawn: Charts) -> dict[str, Any]:
     }
 
 
-def _effects(seen: PageData, goals: Sequence[Goal], axes: Sequence[Axis]) -> dict[str, list[Effect]]:
-    """Return the effects of the parameters on goals, by goal."""
+def effects_of(seen: PageData, goals: Sequence[Goal], axes: Sequence[Axis]) -> dict[str, list[Effect]]:
+    """Return the effects of the parameters of a sweep on goals, by goal, in the order of ``axes``."""
     exact, lot = is_grid(axes, np.zeros(len(seen.cells))), seen.lot
     alike = groups(axes, seen.table.column("seed").to_numpy(zero_copy_only=False).astype(np.float64))
     drawn = (seen.cells % lot < 2) | (lot == 1)  # in a Saltelli sample only these cells are independent of each other

@@ -2,18 +2,19 @@
 """Data for the page of a sweep: parameters as axes, goals, and the results of the cells."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from lathe_rc.errors import InputError, shown
-from lathe_rc.names import instead
+from lathe_rc.errors import shown
 from lathe_rc.sweep import NUMBERS, OF_LEARNING
 from lathe_rc.sweep.effects import Axis
 from lathe_rc.sweep.figures import Goal, said
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.objectives import goal_among
 
 _LARGE = OF_LEARNING  # goals that are better the larger they are
 _MOST_TEXTS = 24  # strings of an axis with separate colours; the others share one
@@ -24,7 +25,8 @@ class PageData:
 
     Args:
         folder: folder of the sweep.
-        goal: column by which the cells are ranked; empty: the largest error of the part, or of the first loop.
+        goal: column or formula of columns by which the cells are ranked, see `lathe_rc.sweep.objectives`; empty: the
+            largest error of the part, or of the first loop.
 
     Attributes:
         folder: see above.
@@ -40,16 +42,17 @@ class PageData:
 
     def __init__(self, folder: Folder, goal: str = "") -> None:
         known = [*NUMBERS, *(each.name for each in folder.measures)]
-        goal = goal or folder.description.goal
-        if goal not in known:
-            raise InputError(
-                f"--goal {shown(goal)!r}: no such number in a row of {folder.path}; {instead(goal, known)}"
-            )
+        asked = goal_among(goal or folder.description.goal, folder.numbers)
+        formula = asked.formula
         self.folder = folder
         self.table = folder.table(["cell", "status", "reason", "limits", "seed", *folder.targets, *known])
         self.cells: NDArray[np.int64] = self.table.column("cell").to_numpy()
+        if formula.text not in known:
+            self.table = self.table.append_column(formula.text, pa.array(asked.values(self.table)))
+            known.append(formula.text)
         found = [self._goal(name) for name in known]
-        self.goal = found[known.index(goal)]
+        place = known.index(formula.text)
+        self.goal = found[place] = replace(found[place], above=asked.largest)
         self.goals = [each for each in found if np.isfinite(each.values).any()]
         axes = [self._axis(target) for target in folder.targets]
         self.axes = [axis for axis in axes if axis.distinct.size > 1]

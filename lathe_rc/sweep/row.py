@@ -23,23 +23,25 @@
 
 import contextlib
 import math
+import re
 import subprocess
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
 import xxhash
 from numpy.typing import NDArray
 
-from lathe_rc import __version__, messages
+from lathe_rc import __version__, allowed_code, messages
 from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.cell.batch import CellRunner, Errors
+from lathe_rc.cell.batch import CellRunner, Errors, Topics
 from lathe_rc.cell.loops import FIGURES, loops, watches
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
@@ -51,6 +53,7 @@ from lathe_rc.cell.stages.obedience import OUT_OF_REACH
 from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
+from lathe_rc.extensions import attribute
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.sweep import NUMBERS
@@ -88,11 +91,12 @@ _TAIL = {
 
 
 class Measure(NamedTuple):
-    """Measure of a run: a statistic of a topic's field over the last revolution, or a figure of a loop.
+    """Measure of a run: a statistic of a field over the last revolution, a figure of a loop, or one of the user's.
 
     Attributes:
-        topic, field: signal; for a loop the error that its controller sees, which is part of the digest.
-        statistic: one of `STATISTICS`, or of `lathe_rc.cell.loops.FIGURES`.
+        topic, field: signal; for a loop the error that its controller sees, which is part of the digest; empty for a
+            function.
+        statistic: one of `STATISTICS`, or of `lathe_rc.cell.loops.FIGURES`; or a function ``package.module:name``.
         node: controller of the loop; empty for a signal.
     """
 
@@ -104,7 +108,9 @@ class Measure(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the measure's column."""
-        return f"{self.node}.{self.statistic}" if self.node else f"{self.topic}.{self.field}:{self.statistic}"
+        if self.node:
+            return f"{self.node}.{self.statistic}"
+        return f"{self.topic}.{self.field}:{self.statistic}" if self.topic else self.statistic
 
 
 def figures(scenario: Scenario) -> dict[str, Measure]:
@@ -121,6 +127,8 @@ def has_tool(scenario: Scenario) -> bool:
 def unit(column: str, scenario: Scenario) -> tuple[float, str]:
     """Return the display unit of a column: the factor from SI units, and the unit's name."""
     node, _, name = column.rpartition(".")
+    if not re.fullmatch(r"[\w/]*", node):  # a formula of columns
+        return 1.0, ""
     loop = next((loop for loop in loops(scenario.nodes) if loop.node == node), None)
     if loop and name in FIGURES:
         told = FIGURES[name][1]
@@ -131,20 +139,26 @@ def unit(column: str, scenario: Scenario) -> tuple[float, str]:
 
 
 def measure(text: str, scenario: Scenario) -> Measure:
-    """Parse a measure ``TOPIC.FIELD:STATISTIC`` or ``NODE.FIGURE``.
+    """Parse a measure ``TOPIC.FIELD:STATISTIC``, ``NODE.FIGURE`` or ``package.module:function``.
 
     Raises:
-        InputError: the topic, the field, the statistic or the figure is unknown.
+        InputError: the topic, the field, the statistic or the figure is unknown, or the function cannot be imported.
     """
     of_loops = figures(scenario)
     if text in of_loops:
         return of_loops[text]
     place, colon, statistic = text.partition(":")
     topic, dot, field = place.removeprefix("/").rpartition(".")
+    dense = Cell(scenario.nodes).dense
+    if colon and topic not in dense and place.replace(".", "_").isidentifier():
+        if find_spec(place.partition(".")[0]):  # otherwise it is rather a misspelt topic
+            allowed_code.allow_named(text)
+        if allowed_code.is_allowed(place) or not dot:
+            function(text)
+            return Measure("", "", text)
     if not colon or not dot:
         loop = f", or {instead(text, of_loops).removeprefix('allowed: ')}" if of_loops else ""
         raise InputError(f"measure {text!r}; allowed: TOPIC.FIELD:STATISTIC, such as coarse/state.effort:max{loop}")
-    dense = Cell(scenario.nodes).dense
     if topic not in dense:
         raise InputError(f"measure {text!r}: no topic {topic!r} in the cell; {instead(topic, dense)}")
     fields = messages.sample_fields(dense[topic].type)
@@ -155,12 +169,35 @@ def measure(text: str, scenario: Scenario) -> Measure:
     return Measure(topic, field, statistic)
 
 
-def schema(targets: Mapping[str, "Target"], measures: Sequence[Measure]) -> pa.Schema:
-    """Return the Arrow schema of the rows of a sweep."""
+def function(name: str) -> Callable[[Recording], float]:
+    """Return the function ``package.module:name`` of a recording to a number.
+
+    Raises:
+        InputError: there is no such function.
+    """
+    module, _, place = name.partition(":")
+    if not allowed_code.is_allowed(module):
+        package = module.partition(".")[0]
+        raise InputError(f"measure {name}: code that is not allowed; allowed: {allowed_code.OPTION} {package}")
+    found = attribute(module, place, f"measure {name}")
+    if not callable(found):
+        raise InputError(f"measure {name}: {shown(repr(found))}; allowed: a function of a recording to a number")
+    return cast("Callable[[Recording], float]", found)
+
+
+def schema(targets: Mapping[str, "Target"], carried: Sequence[str], measures: Sequence[Measure]) -> pa.Schema:
+    """Return the Arrow schema of the rows of a sweep.
+
+    Raises:
+        InputError: a carried column has the name of another column.
+    """
     columns = dict(HEAD)
     for name, target in targets.items():
         columns[name] = pa.list_(_ARROW[target.type]) if target.is_list else _ARROW[target.type]
     columns |= _FOUND | {each.name: pa.float64() for each in measures} | _TAIL
+    if taken := [name for name in carried if name in columns]:
+        raise InputError(f"{taken[0]}: carried along, and a column of each row as well; allowed: another name")
+    columns |= dict.fromkeys(carried, pa.string())
     return pa.schema(list(columns.items()))
 
 
@@ -179,11 +216,16 @@ class _Keeper(Errors):
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         super().__init__(cell, samples)
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
+        self._functions = [each.statistic for each in measures if not each.topic]
+        self._whole = Topics(cell, samples, [*cell.dense, *cell.sparse]) if self._functions else None
+        measures = [each for each in measures if each.topic]
         self.heard = [*self.heard, *self._events, *(f"{asked.topic}.{asked.field}" for asked in measures)]
         asked_of = {asked.node for asked in measures}
         tables = {name: stage.shared for name, stage in cell.stages.items() if name in asked_of}
         self._loops = watches(loops(tables), {topic: source.type for topic, source in cell.dense.items()})
         self.heard += [f"{watch.topics[1]}.{field}" for watch in self._loops for field in ("set_point", "command")]
+        if self._whole:
+            self.heard = self._whole.heard
         self._limited: set[str] = set()
         tools = [stage for stage in cell.stages.values() if isinstance(stage, Tool)]
         self._tolerance = tools[0].parameters.tolerance if tools else 0.0
@@ -199,6 +241,8 @@ class _Keeper(Errors):
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Collect a chunk of samples (implements `lathe_rc.cell.engine.Sink`)."""
         super().chunk(first, samples, dense, sparse)
+        if self._whole:
+            self._whole.chunk(first, samples, dense, sparse)
         for topic, said in sparse.items():
             if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
                 self._limited.add(topic.removesuffix("/events"))
@@ -215,7 +259,11 @@ class _Keeper(Errors):
             watch.chunk(first, samples, dense, sparse)
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
-        """Return the result columns of a completed run."""
+        """Return the result columns of a completed run.
+
+        Raises:
+            LatheError: a function of the recording has no finite value.
+        """
         starts = (errors if self._tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
         found: dict[str, Any] = {
@@ -233,6 +281,12 @@ class _Keeper(Errors):
             for name, values in (("max", errors.largest), ("rms", errors.rms)):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
                 found[f"tool.{name}_errors"] = values
+        if self._whole:
+            recording = self._whole.kept()
+            for name in self._functions:
+                found[name] = value = float(function(name)(recording))
+                if not math.isfinite(value):
+                    raise LatheError(f"{name} is {value}; allowed: a finite number")
         if self._tolerance and not self.soundness.why:
             found["tool.in_tolerance_from"] = (
                 judge(errors.largest, self._tolerance, self._before, doubt=self._doubt).since or None
@@ -248,7 +302,7 @@ def digest(recording: Recording, measures: Sequence[Measure]) -> str | None:
     """
     if messages.TOOL in (recording.types[topic] for topic in recording.dense):
         return _digest([recording.of_type(messages.TOOL)["error"]])
-    signals = dict.fromkeys((messages.full(each.topic), each.field) for each in measures)
+    signals = dict.fromkeys((messages.full(each.topic), each.field) for each in measures if each.topic)
     return _digest([recording.dense[topic][field] for topic, field in signals])
 
 

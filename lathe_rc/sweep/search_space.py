@@ -10,7 +10,8 @@ from optuna.trial import Trial
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
-from lathe_rc.sweep.space import axis, canonical, number
+from lathe_rc.sweep.distributions import number
+from lathe_rc.sweep.space import axis, canonical
 
 
 class Dimension(NamedTuple):

@@ -19,10 +19,10 @@ import itertools
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import scipy
@@ -33,35 +33,14 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
-from lathe_rc.sweep.derived_parameters import Formulas, ordered
+from lathe_rc.sweep.distributions import drawn, factor, number
+from lathe_rc.sweep.expression import Formulas, ordered
 
 SAMPLERS = ("sobol", "halton", "latin", "random", "saltelli")
 _MOST_POINTS = 2**24
 _SAMPLES = f"sobol:N, halton:N, latin:N, random:N or saltelli:N, N from 1 up to {_MOST_POINTS}"
 _PIECE = 2**12  # number of sample points drawn at a time
 _LONG = 40  # number of characters of an axis that a message quotes
-
-
-class Drawn(NamedTuple):
-    """Probability distribution of a sampled parameter.
-
-    Attributes:
-        law: distribution: ``uniform``, ``log`` (uniform in the logarithm) or ``normal``.
-        first, second: ends of the range, or mean and standard deviation.
-    """
-
-    law: str
-    first: float
-    second: float
-
-    def at(self, quantile: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of the distribution at quantiles between 0 and 1, shape (n,)."""
-        if self.law == "normal":
-            return np.asarray(scipy.stats.norm.ppf(quantile, self.first, self.second))
-        if self.law == "log":
-            low, high = math.log(self.first), math.log(self.second)
-            return np.exp(low + (high - low) * quantile)
-        return self.first + (self.second - self.first) * quantile
 
 
 @dataclass(frozen=True)
@@ -75,13 +54,18 @@ class Space:
         grid: values by target: a list, or a string: ``LOW:HIGH:COUNT`` (ends included), ``LOW:HIGH:COUNT:log``, or
             values separated by commas.
         sampled: distributions by target, with one value per sample point: ``LOW:HIGH``, ``LOW:HIGH:log``,
-            ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, or ``normal:DEVIATION`` about the scenario's value.
+            ``uniform:LOW:HIGH``, ``normal:MEAN:DEVIATION``, ``normal:DEVIATION`` about the scenario's value, or a
+            distribution of `scipy.stats` with its arguments, such as ``weibull_min:c=1.5:scale=3e-3``; each can be
+            truncated: ``:min=LOW``, ``:max=HIGH``.
+        correlated: correlations of sampled parameters, by ``"TARGET,TARGET"``: those of the normally distributed
+            quantities whose quantiles the parameters have (Gaussian copula).
         ties: formulas of derived parameters by target, such as ``fine_controller.q_time * 1.1``: targets with
-            + - * / **, brackets, ``sqrt``, ``exp``, ``log``, ``sin``, ``cos`` and ``pi``.
+            + - * / **, brackets and functions, see `lathe_rc.sweep.expression`.
         sample: ``sobol:N``, ``halton:N``, ``latin:N`` or ``random:N``; ``saltelli:N`` for N (d + 2) points of d
             parameters, of which pairs differ in one parameter alone; empty if nothing is sampled.
         seeds: number of seeds per combination of the other values, starting at the scenario's seed.
         given: individual cells, each as values by target.
+        carried: columns of ``given`` that are no parameters but go into the rows, as text.
         sample_seed: random seed of the sample.
 
     Example:
@@ -94,10 +78,12 @@ class Space:
 
     grid: Mapping[str, str | Sequence[Value]] = field(default_factory=dict)
     sampled: Mapping[str, str] = field(default_factory=dict)
+    correlated: Mapping[str, float] = field(default_factory=dict)
     ties: Mapping[str, str] = field(default_factory=dict)
     sample: str = ""
     seeds: int = 1
     given: Sequence[Mapping[str, Value]] = ()
+    carried: Sequence[str] = ()
     sample_seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
@@ -107,7 +93,7 @@ class Space:
     def targets(self) -> list[str]:
         """Return the parameters that differ between the cells, in column order."""
         seed = ["seed"] if self.seeds > 1 else []
-        named = [name for cell in self.given for name in cell]
+        named = [name for cell in self.given for name in cell if name not in self.carried]
         return list(dict.fromkeys([*named, *self.grid, *self.sampled, *self.ties, *seed]))
 
     def count(self, scenario: Scenario) -> int:
@@ -131,8 +117,10 @@ class Space:
         for target in self.targets():
             scenario.parameter(target)
         for cell in self.given:
-            for target, value in cell.items():
-                _check_type(target, scenario.parameter(target), value)
+            if missing := [name for name in self.carried if name not in cell]:
+                raise InputError(f"{missing[0]}: no column of the given cells; allowed: {', '.join(cell)}")
+            for target in cell.keys() - set(self.carried):
+                _check_type(target, scenario.parameter(target), cell[target])
         if any(dict(first) == dict(second) for first, second in itertools.pairwise(sorted(self.given, key=canonical))):
             raise InputError("two of the given cells are the same; allowed: each once")
         if self.sampled and not self.sample:
@@ -141,7 +129,8 @@ class Space:
             raise InputError(f"sample {self.sample!r}, and nothing is drawn; allowed: LOW:HIGH or a law for a target")
         self._points()
         for target, told in self.sampled.items():
-            _drawn(scenario, target, told)
+            drawn(scenario, target, told)
+        factor(list(self.sampled), self.correlated, self.sample)
         ordered(self.ties)
         next(self.cells(scenario))  # evaluates the formulas once; most errors show in the first cell
 
@@ -150,14 +139,14 @@ class Space:
         axes = {target: axis(scenario, target, told) for target, told in self.grid.items()}
         first_seed = scenario.shared.seed
         formulas = Formulas(scenario, self.ties)
-        rows = {target: scenario.parameter(target) for cell in self.given for target in cell}
+        rows = {name: scenario.parameter(name) for cell in self.given for name in cell if name not in self.carried}
         for cell in self.given or ({},):
-            given = {target: _plain(rows[target], value) for target, value in cell.items()}
+            given = {name: _plain(rows[name], value) if name in rows else value for name, value in cell.items()}
             for combination in itertools.product(*axes.values()):
                 fixed = {**given, **dict(zip(axes, combination, strict=True))}
-                for drawn in self._draws(scenario):
+                for point in self._draws(scenario):
                     for seed in range(self.seeds):
-                        values = {**fixed, **drawn}
+                        values = {**fixed, **point}
                         if self.seeds > 1:
                             values["seed"] = first_seed + seed
                         yield formulas.add_to(values)
@@ -172,15 +161,17 @@ class Space:
             raise InputError(f"sample {self.sample!r}; allowed: {_SAMPLES}")
         return count * (len(self.sampled) + 2) if name == "saltelli" else count
 
-    def _draws(self, scenario: Scenario) -> Iterator[dict[str, float]]:
+    def _draws(self, scenario: Scenario) -> Iterator[dict[str, Value]]:
         """Yield the sampled values of each point, by target."""
         if not self.sampled:
             yield {}
             return
-        laws = {target: _drawn(scenario, target, told) for target, told in self.sampled.items()}
+        laws = {target: drawn(scenario, target, told) for target, told in self.sampled.items()}
+        mixed, normal = factor(list(laws), self.correlated, self.sample), scipy.stats.norm
         for quantiles in _sample(self.sample.partition(":")[0], self._points(), len(laws), self.sample_seed):
-            columns = [law.at(column) for law, column in zip(laws.values(), quantiles.T, strict=True)]
-            for row in zip(*(column.tolist() for column in columns), strict=True):
+            points = quantiles if mixed is None else normal.cdf(normal.ppf(quantiles) @ mixed.T)
+            columns = [law.at(column) for law, column in zip(laws.values(), points.T, strict=True)]
+            for row in zip(*columns, strict=True):
                 yield dict(zip(laws, row, strict=True))
 
 
@@ -206,22 +197,6 @@ def _sample(name: str, count: int, dimensions: int, seed: int) -> Iterator[NDArr
             warnings.simplefilter("ignore", UserWarning)  # Sobol warns about counts that are not a power of two
             piece = draws[name](min(_PIECE, count - first))
         yield piece
-
-
-def number(scenario: Scenario, target: str, text: str) -> float:
-    """Parse a number or a percentage of the scenario's value."""
-    plain = text.strip()
-    found = ros_yaml.scalar(plain.removesuffix("%"))
-    if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
-        raise InputError(
-            f"{target}: {shown(text)!r} is no number; allowed: numbers, or parts of the scenario's value in %"
-        )
-    if not plain.endswith("%"):
-        return float(found)
-    base = scenario.value(target)
-    if isinstance(base, bool | str | list):
-        raise InputError(f"{target} = {base!r} has no parts in %; allowed: values")
-    return float(found) / 100.0 * base
 
 
 def axis(scenario: Scenario, target: str, told: str | Sequence[Value]) -> Sequence[Value]:
@@ -316,33 +291,12 @@ def _check_type(target: str, row: Row, value: Value) -> None:
         raise InputError(f"{target} = {shown(repr(value))}; allowed: {row.allowed()}")
 
 
-def _drawn(scenario: Scenario, target: str, told: str) -> Drawn:
-    """Parse the distribution of a sampled parameter."""
-    row = scenario.parameter(target)
-    if row.is_list or row.type is not float:
-        raise InputError(f"{target}: drawn, and is {row.allowed()}; allowed: parameters that are one real number")
-    name, *rest = told.split(":")
-    if name not in ("normal", "uniform"):
-        name, rest = "uniform", [name, *rest]
-    if name == "uniform" and rest[2:] == ["log"]:
-        name, rest = "log", rest[:2]
-    if name == "normal" and len(rest) == 1:
-        rest = ["100%", *rest]
-    if len(rest) != 2:
-        raise InputError(
-            f"{target}={shown(told)}; allowed: LOW:HIGH, LOW:HIGH:log, uniform:LOW:HIGH, normal:MEAN:DEVIATION or "
-            "normal:DEVIATION"
-        )
-    first, second = (number(scenario, target, text) for text in rest)
-    if name == "normal" and second < 0.0:
-        raise InputError(f"{target}={shown(told)}; allowed: a deviation from 0")
-    if name == "log" and not min(first, second) > 0.0:
-        raise InputError(f"{target}={shown(told)}; allowed on a log range: ends above 0")
-    return Drawn(name, first, second)
-
-
-def given(path: Path) -> list[dict[str, Value]]:
+def given(path: Path, carried: Collection[str] = ()) -> list[dict[str, Value]]:
     """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
+
+    Args:
+        path: the file.
+        carried: names of columns that are no targets; their values stay text.
 
     Raises:
         InputError: the file cannot be read, or is in neither format.
@@ -352,15 +306,18 @@ def given(path: Path) -> list[dict[str, Value]]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({shown(error)})") from None
     if path.suffix.lower() != ".csv":
-        return ros_yaml.rows(text, str(path))
+        return [
+            {name: str(value) if name in carried else value for name, value in cell.items()}
+            for cell in ros_yaml.rows(text, str(path))
+        ]
     header, *lines = list(csv.reader(text.splitlines())) or [[]]
-    for number, line in enumerate(lines, 2):
+    for place, line in enumerate(lines, 2):
         if len(line) != len(header):
-            raise InputError(f"{path}:{number}: {len(line)} values; allowed: {len(header)}, as in the first row")
+            raise InputError(f"{path}:{place}: {len(line)} values; allowed: {len(header)}, as in the first row")
     return [
         {
-            target.strip(): ros_yaml.parse_value(value, f"{path}: {target}")
-            for target, value in zip(header, line, strict=True)
+            target: value if target in carried else ros_yaml.parse_value(value, f"{path}: {target}")
+            for target, value in zip(map(str.strip, header), line, strict=True)
         }
         for line in lines
     ]

@@ -167,6 +167,10 @@ class Study:
         with writing(folder.path), folder.locked(wait=True):
             self._storage, self._study = _opened(folder.path / "trials.log", len(self._objectives.goals))
             if not self._study.get_trials(deepcopy=False):
+                with _quiet():
+                    self._study.set_metric_names(
+                        [f"-{goal.column}" if goal.largest else goal.column for goal in self._objectives.goals]
+                    )
                 given = self._start | {target: found.value for target, found in self._formulas.items()}
                 for values in [self._start, given] if given != self._start else [given]:
                     if all(dimension.contains(values[target]) for target, dimension in self._space.items()):

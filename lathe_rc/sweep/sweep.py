@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import distributed
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
@@ -24,6 +25,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.sweep import inputs, row
 from lathe_rc.sweep.alone import KILLED
 from lathe_rc.sweep.folder import Folder
+from lathe_rc.sweep.objectives import front, goal_among
 from lathe_rc.sweep.outcomes import Outcome, outcomes
 from lathe_rc.sweep.space import Space, canonical
 from lathe_rc.sweep.workers import Job, Order, client_of, rows
@@ -67,6 +69,41 @@ class Sweep:
     def outcomes(self) -> list[Outcome]:
         """Return the statuses and reasons of the cells, most frequent first."""
         return outcomes(self.folder.table(["cell", "status", "reason"]))
+
+    def best(self, *goals: str, most: int = 5) -> list[dict[str, Any]]:
+        """Return the best cells for a goal, or the Pareto front for several: parameters, goals and margin, by column.
+
+        Args:
+            goals: goals as of `lathe_rc.tune`, the margins being maximised; none: the largest error.
+            most: number of cells for one goal.
+
+        Raises:
+            InputError: a goal has no such column, or is no formula.
+        """
+        about, whole = self.folder.description, self.table()
+        wanted = [goal_among(goal, self.folder.numbers) for goal in goals or (about.goal,)]
+        values = np.stack([goal.values(whole) for goal in wanted], axis=1)
+        costs = values * [goal.sign for goal in wanted]
+        if len(wanted) > 1:
+            order = front(costs)
+        else:
+            order = [place for place in np.argsort(costs[:, 0], kind="stable")[:most] if np.isfinite(costs[place, 0])]
+        columns = ["cell", *self.folder.carried, *self.folder.targets]
+        more = [about.goal, about.goal.replace("max_error", "rms_error")]
+        more.append("margin" if about.goal.startswith("tool.") else about.goal.replace("max_error", "settling"))
+        rows = whole.select(list(dict.fromkeys([*columns, *more]))).take(pa.array(order, pa.int64())).to_pylist()
+        named = [goal.column for goal in wanted]
+        ranked = [dict(zip(named, values[place].tolist(), strict=True)) for place in order]
+        rest = [name for name in more if name not in named]
+        return [
+            {name: row[name] for name in columns} | goal | {name: row[name] for name in rest}
+            for row, goal in zip(rows, ranked, strict=True)
+        ]
+
+    def count_without(self, goal: str) -> int:
+        """Return the number of done cells in which a goal has no value, for example because it divides by zero."""
+        done = self.table().filter(pyarrow.compute.field("status") == row.DONE)
+        return int(np.isnan(goal_among(goal, self.folder.numbers).values(done)).sum())
 
     def row(self, number: int) -> dict[str, Any]:
         """Return the row of a cell, by column; raises the same errors as `scenario`."""
@@ -260,14 +297,18 @@ class Key:
             del self._base[target]
         self._naming = [target for target in folder.targets if inputs.names_inputs(scenario, target)]
         self._named: dict[str, dict[str, str]] = {}
-        self._inputs = inputs.of_cell(scenario)
+        self._carried = folder.carried
+        self._inputs = inputs.of_cell(scenario, folder.measures)
         self._code = inputs.code(self._inputs)
         measured = sorted(each.name for each in folder.measures)
         self._start = hashlib.sha256("\n".join([scenario.identity, *measured, *filter(None, [self._code])]).encode())
 
     def job(self, number: int, values: dict[str, Value]) -> Job:
         """Return the job of a cell, with its key in hexadecimal digits."""
-        own: dict[str, Any] = {target: value for target, value in values.items() if value != self._base.get(target)}
+        carried = {name: str(values.pop(name)) for name in self._carried if name in values}
+        own: dict[str, Any] = {
+            target: value for target, value in values.items() if value != self._base.get(target)
+        } | carried
         code = self._code
         if naming := {target: own[target] for target in self._naming if target in own}:
             text = canonical(naming)
@@ -277,4 +318,4 @@ class Key:
             code = inputs.code(self._inputs | self._named[text])
         found = self._start.copy()
         found.update(canonical(own).encode())
-        return Job(number, found.hexdigest()[:32], values, code)
+        return Job(number, found.hexdigest()[:32], values, code, carried)

@@ -16,7 +16,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.sweep import row
 from lathe_rc.sweep.folder import Folder, writing
 from lathe_rc.sweep.formulas import Found
-from lathe_rc.sweep.objectives import Objectives, Score
+from lathe_rc.sweep.objectives import Objectives, Score, front
 from lathe_rc.sweep.space import Space
 from lathe_rc.sweep.sweep import Sweep
 
@@ -104,24 +104,20 @@ class Tuning:
     @property
     def front(self) -> list[Trial]:
         """Pareto front of the feasible trials, sorted by the first goal; for one goal, only the best trial."""
-        found: list[Trial] = []
-        # In this order, only a trial already on the front can be at least as good in all goals.
-        for trial in sorted(self.feasible, key=lambda trial: (trial.score.costs, trial.number)):
-            if not any(np.less_equal(other.score.costs, trial.score.costs).all() for other in found):
-                found.append(trial)
-        return found
+        trials = self.feasible
+        return [trials[place] for place in front(np.array([trial.score.costs for trial in trials]))] if trials else []
 
     @property
     def best(self) -> Trial | None:
         """Best trial: for several goals, the one on the front nearest to the best of each; None if none is feasible."""
-        front = self.front
-        if not front:
+        trials = self.front
+        if not trials:
             return None
         # Each goal is scaled by its span over the front: goals have different units.
-        costs = np.array([trial.score.costs for trial in front])
+        costs = np.array([trial.score.costs for trial in trials])
         span = np.ptp(costs, axis=0)
         distance = np.linalg.norm((costs - costs.min(axis=0)) / np.where(span > 0.0, span, 1.0), axis=1)
-        return front[int(np.argmin(distance))]
+        return trials[int(np.argmin(distance))]
 
     def goals(self, trial: Trial) -> dict[str, float]:
         """Return the goal values of a trial, by column [SI units]; infinite for missing values."""

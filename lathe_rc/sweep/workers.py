@@ -12,7 +12,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -70,12 +70,14 @@ class Job(NamedTuple):
         key: hash that identifies the cell.
         values: values of the varied parameters, by target.
         code: hash of the third-party classes of the cell; None if there are none.
+        carried: values of columns that are no parameters.
     """
 
     number: int
     key: str
     values: dict[str, Value]
     code: str | None
+    carried: Mapping[str, str] = {}
 
 
 class Order(NamedTuple):
@@ -159,12 +161,16 @@ def compute_alone(share: Share) -> pa.Table:
 def _row(order: Order, job: Job, bench: CellRunner | None = None) -> dict[str, Any]:
     base = _scenario(order.name, order.text, order.identity)
     found = row.compute(base, job.values, order.targets, order.measures, bench)
-    return {"cell": job.number, "key": job.key, "code": job.code} | found
+    return _head(job) | found
+
+
+def _head(job: Job) -> dict[str, Any]:
+    return {"cell": job.number, "key": job.key, "code": job.code, **job.carried}
 
 
 def _failed(order: Order, job: Job, reason: str, limit: float) -> dict[str, Any]:
     """Return the row of a cell that has ended its process."""
-    found = {"cell": job.number, "key": job.key, "code": job.code, "status": row.FAILED, "reason": reason}
+    found = _head(job) | {"status": row.FAILED, "reason": reason}
     found |= {"version": row.revision(), "time_limit": limit if reason.startswith(NO_END) else None, "limits": ""}
     base, values = _scenario(order.name, order.text, order.identity), dict(job.values)
     with suppress(InputError):

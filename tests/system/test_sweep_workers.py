@@ -152,7 +152,7 @@ from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
 def fill():
     kept = []
     while True:
-        kept.append(np.ones(2**22))
+        kept.append(np.empty(2**22))
 
 def hang():
     while True:
