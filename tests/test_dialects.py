@@ -7,12 +7,14 @@ from numpy.testing import assert_array_equal
 
 from lathe_rc.signals import measured_profile, measurement_file, tachogram
 from lathe_rc.signals.counts import CsvReader
+from lathe_rc.sweep.space import given
 
 TEXTS = {
     "tachogram": "# of a µ-tachometer\ntime_s,rpm\n1700000000.25,999.5\n1700000000.5,1000.25\n1700000001,1001\n",
     "counts": "# at 20 °C\ntime_s,counts,edge_s,index_counts\n0.001,5,0.0005,\n0.0025,-3,0.002,4.5\n",
     "profile": "# Ø 100\nangle_deg,radius_um\n0,1.5\n120,-2.25\n240,0.75\n",
     "measurement": "time_ms,command [µm],response\n# µ\n0,1.5,2e-6\n0.5,-1e-3,0.25\n",
+    "cells": "tool.tolerance,learning_controller.lead_time\n2e-6,0.0012\n1,1.4e-3\n",
     "whole numbers first": "time_ms,command [µm],response\n0,1,2\n1,0.5,0.25\n",
 }
 
@@ -33,6 +35,7 @@ READERS = {
     "profile": lambda path: [(form := measured_profile.read_csv(path)).angle, form.radius],
     "measurement": columns,
     "whole numbers first": columns,
+    "cells": lambda path: [[*cell.values()] for cell in given(path)],
 }
 DIALECTS = {
     "decimal comma": lambda text: text.replace(",", ";").replace(".", ",").encode(),

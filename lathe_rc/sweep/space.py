@@ -14,10 +14,10 @@ fastest, then the points, then the values of the last grid. Each of them is give
 or as values, see `Space`.
 """
 
-import csv
 import itertools
 import json
 import math
+import re
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -28,11 +28,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lathe_rc import files
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Row, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
+from lathe_rc.signals import table
 from lathe_rc.sweep.distributions import drawn, factor, number
 from lathe_rc.sweep.expression import Formulas, ordered
 
@@ -40,6 +40,7 @@ SAMPLERS = ("sobol", "halton", "latin", "random", "saltelli")
 _MOST_POINTS = 2**24
 _SAMPLES = f"sobol:N, halton:N, latin:N, random:N or saltelli:N, N from 1 up to {_MOST_POINTS}"
 _PIECE = 2**12  # number of sample points drawn at a time
+_DECIMAL = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")  # beside semicolons or tabulators
 _LONG = 40  # number of characters of an axis that a message quotes
 
 
@@ -301,26 +302,26 @@ def given(path: Path, carried: Collection[str] = ()) -> list[dict[str, Value]]:
     Raises:
         InputError: the file cannot be read, or is in neither format.
     """
-    try:
-        text = files.contents(path).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({shown(error)})") from None
+    text = table.read_text(path, "cells")
     if path.suffix.lower() != ".csv":
         return [
             {name: str(value) if name in carried else value for name, value in cell.items()}
             for cell in ros_yaml.rows(text, str(path))
         ]
-    header, *lines = list(csv.reader(text.splitlines())) or [[]]
-    for place, line in enumerate(lines, 2):
-        if len(line) != len(header):
-            raise InputError(f"{path}:{place}: {len(line)} values; allowed: {len(header)}, as in the first row")
-    return [
-        {
-            target: value if target in carried else ros_yaml.parse_value(value, f"{path}: {target}")
-            for target, value in zip(map(str.strip, header), line, strict=True)
-        }
-        for line in lines
-    ]
+    lines = table.lines_of(text)
+    mark = table.delimiter_of(lines[0][1]) if lines else ","
+    (_, header), *rows = [*table.rows(lines, path, mark)] or [(0, [])]
+    for line, row in rows:
+        table.check_width(path, line, len(row), len(header))
+
+    def value(target: str, text: str) -> Value:
+        if target in carried:
+            return text
+        text = table.pointed(text, mark) if _DECIMAL.fullmatch(text) else text
+        return ros_yaml.parse_value(text, f"{path}: {target}")
+
+    targets = [target.strip() for target in header]
+    return [{target: value(target, text) for target, text in zip(targets, row, strict=True)} for _, row in rows]
 
 
 def canonical(values: Mapping[str, Value]) -> str:

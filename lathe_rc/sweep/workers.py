@@ -42,11 +42,8 @@ _MOST = 4096  # most cells of a task
 _LEAST = 8  # towards the end, tasks get shorter, down to 1/8 of the others
 _AHEAD = 2  # tasks per worker thread: one is running, and the next is ready at the scheduler
 _CONNECT = 5  # [s] allowed for reaching a scheduler
-_UNKNOWN, _SHORTEST, _SLOWER = (
-    600.0,
-    60.0,
-    20.0,
-)  # time limit of cells [s]: of the first, of all, and to the slowest one
+# Time limit of a cell [s]: of the first ones, the least, and relative to the slowest cell so far.
+_UNKNOWN, _SHORTEST, _SLOWER = 600.0, 60.0, 20.0
 _DEATHS = 4  # workers that may die with a task; a task that waits at a worker dies with it as well
 _MEMORY = 0.9  # share of a worker's memory that its cells may use; Dask ends a worker with 0.95
 _SETTINGS = {  # settings of this machine's workers
