@@ -49,7 +49,6 @@ class MemberProtocol:
         safe: this member knows that members are lost.
         over: this member's part of the run is complete.
         done: this member may leave.
-        run_end: end of the run, as the time master has announced it [sample]; 0: not announced.
         cut: why the run ends before its planned end; empty: it does not.
         left_early: this member was ended before the run.
         failure: reason of this member's failure.
@@ -78,7 +77,7 @@ class MemberProtocol:
         self._newest_state: CellState | None = None  # from a time master that is not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
-        self.run_end, self.cut, self.left_early = 0, "", False
+        self.cut, self.left_early = "", False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
         self.unmatched: Sequence[str] = ()
@@ -435,8 +434,8 @@ class MemberProtocol:
             self._newest_state = state  # from a process not announced yet, or from outside the cell
             return
         self.phase = Phase(state.state)
-        if self.phase == Phase.RUNNING and state.end_index:
-            self.run_end, self.cut, self._end_due = state.end_index, state.message, math.inf
+        if self.phase == Phase.RUNNING and state.message:
+            self.cut, self._end_due = state.message, math.inf
             self.active = True  # a deactivated member resumes for the end
         if self.phase != Phase.WAITING and not self.ready and self._join_due == math.inf:
             # A member that cannot resume gives up, and names its established namesake if there is one.

@@ -152,7 +152,7 @@ class TimeMasterProtocol(MemberProtocol):
         self.actions += [do.Start(), do.Release()]
 
     def _say(self, phase: Phase, first: int, why: str = "") -> None:
-        known = self._declared or self.ends_early or (self.blocks == self.blocks_in_run and not self.window)
+        known = self._declared or self.ends_early
         end, lost = (self.end or 0, tuple(sorted(self.without))) if known else (0, ())
         self.phase = phase
         self.actions.append(do.Say(CellState(self.own.run_id, phase, first, why[:1024], end, lost, self.own.session)))
@@ -245,8 +245,6 @@ class TimeMasterProtocol(MemberProtocol):
         """Record that the last block is released; the run ends when all members have completed it."""
         if not self.completed:
             self.finish_run()
-        elif not self.window and self.running:
-            self._say(Phase.RUNNING, self._first, self.cut)  # for readers that lose the last block of a device
 
     def end_by(self, signal: str, now: float) -> None:
         """End the run for all members with the next block (extends `MemberProtocol`)."""
