@@ -298,10 +298,11 @@ class RecorderRole(Role):
 
     def tick(self, now: float) -> float:
         """Flush the bag periodically, so that a crash loses a bounded time (implements `Role`)."""
-        if (run_end := self.node.protocol.fixed_end) and self._merger is None:
-            for queue in self._queues.values():
-                queue.end_at(run_end, now)
-            self.node.attempt(self._end_unsorted, run_end)
+        queues = self._queues.values()
+        for queue in queues:
+            queue.end_with(queues, now)
+        if self._merger is None and self._all_ended:
+            self.node.attempt(self._end_unsorted, max(queue.end for queue in queues))
         if self._writer is not None and now >= self._flush_due:
             self._flush_due = now + FLUSH_PERIOD
             self._tell_gaps()

@@ -196,10 +196,10 @@ class StageRole(Role):
     def tick(self, now: float) -> float:
         """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
-        if run_end := self.node.protocol.fixed_end:
-            for queue in self.inputs.queues.values():
-                queue.end_at(run_end, now)
-            self.node.due = True
+        queues = self.inputs.queues.values()
+        for queue in queues:
+            queue.end_with(queues, now)
+            self.node.due = self.node.due or queue.lossy
         return float("inf")
 
     def statistics(self) -> dict[str, object]:

@@ -129,9 +129,10 @@ class BlockQueue(BlockOrder):
             self.received += 1
             self.lost += 1
 
-    def end_at(self, end: int, now: float) -> None:
-        """Hold the newest sample up to the end of the run once a device that loses blocks is quiet; ``now`` [s]."""
-        if not self.lossy or self.ended:
+    def end_with(self, others: Collection["BlockQueue"], now: float) -> None:
+        """Hold the newest sample of a quiet device that loses blocks up to the end of other topics; ``now`` [s]."""
+        end = next((queue.end for queue in others if queue.ended), None)
+        if end is None or not self.lossy or self.ended:
             return
         if self._quiet[0] != self.end or not self._quiet[1]:
             self._quiet = (self.end, now)

@@ -27,7 +27,6 @@ _END_BY_MASTER = 1.0  # [s] for a time master that is ended by the same Ctrl-C t
 LONGEST_MESSAGE = 1024  #: characters of Member.msg and CellState.msg
 _MOST_MEMBERS = 256  # largest number of announced names
 INACTIVE = "inactive"  #: message of a member that is deactivated
-ALL_SENT = "all blocks are sent"  #: message of a free-running cell's state, for readers that lose the last block
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
@@ -51,7 +50,6 @@ class MemberProtocol:
         safe: this member knows that members are lost.
         over: this member's part of the run is complete.
         done: this member may leave.
-        all_sent: the time master has announced that it has sent all blocks of a free-running cell.
         cut: why the run ends before its planned end; empty: it does not.
         left_early: this member was ended before the run.
         failure: reason of this member's failure.
@@ -81,7 +79,7 @@ class MemberProtocol:
         self._newest_states: dict[str, CellState] = {}  # by sender, from time masters that are not announced yet
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
-        self.all_sent, self.cut, self.left_early = False, "", False
+        self.cut, self.left_early = "", False
         self.failure: LatheError | None = None
         self.without: frozenset[str] = frozenset()
         self.end: int | None = None
@@ -393,11 +391,6 @@ class MemberProtocol:
         self._report("ready")
         self.members_changed(now)
 
-    @property
-    def fixed_end(self) -> int | None:
-        """End of the run once no more than the last blocks can be under way [sample]; None before."""
-        return self.end if self.all_sent or self.cut else None
-
     def missing(self) -> list[str]:
         """Return the members and topics for which this member waits; empty if there are none."""
         if self.done or self.failure or self.over or self.phase == Phase.SAFE:
@@ -496,8 +489,7 @@ class MemberProtocol:
         """Take the end of the run: the planned one, or one that has come nearer."""
         self.end = state.end_index or self.end
         if state.state == Phase.RUNNING and state.message:
-            self.all_sent, self.cut = state.message == ALL_SENT, "" if state.message == ALL_SENT else state.message
-            self._end_due = math.inf
+            self.cut, self._end_due = state.message, math.inf
             self.active = True  # a deactivated member resumes for the end
 
     def go_safe(self, state: CellState) -> None:

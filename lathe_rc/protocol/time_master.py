@@ -10,7 +10,6 @@ from lathe_rc.cell.latency_histogram import Durations
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.member import (
-    ALL_SENT,
     GIVEN_UP,
     INACTIVE,
     LONGEST_MESSAGE,
@@ -263,8 +262,6 @@ class TimeMasterProtocol(MemberProtocol):
         """Record that the last block is released; the run ends when all members have completed it."""
         if not self.completed:
             self.finish_run()
-        elif not self.window and self.running:
-            self._say(Phase.RUNNING, self._first, self.cut or ALL_SENT)
 
     def end_by(self, signal: str, now: float) -> None:
         """End the run for all members with the next block (extends `MemberProtocol`)."""
