@@ -106,6 +106,8 @@ def test_a_cell_that_loses_a_process_ends_at_its_safe_position(name, reaction, m
     told = {event["event"] for event in events}
     if number == "STOP" and (reaction == "wait" or lost == set(cell.nodes)):
         assert "safe" not in told
+    elif MASTER in lost and number in ("TERM", "INT"):
+        assert not told & {"safe", "abandoned", "masterless"}, "the run ends early, for all members"
     elif MASTER in lost:
         given_up = [event for event in events if event["event"] in ("abandoned", "masterless", "error")]
         causes = {event["node"]: event["message"] for event in given_up if event["node"] not in lost}
