@@ -176,12 +176,6 @@ FAULTS = (
         "a slow begin of the safe state is taken for silence",
     ),
     Fault(
-        "time_master",
-        "waits = self.unsafe or self._room <= 0 or (self.starved and self.held_at is None)\n",
-        "waits = self.unsafe or self._room <= 0\n",
-        "a time master that waits for its own input forgets the members that are silent",
-    ),
-    Fault(
         "member",
         "        if self.master is None or block.source not in self.master.members:\n",
         "        if True:\n",

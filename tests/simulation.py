@@ -11,16 +11,21 @@ import json
 import random
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
+import numpy as np
+
 from lathe_rc import messages
+from lathe_rc.cell.block import Block
+from lathe_rc.cell.stage import Input
+from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import (
     Announcement,
     BadBlock,
-    BlockOrder,
     CellState,
     ForeignMessage,
     MemberProtocol,
@@ -29,6 +34,8 @@ from lathe_rc.protocol import (
     TimeMasterProtocol,
     actions,
 )
+from lathe_rc.protocol.inputs import Inputs
+from lathe_rc.protocol.kept_states import KeptStates
 
 SIZE = 4  # samples in a block
 HOST = "here"
@@ -37,14 +44,34 @@ RESTART_TIME = 1.0  # [s] that the cell waits for another process of a member
 HORIZON = 60.0  # [s] of simulated wall time after which a member that is still there hangs
 
 
-@dataclass(frozen=True)
-class Block:
-    """Block of one topic; `value` stands for its samples and depends on all inputs of the computation."""
+STEP_NS = 15_625
+SPOILED = {  #: what may be wrong with a block
+    "gap": lambda block: _shifted(block, SIZE),
+    "repeat": lambda block: _shifted(block, -SIZE),
+    "half a repeat": lambda block: _shifted(block, -SIZE // 2),
+    "far away": lambda block: _shifted(block, 2**40),
+    "short": lambda block: replace(block, samples=SIZE - 1, log_ns=block.log_ns - STEP_NS),
+    "long": lambda block: replace(block, samples=SIZE + 1, log_ns=block.log_ns + STEP_NS),
+    "step": lambda block: replace(block, step_ns=STEP_NS + 1),
+    "stamp": lambda block: replace(block, log_ns=block.log_ns + 1),
+    "last": lambda block: replace(block, last=not block.last),
+    "another source": lambda block: replace(block, source="/ghost"),
+}
 
-    source: str
-    index: int
-    value: int
-    last: bool
+
+def _shifted(block: Block, samples: int) -> Block:
+    return replace(block, first_index=block.first_index + samples, log_ns=block.log_ns + samples * STEP_NS)
+
+
+@cache
+def table_of(run_id: str, window: int) -> ToolParameters:
+    """Return the parameters of a simulated member."""
+    return ToolParameters(run_id=run_id, window=window, block_size=SIZE)
+
+
+def mixed(*parts: object) -> int:
+    """Return a number that depends on all parts, and that a sample can hold."""
+    return hash(parts) & (2**52 - 1)
 
 
 @dataclass(frozen=True)
@@ -69,7 +96,7 @@ class Design:
 
 def safe_value(name: str) -> int:
     """Return what a member computes in the safe state, whatever its inputs: its safe position."""
-    return hash((name, "safe"))
+    return mixed(name, "safe")
 
 
 class Network:
@@ -157,13 +184,18 @@ class Process:
         self._performs = self.listens = self._has_work = False
         self.blocks = 0
         self.values: list[int] = []
-        self.orders = {name: BlockOrder(name, cell.run_id) for name, _ in design.inputs}
-        self.taken: dict[str, list[int]] = {name: [] for name, _ in design.inputs}
-        self.last: dict[str, int | None] = dict.fromkeys(self.taken)  # index of the last block
-        self.held: dict[str, int] = {}  # index of the block from which the newest is held
+        table = table_of(cell.run_id, cell.window)
+        ports = [(name, Input(name, messages.COMMAND, ("position",), delay * SIZE)) for name, delay in design.inputs]
+        self.inputs, self.encoder = (
+            Inputs(ports, table, 1),
+            Encoder(messages.COMMAND, cell.run_id, design.name, STEP_NS),
+        )
+        for queue in self.inputs.queues.values():
+            queue.run_end = lambda: self.protocol.end
+        self.heard: dict[str, list[int]] = {name: [] for name, _ in design.inputs}  # values of the blocks read
+        self.kept: KeptStates[Any] = KeptStates(cell.window)
         self.safe_from: int | None = None  # index of the first block in the safe state
-        self._pace: BlockOrder | None = None  # of the time master, if no input limits the member
-        self._early: list[tuple[str, Block]] = []
+        self._early: list[tuple[str, Block, str]] = []
         is_master = design.name == cell.master
         own = Announcement(
             run_id=cell.run_id,
@@ -173,7 +205,7 @@ class Process:
             publishes=() if design.records else (design.name,),
             types=() if design.records else (messages.ENCODER if is_master else messages.STATE,),
             sparse=() if design.records else (False,),
-            subscribes=() if design.records else tuple(self.orders),
+            subscribes=() if design.records else tuple(self.heard),
             parameters=json.dumps({"stall_reaction": cell.stalls, "restart_file": "x" * design.restarts}),
             host=HOST,
             pid=self.pid,
@@ -194,7 +226,7 @@ class Process:
             self._advertise()
         self.protocol.activate(self.cell.now)
         while self._put_off:
-            self._receive(*self._put_off.popleft(), "")
+            self._receive(*self._put_off.popleft())
         self._step()
 
     def _advertise(self) -> None:
@@ -202,7 +234,7 @@ class Process:
         for topic in ("members", "cell_state", "progress"):
             net.advertise(self.identity, topic, 1)
         net.advertise(self.identity, self.design.name, 3 * self.cell.window + 32)
-        self._put_off: deque[tuple[str, object]] = deque()
+        self._put_off: deque[tuple[str, object, str]] = deque()
         self.cell.discover(self)
 
     def reads(self, topic: str) -> bool:
@@ -210,7 +242,8 @@ class Process:
             return self.design.name == self.cell.master
         if topic in ("members", "cell_state"):
             return True
-        return self.wired and (topic in self.orders or (self._pace is not None and topic == self.cell.master))
+        follows = self.inputs.pace is not None and topic == self.cell.master
+        return self.wired and (topic in self.heard or follows)
 
     wired = True
 
@@ -265,9 +298,9 @@ class Process:
                 assert isinstance(protocol, TimeMasterProtocol)
                 protocol.hear_progress(message, now, sender)
             elif not protocol.active:
-                self._put_off.append((topic, message))
+                self._put_off.append((topic, message, sender))
             elif isinstance(message, Block):
-                self._take_block(topic, message)
+                self._take_block(topic, message, sender)
         except ForeignMessage:
             self.strangers += 1
         except BadBlock as error:
@@ -275,21 +308,14 @@ class Process:
         except LatheError as error:
             protocol.fail(error)
 
-    def _take_block(self, topic: str, block: Block) -> None:
+    def _take_block(self, topic: str, block: Block, sender: str) -> None:
         if not self.protocol.ready:
-            self._early.append((topic, block))
+            self._early.append((topic, block, sender))
             return
         self._has_work = True
-        order = self.orders.get(topic) or self._pace
-        assert order is not None, "it reads the topic"
-        order.admit(self.cell.run_id, block.source)
-        if order.missing(block.source, self.cell.sample(block.index), SIZE) is not None:
-            order.append(self.cell.sample(block.index + 1), last=block.last)
-            if order is self._pace:
-                return
-            self.taken[topic].append(block.value)
-            if block.last:
-                self.last[topic] = block.index
+        queue = self.inputs.queues.get(topic) or self.inputs.pace
+        assert queue is not None, "it reads the topic"
+        queue.accept(block, sender)
 
     # ---- protocol
 
@@ -322,7 +348,7 @@ class Process:
 
     def _unmatched(self) -> Iterator[str]:
         cell, net, protocol = self.cell, self.cell.network, self.protocol
-        for topic in self.orders:
+        for topic in self.heard:
             for name in protocol.expected_writers(topic):
                 process = cell.process_of(name)
                 if process is None or not net.is_matched(process.identity, self.identity, topic):
@@ -362,8 +388,8 @@ class Process:
                 self._begin(joins=joins)
                 self.protocol.begun(now)
                 early, self._early = self._early, []
-                for topic, block in early:
-                    self._receive(topic, block, "")
+                for topic, block, sender in early:
+                    self._receive(topic, block, sender)
             case actions.CheckCell():
                 assert isinstance(self.protocol, TimeMasterProtocol)
                 self.protocol.start(now)
@@ -381,43 +407,41 @@ class Process:
     def _members_changed(self) -> None:
         if self.design.records and not self.wired and self.protocol.complete:
             self.wired = True
-            self.protocol.describe(subscribes=tuple(self.orders))
+            self.protocol.describe(subscribes=tuple(self.heard))
             self.cell.discover(self)
         peers = self.protocol.master.members if self.protocol.master else ()
-        for name, order in self.orders.items():
-            if name in peers and name in self.protocol.members and order.source != name:
-                order.expect(name, self.cell.first)
-                order.repeats = self.protocol.restarts(name)
+        for name, queue in self.inputs.queues.items():
+            if name in peers and name in self.protocol.members and queue.source != name:
+                queue.expect(name, self.cell.first)
+                queue.repeats = self.protocol.restarts(name)
 
     def _begin(self, *, joins: bool) -> None:
         if joins and not self.design.restarts:
             raise LatheError(f"{self.design.name}: the cell is running already")
+        self.inputs.begin(self.cell.first)
+        self.kept.begin(delay for each in self.cell.designs for name, delay in each.inputs if name == self.design.name)
         if joins:
             self._resume()
-        if self.design.restarts:
-            self._keep()
+        self._keep()
 
     def _keep(self) -> None:
-        """Store the state; a new process resumes from a state that no reader has passed."""
-        delays = [delay for each in self.cell.designs for name, delay in each.inputs if name == self.design.name]
-        behind = self.cell.window + max(delays, default=0)
-        kept = self.cell.files.setdefault(self.design.name, deque())
-        queues = {name: (order.end, order.received, list(self.taken[name])) for name, order in self.orders.items()}
-        kept.append((self.blocks, list(self.values), queues))
-        while len(kept) > 1 and kept[1][0] <= self.blocks - behind:
-            kept.popleft()
+        """Store the state, if another process of the member may resume from it."""
+        if not self.design.restarts or self.blocks < self.kept.keep_at:
+            return
+        past = {name: (buffer.end, buffer.past()) for name, buffer in self.inputs.buffers.items()}
+        queues = {name: queue.state() for name, queue in self.inputs.queues.items()}
+        state = self.blocks, list(self.values), past, queues
+        self.cell.files[self.design.name] = self.kept.keep(self.blocks, state)
 
     def _resume(self) -> None:
-        kept = self.cell.files.get(self.design.name)
-        if not kept:
+        if self.design.name not in self.cell.files:
             raise LatheError(f"{self.design.name}: no state to go on from")
-        self.blocks, values, queues = kept[0]
+        self.blocks, values, past, queues = self.cell.files[self.design.name]
         self.values = list(values)
-        kept.clear()
         self.protocol.resumed(self.blocks)
-        for name, (end, received, taken) in queues.items():
-            self.orders[name].resume(name, end, received, ended=False)
-            self.taken[name] = list(taken)
+        for name, queue in self.inputs.queues.items():
+            self.inputs.buffers[name].restart(*past[name])
+            queue.go_on(name, queues[name])
 
     # ---- role
 
@@ -427,33 +451,15 @@ class Process:
         if not action.again and self.design.name != self.cell.master:
             self.safe_from = self.cell.block(action.first)
             self.free_at, self.dawdles = max(self.free_at, self.cell.now) + self.dawdles, 0.0
-        lost, end = action.lost, self.cell.block(action.end)
-        for name, order in self.orders.items():
-            if name in lost and order.held_from is None:
-                self.held[name] = len(self.taken[name])
-                order.hold(self.cell.sample(end))
-                self.last[name] = max(end - 1, len(self.taken[name]) - 1)
-        forward = [name for name, delay in self.design.inputs if not delay]
-        if forward and all(name in self.held for name in forward) and self._pace is None:
-            self._follow(self.cell.master)
+        if self.inputs.lose(action.lost, action.end):
+            self.inputs.follow(self.cell.master, self.cell.master, action.first)
+            self.cell.discover(self)
 
-    def _follow(self, master: str) -> None:
-        """Limit the member to the spindle's progress."""
-        self._pace = BlockOrder(master, self.cell.run_id)
-        self._pace.expect(master, self.cell.sample(self.blocks))
-        self._pace.repeats = True
-        self.cell.discover(self)
-
-    def _block(self, name: str, index: int) -> int | None:
-        """Return the value of an input's block; None while it is missing."""
-        if index < 0:
-            return 0
-        taken = self.taken[name]
-        if index < len(taken):
-            return taken[index]
-        if name in self.held:
-            return taken[-1] if taken else 0
-        return None
+    @property
+    def held(self) -> dict[str, int]:
+        """Return the index of the block from which the newest one of a lost member is held."""
+        queues = self.inputs.queues.items()
+        return {name: self.cell.block(queue.held_from) for name, queue in queues if queue.held_from is not None}
 
     def _work(self) -> None:
         protocol, cell = self.protocol, self.cell
@@ -461,41 +467,40 @@ class Process:
             return
         if isinstance(protocol, TimeMasterProtocol):
             while protocol.may_release and protocol.credit > 0 and self.blocks != protocol.blocks_in_run:
-                protocol.starved = not self._compute(last=self.blocks + 1 == protocol.blocks_in_run)
+                first = cell.sample(self.blocks)
+                protocol.starved = not self.inputs.ready(first, self.blocks, 1, in_cell=True)
                 if protocol.starved:
                     return
+                self._compute(last=self.blocks + 1 == protocol.blocks_in_run)
                 self._perform_all()
             return
         while not protocol.over and not protocol.failure:
-            if self.design.restarts and self.blocks >= cell.files[self.design.name][-1][0] + cell.window:
-                self._keep()
-            lasts = [self.last[name] for name, delay in self.design.inputs if not delay]
-            last = bool(lasts) and all(each is not None and self.blocks >= each for each in lasts)
-            if not self._compute(last=last):
+            ready = self.inputs.ready(self.cell.sample(self.blocks), self.blocks, 1, in_cell=True)
+            if ready is None:
                 return
+            self._compute(last=ready[1])
             self._perform_all()
+            self._keep()
 
-    def _compute(self, *, last: bool) -> bool:
-        """Compute the next block, if its inputs have arrived; return True if it was computed."""
-        if self._pace is not None and self.cell.sample(self.blocks) >= self._pace.end:
-            return False
+    def _compute(self, *, last: bool) -> None:
+        """Compute the next block, whose inputs have arrived."""
+        first = self.cell.sample(self.blocks)
         inputs = []
-        for name, delay in self.design.inputs:
-            value = self._block(name, self.blocks - delay)
-            if value is None:
-                return False
-            inputs.append(value)
+        for (name, _), signals in zip(self.design.inputs, self.inputs.read(first, SIZE), strict=True):
+            inputs.append(int(signals["position"][0]))
+            self.heard[name].append(inputs[-1])
         safe = self.safe_from is not None and self.blocks >= self.safe_from
-        value = safe_value(self.design.name) if safe else hash((self.design.name, self.blocks, *inputs))
+        value = safe_value(self.design.name) if safe else mixed(self.design.name, self.blocks, *inputs)
         self.values.append(value)
         if isinstance(self.protocol, TimeMasterProtocol):
             self.protocol.release(1, self.cell.now)
         self.blocks += 1
         self.free_at = max(self.free_at, self.cell.now) + self.cost
         if not self.design.records:
-            shift, self.spoils = {"": 0, "gap": 1, "repeat": -1}[self.spoils], ""
-            block = Block(self.design.name, self.blocks - 1 + shift, value, last)
-            self.cell.network.publish(self.identity, self.design.name, block)
+            signals = {"position": np.full(SIZE, float(value))}
+            block = self.encoder.block(first, signals, None, last=last, companions=0)
+            spoiled, self.spoils = SPOILED.get(self.spoils), ""
+            self.cell.network.publish(self.identity, self.design.name, spoiled(block) if spoiled else block)
         self.protocol.computed(self.blocks, self.cell.sample(self.blocks), self.cell.now, last=last)
         if self.design.name == self.cell.master and not self.namesake:
             self.cell.look_at_window(self)
@@ -503,7 +508,6 @@ class Process:
                 self.cell.at(self.cell.now + self.cell.delay(), call)
         if last:
             self.protocol.complete_part()
-        return True
 
 
 class Simulation:
@@ -530,7 +534,7 @@ class Simulation:
         self.dead: list[Process] = []  # killed processes
         self.killed: dict[str, float] = {}  # time at which members have left otherwise
         self.since: dict[str, float] = {}  # time at which a process was stopped
-        self.files: dict[str, deque[Any]] = {}
+        self.files: dict[str, Any] = {}  # newest state of each member that can be restarted
         self.reports: list[tuple[float, str, str, Any]] = []
         self.network = Network(self)
         self._pids = 100
@@ -653,7 +657,7 @@ class Simulation:
         for index in range(self.length):
             for design in self.designs:
                 inputs = [values[name][index - delay] if index >= delay else 0 for name, delay in design.inputs]
-                values[design.name].append(hash((design.name, index, *inputs)))
+                values[design.name].append(mixed(design.name, index, *inputs))
         return values
 
 
@@ -741,7 +745,7 @@ class Schedule:
         if (process := self._process(design)) and not design.restarts and not design.records and self._running():
             self._blame(design)
             self.cell.spoiled = True
-            process.spoils = "gap" if seconds < 0.1 else "repeat"
+            process.spoils = list(SPOILED)[int(seconds * 1e6) % len(SPOILED)]
 
     def _dawdle(self, design: Design, seconds: float, other: Design) -> None:
         """Let the begin of the safe state take its time: the cell has to wait for it."""
@@ -909,8 +913,8 @@ def _unsafe(process: Process, cell: Simulation, safe: int) -> Iterator[str]:
     blocks = cell.safe_blocks if safe != cell.length else 0
     if process.design.name != cell.master and process.values[safe:] != [safe_value(process.design.name)] * blocks:
         yield f"{process.identity} is not at its safe position"
-    left = process.taken.keys() - process.protocol.without - {cell.master} if process.design.records else ()
-    yield from (f"the bag lacks {name}" for name in left if process.taken[name][safe:] != [safe_value(name)] * blocks)
+    left = process.heard.keys() - process.protocol.without - {cell.master} if process.design.records else ()
+    yield from (f"the bag lacks {name}" for name in left if process.heard[name][safe:] != [safe_value(name)] * blocks)
 
 
 def _lost_too_early(cell: Simulation) -> Iterator[str]:

@@ -369,6 +369,28 @@ def test_the_safe_state_ends_a_hold():
     assert protocol.held_at is None, "the members shall reach their safe state"
 
 
+@pytest.mark.parametrize("waits", ["for its own input", "for a report"])
+def test_a_silent_member_is_lost_although_the_window_is_not_used_up(waits):
+    """A time master in a chain with a controller waits for the feedback of the member, shorter than the window."""
+    protocol = leads(window=64)
+    release(protocol, 17 if waits == "for a report" else 3)
+    protocol.hear_progress(Progress("", "/recorder", protocol.blocks, 4 * protocol.blocks, 5), 0.0)
+    protocol.starved = waits == "for its own input"
+    for now in (0.05, 0.1, 0.15, 0.2):
+        protocol.look(now, {"/c": 0.01}, ())
+    assert protocol.without == {"/c"}
+    assert protocol.failure is None
+
+
+def test_a_member_that_is_slow_to_confirm_the_safe_state_is_waited_for():
+    protocol = leads()
+    release(protocol, 2)
+    protocol.declare_safe("the encoder is lost", 0.0)
+    for now in np.arange(0.05, 2.2, 0.05).tolist():
+        protocol.look(now, {}, ())
+        assert (protocol.failure is None) == (now < 2.01), "both are given up then, and nobody is left"
+
+
 @pytest.mark.parametrize("session", [0, 5])
 def test_progress_of_another_start_of_the_scenario_is_a_stranger(session):
     """Equal scenarios have equal run ids: "/c claims 7472 blocks; 0 were sent" ended a cell beside one that ended."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the blocks of one topic: each block once, no gaps, from one source."""
 
-from lathe_rc.protocol.messages import BadBlock, ForeignMessage
+from lathe_rc.protocol.messages import LONGEST, BadBlock, ForeignMessage
 
 
 class BlockOrder:
@@ -26,12 +26,13 @@ class BlockOrder:
         repeats: blocks may be repeated, since the source can be restarted in another process.
         held_from: sample from which the newest sample of a lost source is held; None: the source is not lost.
         rejected: a block of the source was bad; all that follow are ignored.
+        sender: node that has published the next block, as DDS knows it; empty: not known.
     """
 
     def __init__(self, topic: str, run_id: str, longest_gap: int | None = None) -> None:
         self.topic = topic
         self._run_id, self._longest_gap = run_id, longest_gap
-        self.source = ""
+        self.source = self.sender = ""
         self.open, self.ended, self.repeats, self.rejected = True, False, False, False
         self.received = self.lost = self.end = 0
         self.lossy = False
@@ -58,12 +59,17 @@ class BlockOrder:
         """Reject a block from outside the cell.
 
         Raises:
-            ForeignMessage: the block has another run id or source.
+            ForeignMessage: the block has another run id, source or sender.
+            BadBlock: the source's own block names another one.
         """
         if self._run_id and run_id != self._run_id:
             raise ForeignMessage(self.topic, source, run_id, f"expected run {self._run_id!r}")
+        if source != self.source and self.source and self.sender == self.source:
+            raise self.reject(self.source, f"{self.source} sends a block of {source[:LONGEST]!r}")
         if source != self.source and (self.source or self._run_id):
             raise ForeignMessage(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
+        if self.sender not in ("", source):
+            raise ForeignMessage(self.topic, source, run_id, f"it is from {self.sender}")
 
     def missing(self, source: str, first: int, samples: int) -> int | None:
         """Return the number of samples missing before a block; None for a repeat, or if it is ignored.

@@ -71,17 +71,16 @@ class BlockQueue(BlockOrder):
         """
         if self.ignores:
             return None
+        self.sender = sender
         try:
             block = self._decoder.decode(data)
             self.admit(block.run_id, block.source)
-            if sender not in ("", block.source):
-                raise ForeignMessage(self.topic, block.source, block.run_id, f"it is from {sender}")
             self._decoder.check()
         except NoBlockError as error:
+            if sender and sender == self.source:
+                raise self.reject(sender, f"{sender} sends bytes that are no block: {error}") from None
             raise ForeignMessage(self.topic, "", "", str(error)) from None
         except ValueError as error:
-            if sender not in ("", self.source):
-                raise ForeignMessage(self.topic, self.source, self._run_id, f"it is from {sender}") from None
             raise self.reject(self.source, str(error)) from None
         return self._queue(block)
 
@@ -103,8 +102,9 @@ class BlockQueue(BlockOrder):
         """Return the last block taken by `add`, encoded as lathe_rc's own nodes do."""
         return self._decoder.message
 
-    def accept(self, block: Block) -> Block | None:
+    def accept(self, block: Block, sender: str = "") -> Block | None:
         """Check a decoded block of finite numbers and queue it (see `add`)."""
+        self.sender = sender
         self.admit(block.run_id, block.source)
         return self._queue(block)
 

@@ -27,6 +27,7 @@ _END_BY_MASTER = 1.0  # [s] for a time master that is ended by the same Ctrl-C t
 LONGEST_MESSAGE = 1024  #: characters of Member.msg and CellState.msg
 _MOST_MEMBERS = 256  # largest number of announced names
 INACTIVE = "inactive"  #: message of a member that is deactivated
+_PHASES, _STATES = frozenset(Phase), frozenset(MemberState)
 _WAIT_REPORTS = (2.0, 8.0, 30.0)  # [s] of waiting until each report; the last one repeats
 
 
@@ -255,7 +256,7 @@ class MemberProtocol:
             why = f"expected run {self.own.run_id!r}"
         elif sender not in ("", member.name):
             why = f"it is from {sender}"
-        elif member.state not in tuple(MemberState):
+        elif member.state not in _STATES:
             why = f"state {member.state}; expected one of its states"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
@@ -461,7 +462,7 @@ class MemberProtocol:
             if self.own.run_id:
                 raise ForeignMessage("cell_state", "", state.run_id, f"expected run {self.own.run_id!r}")
             return
-        if state.state not in tuple(Phase):
+        if state.state not in _PHASES:
             raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
         led = self.master is not None and sender in ("", self.master.name)
         if self.master is None or not led or state.session not in (0, self.master.session):

@@ -10,7 +10,7 @@ from enum import IntEnum
 
 from lathe_rc.errors import LatheError
 
-_LONGEST = 256  # characters of a quoted name
+LONGEST = 256  #: characters of a quoted name
 
 
 class MemberState(IntEnum):
@@ -113,8 +113,8 @@ class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wro
     """
 
     def __init__(self, topic: str, source: str, run_id: str, why: str) -> None:
-        self.sender = f"{source[:_LONGEST] or 'an unknown sender'} of run {run_id[:_LONGEST]!r} on {topic}"
-        super().__init__(f"{topic}: message of run {run_id[:_LONGEST]!r} from {source[:_LONGEST] or '?'}; {why}")
+        self.sender = f"{source[:LONGEST] or 'an unknown sender'} of run {run_id[:LONGEST]!r} on {topic}"
+        super().__init__(f"{topic}: message of run {run_id[:LONGEST]!r} from {source[:LONGEST] or '?'}; {why}")
         self.topic = topic
         self._rest = source, run_id, why
 
