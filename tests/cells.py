@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from lathe_rc import harness, messages
 from lathe_rc.bag.resimulation.resim import resimulate
-from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES, Scenario, load
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell, Unknown
@@ -84,6 +84,13 @@ def run(shared: Values | None = None, **nodes: Values) -> harness.Result:
 def config(name: str, *overrides: str) -> Scenario:
     """A scenario that comes with lathe_rc, with changes as ``--set`` takes them."""
     return load(SCENARIOS[0].with_stem(name), list(overrides))
+
+
+def of_nodes(name: str, nodes: Mapping[str, NodeParameters]) -> Scenario:
+    """A cell of other nodes than its time master names."""
+    (master,) = Scenario(name, nodes).masters
+    table = nodes[master].model_copy(update={"members": list(nodes)})
+    return Scenario(name, {**nodes, master: table})
 
 
 def assert_resimulated(bag: Path) -> None:

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from cells import config, form_error
+from cells import config, form_error, of_nodes
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -223,7 +223,7 @@ def test_a_gauge_that_nobody_learns_from_changes_nothing():
     """The drive's own sensor gives the bits of the cell without a gauge."""
     with_gauge = config("gauged", BLIND, "spindle_encoder.revolutions=3.0")
     nodes = {name: table for name, table in with_gauge.nodes.items() if name != "gauge"}
-    without = type(with_gauge)("without", nodes)
+    without = of_nodes("without", nodes)
     assert_array_equal(form_error(harness.run(with_gauge)), form_error(harness.run(without)))
 
 
