@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cells import of_nodes
 
 from lathe_papers import cells
 from lathe_rc import harness
@@ -45,7 +46,7 @@ def series_cell(mass_ratio):
     kept = {name: table for name, table in nodes.items() if name not in ("electrodynamic_actuator", "piezo_actuator")}
     common = {name: getattr(nodes["tool"], name) for name in ("sample_rate", "block_size", "nominal_rpm", "run_id")}
     table = scenario.TABLES["series_drive"].read("series_drive", {**common, "mass_ratio": mass_ratio})
-    return cells.of_nodes("series", {**kept, "series_drive": table})
+    return of_nodes("series", {**kept, "series_drive": table})
 
 
 def test_undamped_piezo_in_a_learning_channel_is_refused_with_the_worst_frequency():
