@@ -110,6 +110,7 @@ for ratio in (None, 0.0, 0.1):
         del nodes["electrodynamic_actuator"], nodes["piezo_actuator"]
         values = {**shared, **direct, "mass_ratio": ratio}
         nodes["series_drive"] = SeriesDriveParameters.read("series_drive", values)
+        nodes["spindle_encoder"] = nodes["spindle_encoder"].model_copy(update={"members": list(nodes)})
         title = f"series, m/M = {ratio:g}"
     result = lathe_rc.run(scenario.Scenario("series", nodes))
     print(f"| {title} | {result.errors.rms[-1] * 1e9:.2f} nm |")
