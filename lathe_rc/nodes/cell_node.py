@@ -616,7 +616,7 @@ class CellNode(LifecycleNode):
         named = self.guarded(callback, always=always)
 
         def call(data: bytes, publisher: bytes) -> None:
-            if sender := self._senders.get(publisher):
+            if (sender := self._senders.get(publisher)) is not None:
                 named(data, sender)
                 return
             most = _MOST_DEFERRED * signal_depth(self.table)
@@ -631,7 +631,7 @@ class CellNode(LifecycleNode):
         """Hand over the messages of a publisher once the ROS graph names its node."""
         self._senders = graph.senders(self, topic) | self._senders if len(self._senders) < _MOST_SENDERS else {}
         sender, waiting = self._senders.get(publisher), self._nameless[topic, publisher]
-        while sender and waiting:
+        while sender is not None and waiting:
             named, data, _ = waiting.popleft()
             named(data, sender)
         if waiting and time.monotonic() > waiting[0][2] + _NAMELESS:

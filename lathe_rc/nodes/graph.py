@@ -13,7 +13,7 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from lathe_rc import allowed_code, resources
-from lathe_rc.cell.beside import REPLAYED_FILES
+from lathe_rc.cell.beside import REPLAYED_FILES, REPLAYER
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import Unknown
@@ -33,9 +33,12 @@ def publishers(node: Node, topic: str) -> list[str]:
 
 
 def senders(node: Node, topic: str) -> dict[bytes, str]:
-    """Return the names of the nodes that publish a topic, by the identity of their publishers."""
-    ends = node.get_publishers_info_by_topic(topic)
-    return {bytes(end.endpoint_gid[:GID]): _name(end) for end in ends if end.node_name != _NOT_TOLD_YET}
+    """Return the names of the nodes that publish a topic, by the identity of their publishers.
+
+    A replayer speaks for all nodes of its bag: its name is empty, as if it were not known.
+    """
+    ends = [end for end in node.get_publishers_info_by_topic(topic) if end.node_name != _NOT_TOLD_YET]
+    return {bytes(end.endpoint_gid[:GID]): "" if end.node_name == REPLAYER else _name(end) for end in ends}
 
 
 def unmatched(

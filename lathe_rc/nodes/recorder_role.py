@@ -141,7 +141,7 @@ class RecorderRole(Role):
 
     def _is_master(self, name: str) -> bool:
         master = self.node.protocol.master
-        return master is None or master.name == name
+        return master is None or name in ("", master.name)
 
     def subscriptions(self) -> list[str]:
         """Return all signal topics of the members."""
@@ -319,7 +319,7 @@ class RecorderRole(Role):
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
-        if sender != source:
+        if sender not in ("", source):
             raise ForeignMessage(topic, source, run_id, f"it is from {sender}")
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._first + (self._merger.samples if self._merger else 0)
