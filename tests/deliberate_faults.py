@@ -183,8 +183,8 @@ FAULTS = (
     ),
     Fault(
         "member",
-        '        elif sender not in ("", member.name):\n',
-        "        elif False:\n",
+        '        if sender not in ("", member.name):\n',
+        "        if False:\n",
         "the announcement of another node in a member's name is believed",
     ),
     Fault(

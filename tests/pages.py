@@ -197,7 +197,7 @@ class Reader:
         lathe.chmod(0o755)
         patch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
         patch.setenv("LATHE", str(ROOT))
-        patch.delenv("COLUMNS", raising=False)  # what a page shows has no width
+        patch.setenv("COLUMNS", "120")  # as wide as a page
         patch.chdir(folder)
 
     def follow(self, page: Path) -> None:

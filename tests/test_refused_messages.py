@@ -141,7 +141,7 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items())) | {
         "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states",
         "/tool of run 'elsewhere' on /members",
-        "/made_up of run 'test' on /members",
+        "/haunted/ghost of run 'test' on /members",
         "an unknown sender of run 'x' on /cell_state",
         "/tool of run 'x' on /progress",
     }

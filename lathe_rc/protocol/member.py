@@ -253,10 +253,11 @@ class MemberProtocol:
         """Reject an announcement from outside the cell."""
         why, known = "", self.members.get(member.name)
         if self.own.run_id and member.run_id != self.own.run_id:
-            why = f"expected run {self.own.run_id!r}"
-        elif sender not in ("", member.name):
-            why = f"it is from {sender}"
-        elif member.state not in _STATES:
+            raise ForeignMessage("members", member.name, member.run_id, f"expected run {self.own.run_id!r}")
+        if sender not in ("", member.name):
+            # Counted by its sender: a flood of made-up names must not hide what others send.
+            raise ForeignMessage("members", sender, member.run_id, f"it speaks as {member.name}")
+        if member.state not in _STATES:
             why = f"state {member.state}; expected one of its states"
         elif member.members and member.stage not in self._masters:
             why = f"a time master is a {' or '.join(self._masters)}"
