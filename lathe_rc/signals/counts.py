@@ -21,7 +21,7 @@ import numpy as np
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.edge_time import COUNT, STAMP, edge_table, pass_edge, passed
-from lathe_rc.signals.table import delimiter_of, lines_of, pointed, read_text
+from lathe_rc.signals.table import lines_of, pointed, read_text
 
 #: time [ns], counter and, with edge times, that of the last edge [ns]; an integer counter as int, for all its digits
 Reading = tuple[int, int | float] | tuple[int, int | float, int]
@@ -111,8 +111,7 @@ class CsvReader(Reader):
     def __init__(self, path: Path) -> None:
         text = read_text(path, "counts")
         self._path, self._ends = path, text.endswith(("\n", "\r"))
-        lines = lines_of(text)
-        mark = delimiter_of(lines[0][1]) if lines else ","
+        lines, mark = lines_of(text)
         self._lines = [(n, pointed(line, mark).replace(mark, ",")) for n, line in lines]
         header = self._lines[0][1].replace(" ", "") if self._lines else ""
         found = _COLUMNS.fullmatch(header)

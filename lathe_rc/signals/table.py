@@ -95,9 +95,21 @@ def read_text(path: Path, what: str) -> str:
         raise not_text(path) from None
 
 
-def lines_of(text: str) -> list[tuple[int, str]]:
-    """Return the lines of a table that are neither empty nor comments, with their numbers from 1."""
-    return [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"]
+def lines_of(text: str) -> tuple[list[tuple[int, str]], str]:
+    """Return the lines of a table but empty ones and comments, numbered from 1, and the mark between columns."""
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"]
+    return lines, delimiter_of(lines[0][1]) if lines else ","
+
+
+def header_and_rows(text: str, path: Path) -> tuple[list[str], list[tuple[int, list[str]]], str]:
+    """Return the header of a table, the rows below it with their line numbers, and the mark between columns.
+
+    Raises:
+        InputError: a line is not CSV.
+    """
+    lines, delimiter = lines_of(text)
+    (_, header), *found = [*rows(lines, path, delimiter)] or [(0, [])]
+    return [name.strip() for name in header], found, delimiter
 
 
 def number(text: str, path: Path, line: int) -> float:
@@ -144,10 +156,7 @@ def parse_table(
     Raises:
         InputError: the file is malformed, or contains a number that is not finite.
     """
-    lines = lines_of(text)
-    delimiter = delimiter_of(lines[0][1]) if lines else ","
-    (_, names), *found = [*rows(lines, path, delimiter)] or [(0, [])]
-    header = [name.strip() for name in names]
+    header, found, delimiter = header_and_rows(text, path)
     if header not in [list(known) for known in headers]:
         allowed = " or ".join(",".join(known) for known in headers)
         raise InputError(f"{path}: header {delimiter.join(header)!r}; allowed: {allowed}")

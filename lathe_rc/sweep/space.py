@@ -308,11 +308,9 @@ def given(path: Path, carried: Collection[str] = ()) -> list[dict[str, Value]]:
             {name: str(value) if name in carried else value for name, value in cell.items()}
             for cell in ros_yaml.rows(text, str(path))
         ]
-    lines = table.lines_of(text)
-    mark = table.delimiter_of(lines[0][1]) if lines else ","
-    (_, header), *rows = [*table.rows(lines, path, mark)] or [(0, [])]
+    targets, rows, mark = table.header_and_rows(text, path)
     for line, row in rows:
-        table.check_width(path, line, len(row), len(header))
+        table.check_width(path, line, len(row), len(targets))
 
     def value(target: str, text: str) -> Value:
         if target in carried:
@@ -320,7 +318,6 @@ def given(path: Path, carried: Collection[str] = ()) -> list[dict[str, Value]]:
         text = table.pointed(text, mark) if _DECIMAL.fullmatch(text) else text
         return ros_yaml.parse_value(text, f"{path}: {target}")
 
-    targets = [target.strip() for target in header]
     return [{target: value(target, text) for target, text in zip(targets, row, strict=True)} for _, row in rows]
 
 
