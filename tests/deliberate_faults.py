@@ -195,8 +195,8 @@ FAULTS = (
     ),
     Fault(
         "time_master",
-        '        if sender not in ("", name):\n',
-        "        if False:\n",
+        '        check_sender("progress", name, progress.run_id, sender)\n',
+        "",
         "the progress of another node in a member's name is believed",
     ),
     Fault(

@@ -33,6 +33,7 @@ from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
 from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
 from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.messages import check_sender
 
 _HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos(4)}
 _OFFERED = {topic.name: topic for topic in HOST_TOPICS}
@@ -319,8 +320,7 @@ class RecorderRole(Role):
         source, run_id = getattr(message, "source", self._sparse[topic]), getattr(message, "run_id", self.table.run_id)
         if source != self._sparse[topic] or (self.table.run_id and run_id != self.table.run_id):
             raise ForeignMessage(topic, source, run_id, f"expected {self._sparse[topic]} of run {self.table.run_id!r}")
-        if sender not in ("", source):
-            raise ForeignMessage(topic, source, run_id, f"it is from {sender}")
+        check_sender(topic, source, run_id, sender)
         sample, rest = divmod(messages.stamp_ns(message) - messages.START_NS, self.table.step_ns)
         begin = self._first + (self._merger.samples if self._merger else 0)
         end = begin + self._depth * self.table.block_size if self._merger else sample + 1

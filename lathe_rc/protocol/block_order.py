@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Order of the blocks of one topic: each block once, no gaps, from one source."""
 
-from lathe_rc.protocol.messages import LONGEST, BadBlock, ForeignMessage
+from lathe_rc.protocol.messages import LONGEST, BadBlock, ForeignMessage, check_sender
 
 
 class BlockOrder:
@@ -68,8 +68,7 @@ class BlockOrder:
             raise self.reject(self.source, f"{self.source} sends a block of {source[:LONGEST]!r}")
         if source != self.source and (self.source or self._run_id):
             raise ForeignMessage(self.topic, source, run_id, f"expected {self.source or 'nobody yet'}")
-        if self.sender not in ("", source):
-            raise ForeignMessage(self.topic, source, run_id, f"it is from {self.sender}")
+        check_sender(self.topic, source, run_id, self.sender)
 
     def missing(self, source: str, first: int, samples: int) -> int | None:
         """Return the number of samples missing before a block; None for a repeat, or if it is ignored.

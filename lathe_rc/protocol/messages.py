@@ -121,3 +121,13 @@ class ForeignMessage(LatheError):  # noqa: N818 - the message, not what went wro
     def on(self, topic: str) -> "ForeignMessage":
         """Return a copy of the error with another topic name."""
         return ForeignMessage(topic, *self._rest)
+
+
+def check_sender(topic: str, source: str, run_id: str, sender: str) -> None:
+    """Reject a message that names another node than its sender, as DDS knows it; empty: the sender is not known.
+
+    Raises:
+        ForeignMessage: the sender is another node.
+    """
+    if sender not in ("", source):
+        raise ForeignMessage(topic, source, run_id, f"it is from {sender}")

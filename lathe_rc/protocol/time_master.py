@@ -18,7 +18,16 @@ from lathe_rc.protocol.member import (
     given_up,
     why_failed,
 )
-from lathe_rc.protocol.messages import Announcement, BadBlock, CellState, ForeignMessage, MemberState, Phase, Progress
+from lathe_rc.protocol.messages import (
+    Announcement,
+    BadBlock,
+    CellState,
+    ForeignMessage,
+    MemberState,
+    Phase,
+    Progress,
+    check_sender,
+)
 
 _REPORT_PERIOD = 0.05  # [s] between reports of progress
 _ANNOUNCED = 0.05  # [s] from the announcement of an early end to the last block
@@ -207,8 +216,7 @@ class TimeMasterProtocol(MemberProtocol):
         if progress.run_id != self.own.run_id:
             raise ForeignMessage("progress", progress.name, progress.run_id, f"expected run {self.own.run_id!r}")
         name = progress.name
-        if sender not in ("", name):
-            raise ForeignMessage("progress", name, progress.run_id, f"it is from {sender}")
+        check_sender("progress", name, progress.run_id, sender)
         if name == self.own.name and progress.session in (0, self.own.session):
             return  # a process publishes the progress of all its nodes, which reaches them too
         if not self.running:
@@ -279,18 +287,17 @@ class TimeMasterProtocol(MemberProtocol):
         A run with a planned end fails after it, since it has not come to this end.
         """
         planned, self.ends_early, self.active, self.held_at, self._heard = self.end, True, True, None, now
-        if not (self._declared or self.cut):
-            end = self.samples + self._reactions.block_size
-            if planned is None or end < planned:
-                self._set_end(end)
-                self.cut = f"{why}; it ends at sample {end}" + (f" of {planned}" if planned is not None else "")
-                self._short = planned is not None
-                self._log("info", self.cut)
-                self._say(Phase.RUNNING, self._first, self.cut)
-                # The last block comes on another topic: readers that know of no earlier end would reject it.
-                self.held_at, self._last_due = self.blocks, now + _ANNOUNCED
-                return
-        self.actions.append(do.Release())
+        end = self.samples + self._reactions.block_size
+        if self._declared or self.cut or (planned is not None and end >= planned):
+            self.actions.append(do.Release())
+            return
+        self._set_end(end)
+        self.cut = f"{why}; it ends at sample {end}" + (f" of {planned}" if planned is not None else "")
+        self._short = planned is not None
+        self._log("info", self.cut)
+        self._say(Phase.RUNNING, self._first, self.cut)
+        # The last block comes on another topic: readers that know of no earlier end would reject it.
+        self.held_at, self._last_due = self.blocks, now + _ANNOUNCED
 
     def finish_run(self) -> None:
         """End the run after all members have completed the last block."""
