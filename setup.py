@@ -2,6 +2,7 @@
 """Package metadata; colcon, pip and the ament index all read it from here."""
 
 import re
+import runpy
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -13,9 +14,10 @@ HERE = Path(__file__).resolve().parent
 # read, not imported: nothing that the stages need is there yet
 STAGES = re.findall(r'^    "(\w+)": "\w+:\w+",$', (HERE / "lathe_rc/cell/stages/__init__.py").read_text(), re.MULTILINE)
 NODES = [*STAGES, "recorder"]
+TABLES = runpy.run_path(str(HERE / "lathe_rc/packages.py"))
+PACKAGES, ALONE = sorted(TABLES["OURS"]), TABLES["STANDALONE"]
 PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
 STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
-ALONE = ["container", "machine_state", "replayer", "rerun_bridge", "topic_recorder"]
 EXECUTABLES = {
     **{name: f"lathe_rc.nodes.executables:{name}" for name in (*NODES, *ALONE)},
     "launch_plan": "lathe_rc.harness.launch_plan:main",
@@ -76,23 +78,25 @@ setup(
     long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
-    packages=find_packages(include=["lathe_rc", "lathe_rc.*", "lathe_papers", "lathe_papers.*"]),
+    packages=find_packages(include=[each for name in PACKAGES for each in (name, f"{name}.*")]),
     # lathe_rc/msg_defs is a link to msg_defs: importlib.resources finds the messages in every installation
     package_data={
         "lathe_rc": [
             "py.typed",
             "__init__.pyi",
-            "*/__init__.pyi",
             "nodes/*.xml",
             "msg_defs/msg/*.msg",
             "msg_defs/srv/*.srv",
-            "sweep/*.j2",
             "view/*.j2",
             "view/*.css",
-            "view/*.html",
             "view/*.js",
             "templates/*/*.j2",
-        ]
+        ],
+        "lathe_bagtools": ["py.typed", "__init__.pyi"],
+        "lathe_commission": ["py.typed"],
+        "lathe_explore": ["py.typed", "__init__.pyi", "sweep/*.j2"],
+        "lathe_export": ["py.typed", "__init__.pyi", "templates/*/*.j2"],
+        "lathe_live": ["py.typed", "*.j2", "*.css", "*.html", "*.js"],
     },
     data_files=shared_files(),
     python_requires=">=3.10",

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import sides
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, resources
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
 

@@ -22,10 +22,10 @@ import psutil
 from benchmarks import batch
 from benchmarks.engine import OVERRIDES, loaded
 from benchmarks.sides import alternate, ratio, spread
+from lathe_explore.sweep import row, workers
+from lathe_explore.sweep.space import Space
+from lathe_explore.sweep.sweep import run_sweep
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.sweep import row, workers
-from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.sweep import run_sweep
 
 _CORES = os.cpu_count() or 1
 _CELLS = {"two_channel": 10_000, "full_cell": 2000}

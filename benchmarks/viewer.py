@@ -28,7 +28,7 @@ def _log(file: Path, recording: Recording, samples: int, step: float) -> int:
     """Log single samples of every curve to a file; returns how many."""
     import rerun as rr
 
-    from lathe_rc.view.rerun_signals import curve_path, curves
+    from lathe_live.rerun_signals import curve_path, curves
 
     drawn = [
         (curve_path(topic, field), recording.dense[topic][field] * curve.scale)
@@ -50,8 +50,8 @@ def measure(*, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     """Export against single logs."""
     if importlib.util.find_spec("rerun_bindings") is None:
         return {"reason": "rerun is not installed (pip install rerun-sdk)"}
-    from lathe_rc.view.rerun_bag import write
-    from lathe_rc.view.rerun_signals import curves
+    from lathe_live.rerun_bag import write
+    from lathe_live.rerun_signals import curves
 
     rounds = 2 if quick else 5
     piston = scenario.load(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws img/architecture.svg of index.md: the packages of lathe_rc in layers, and who imports whom.
+"""Draws img/architecture.svg of index.md: the packages in layers, and who imports whom.
 
 tests/test_site.py compares the picture with the imports in the code.
 """
@@ -18,16 +18,25 @@ class Layer(NamedTuple):
 
 #: Who is in a layer imports from it and from those below.
 LAYERS = (
-    Layer("the command line", {"commands": "lathe run, sweep, view, report, …"}),
+    Layer(
+        "other packages",
+        {
+            "lathe_bagtools": "replay, resim",
+            "lathe_commission": "fit, design",
+            "lathe_explore": "sweep, tune",
+            "lathe_export": "tables, C, FMU",
+            "lathe_live": "panel, Rerun",
+        },
+    ),
+    Layer("the command line", {"commands": "lathe run, bag, report, …"}),
     Layer("Python", {"harness": "runs a scenario, scores it"}),
-    Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS", "sweep": "variations, tuning, on all cores"}),
-    Layer("to look at", {"view": "report, figures, Rerun, notebooks"}),
+    Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS"}),
+    Layer("to look at", {"view": "report, figures, notebooks"}),
     Layer(
         "beside the cell",
         {
             "bag": "MCAP: record, read, repair",
             "protocol": "joining, progress, the end",
-            "c_library": "stages without Python",
         },
     ),
     Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
@@ -88,7 +97,7 @@ def picture() -> str:
             kind = "box ros" if name == "nodes" else "box"
             drawn += [
                 f'<rect class="{kind}" x="{x:g}" y="{y}" width="{width:g}" height="{HEIGHT}" rx="6"/>',
-                f'<text class="name" x="{x + width / 2:g}" y="{y + 21}" text-anchor="middle">{name}</text>',
+                f'<text class="name" x="{x + width / 2:g}" y="{y + 21}" text-anchor="middle">{name.removeprefix("lathe_")}</text>',
                 f'<text class="what" x="{x + width / 2:g}" y="{y + 39}" text-anchor="middle">{what}</text>',
             ]
     for start, end in BESIDE:

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc.analysis import modal_fit
+from lathe_commission import modal_fit
+from lathe_commission.modal_fit import ResponseData
 from lathe_rc.analysis.frequency_response import FrequencyResponse, deviation_of, estimate
 from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.analysis.modal_fit import ResponseData
 from lathe_rc.transfer import LinearSystem, TransferFunction
 
 Array = npt.NDArray[np.float64]

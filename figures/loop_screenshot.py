@@ -6,8 +6,8 @@ from pathlib import Path
 
 import lathe_rc
 from chromium import save, shot
-from lathe_rc.cell.varied_loop import VariedLoop
-from lathe_rc.view.loop_page import LoopPage
+from lathe_live.loop_page import LoopPage
+from lathe_live.varied_loop import VariedLoop
 
 SIZE = (1240, 1330)
 

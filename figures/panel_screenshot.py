@@ -7,8 +7,8 @@ from pathlib import Path
 
 import lathe_rc
 from chromium import SETTLED, Chromium, light_and_dark, save
-from lathe_rc.view import page_server, panel
-from lathe_rc.view.panel_run import Driver, LiveCell
+from lathe_live import page_server, panel
+from lathe_live.panel_run import Driver, LiveCell
 
 WIDE, NARROW = (1280, 900), (420, 900)
 BROKEN, LATER = 45, 47  # revolutions

@@ -8,8 +8,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 import lathe_rc
+from lathe_commission.hysteresis_fit import Loop, identify
 from lathe_rc import messages
-from lathe_rc.analysis.hysteresis_fit import Loop, identify
 from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from lathe_rc.view import rerun_bag
-from lathe_rc.view.rerun_output import require
+from lathe_live import rerun_bag
+from lathe_live.rerun_output import require
 from place import PICTURES
 
 SIZE = (1500, 900)

@@ -184,7 +184,7 @@ def _base() -> Scenario:
 
 def run(parameters: BestLawParameters, track: Track = untracked) -> BestLawResult:
     """Run the sweep and collect the error of each law under each condition."""
-    from lathe_rc.sweep.space import Space
+    from lathe_explore.sweep.space import Space
 
     base = _base()
     laws = {law: values[0] for law, values in settings(SpeedDeviationParameters(model_error=0.0)).items()}

@@ -123,7 +123,7 @@ def _drawn(scenario: Scenario) -> list[str]:
 
 def run(parameters: DriveToleranceParameters, track: Track = untracked) -> DriveToleranceResult:
     """Run the sweep and collect the errors by tolerance."""
-    from lathe_rc.sweep.space import Space
+    from lathe_explore.sweep.space import Space
 
     base = cells.load(parameters.scenario, spindle_encoder={"revolutions": parameters.revolutions})
     spaces = [Space(given=[{"seed": base.shared.seed}])]

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import lathe_rc
+import lathe_explore
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.study import Track
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from lathe_rc.sweep.space import Space
+    from lathe_explore.sweep.space import Space
 
 
 def table(
@@ -26,9 +26,9 @@ def table(
         folder: parent folder of the sweep folders; empty to discard the rows.
         columns: columns to read; a target that a sweep does not vary has the scenario's value.
         track: progress display, in cells.
-        options: further arguments of `lathe_rc.run_sweep`.
+        options: further arguments of `lathe_explore.run_sweep`.
     """
-    from lathe_rc.sweep.workers import client_of
+    from lathe_explore.sweep.workers import client_of
 
     count = sum(space.count(scenario) for _, scenario, space in asked)
     steps = iter(track(range(count)))
@@ -42,7 +42,7 @@ def table(
         place = Path(folder or temporary)
         found = []
         for name, scenario, space in asked:
-            swept = lathe_rc.run_sweep(scenario, space, place / name, client=client, watch=watch, **options)
+            swept = lathe_explore.run_sweep(scenario, space, place / name, client=client, watch=watch, **options)
             found.append(swept.table().select([name for name in columns if name in swept.folder.schema.names]))
         list(steps)
         return found

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 # The public face of lathe_rc, and the only list of it: `lathe_rc.public` imports from here. Other modules may change.
 
+from lathe_bagtools.hosts import digests_by_host as digests_by_host
+from lathe_explore.sweep.space import Space as Space
+from lathe_explore.sweep.sweep import run_sweep as run_sweep
+from lathe_explore.sweep.tune import tune as tune
+from lathe_export.tables.export import export_bag as export_bag
 from lathe_rc import messages as messages
 from lathe_rc import study as study
-from lathe_rc.bag.exporting.export import export_bag as export_bag
 from lathe_rc.bag.reader import read_bag as read_bag
 from lathe_rc.cell.batch import run_many as run_many
 from lathe_rc.cell.budget import budget as budget
@@ -25,11 +29,7 @@ from lathe_rc.errors import InputError as InputError
 from lathe_rc.errors import LatheError as LatheError
 from lathe_rc.harness.result import Result as Result
 from lathe_rc.harness.runner import run as run
-from lathe_rc.hosts import digests_by_host as digests_by_host
 from lathe_rc.jit import kernel as kernel
-from lathe_rc.sweep.space import Space as Space
-from lathe_rc.sweep.sweep import run_sweep as run_sweep
-from lathe_rc.sweep.tune import tune as tune
 from lathe_rc.view.report import write_report as write_report
 
 __version__: str

@@ -14,8 +14,8 @@ import click
 from click.shell_completion import CompletionItem
 
 from lathe_rc import __version__, allowed_code, extras
-from lathe_rc.command_list import COMMANDS, imported
 from lathe_rc.errors import LatheError, shown
+from lathe_rc.packages import COMMANDS
 
 
 class _Command(click.Command):
@@ -25,7 +25,7 @@ class _Command(click.Command):
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
         """Return the Click context of the imported command."""
-        return imported(str(self.name)).make_context(info_name, args, parent, **extra)
+        return extras.command(str(self.name)).make_context(info_name, args, parent, **extra)
 
 
 class Group(click.Group):

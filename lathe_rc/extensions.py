@@ -27,6 +27,7 @@ from pydantic_core import core_schema
 
 from lathe_rc import allowed_code
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.packages import OURS
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -241,12 +242,12 @@ def search_path() -> str:
 
 
 def is_ours(module: str) -> bool:
-    """Return whether a module belongs to lathe_rc.
+    """Return whether a module belongs to this distribution.
 
     The name of the compiled-code folder contains a hash of lathe_rc's own source. The source of third-party modules is
     covered by the cache of their steps instead (`lathe_rc.compiled.step`).
     """
-    return module.startswith(("lathe_rc.", "lathe_papers."))
+    return module.partition(".")[0] in OURS
 
 
 @cache
@@ -284,7 +285,8 @@ def source_hash(module: str) -> str:
 _INSTALLED = sysconfig.get_path("purelib")
 #: packages whose versions do not change within an installation, the first two with a separate hash, or which only draw
 COMMON = {
-    *("lathe_rc", "lathe_papers", "numpy", "scipy", "numba", "annotated_types", "pydantic", "matplotlib", "rich"),
+    *OURS,
+    *("numpy", "scipy", "numba", "annotated_types", "pydantic", "matplotlib", "rich"),
     *sys.stdlib_module_names,
 }
 

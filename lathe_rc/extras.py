@@ -7,8 +7,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
+from typing import TYPE_CHECKING, cast
 
+from lathe_rc import packages
 from lathe_rc.errors import LatheError
+
+if TYPE_CHECKING:  # a checkout imports this module before any package is installed
+    import click
 
 _MODULES = {
     "fmu": ("fmpy",),
@@ -83,3 +88,8 @@ def load(name: str) -> ModuleType:
         return importlib.import_module(name)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def command(name: str) -> "click.Command":
+    """Return a command of the command line after importing its module."""
+    return cast("click.Command", getattr(load(packages.module_of(name)), name))

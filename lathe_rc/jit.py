@@ -43,12 +43,12 @@ _KERNELS = (
     "plants/*.py",
     "control/*.py",
     "analysis/*.py",
-    "bag/resimulation/bag_spindle.py",
     "bag/reading/chunk_messages.py",
     "safety/*.py",
     "cell/ahead.py",
     "cell/program.py",
     "cell/stages/*.py",
+    "../lathe_bagtools/resimulation/bag_spindle.py",
     "../lathe_papers/formulas/*.py",
 )
 

@@ -18,10 +18,9 @@ from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.messages import ALIVE, SAFETY
+from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.machine_state import source as machine_source
-from lathe_rc.view.rerun_signals import is_drawn
 
 OPERATOR = "operator"  #: user of the ROS command-line tools, who may read every topic and call every service
 
@@ -137,16 +136,12 @@ class _Maker:
         )
 
     def rerun_bridge(self) -> Profile:
-        """Return the profile of the Rerun bridge, which reads the signals shown in a scene and the cell's state."""
-        drawn = [topic for topic, source in self._signals.items() if is_drawn(source.type)]
-        return self._node(RERUN_BRIDGE, subscribe=[*drawn, "cell_state"])
+        """Return the profile of the Rerun bridge, which reads signals and the cell's state."""
+        return self._node(RERUN_BRIDGE, subscribe=[*self._signals, "cell_state"])
 
     def panel(self) -> Profile:
-        """Return the profile of an attached panel, which reads the signals of the Rerun bridge and the cell's state."""
-        bridge = self.rerun_bridge()
-        states = {topic for topic, source in self._signals.items() if source.type == SAFETY} | {"cell_state"}
-        reply = frozenset(f"{PANEL}/{each}" for each in _PARAMETERS)
-        return replace(bridge, node=PANEL, subscribe=bridge.subscribe | states, reply=reply)
+        """Return the profile of an attached panel, which reads signals and the cell's state."""
+        return self._node(PANEL, subscribe=[*self._signals, "cell_state"])
 
     def panel_commands(self) -> Profile:
         """Return the profile of its second node, which asks for events, pace and pause."""

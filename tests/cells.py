@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES, Scenario, load
 from lathe_rc.cell.wire import Encoder

@@ -26,14 +26,15 @@ from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import CompressionMode
 from sealed_bags import unsealed
 
+from lathe_bagtools.resimulation import resim
+from lathe_commission import hysteresis_fit, reduced_order
+from lathe_commission.commands.fit import fit as fit_command
 from lathe_papers.formulas import step_fit
 from lathe_rc import data_file, files, harness, messages
-from lathe_rc.analysis import hysteresis_fit, reduced_order
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
-from lathe_rc.bag.resimulation import resim
 from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.cell import scenario
 from lathe_rc.cell.changes import Restoring, changes
@@ -43,7 +44,6 @@ from lathe_rc.cell.scenario import TABLES, Scenario, new_stage
 from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.commands.fit import fit as fit_command
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError

@@ -10,17 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from lathe_explore.sweep import row, study, tune
+from lathe_explore.sweep.folder import Folder, Request
+from lathe_explore.sweep.space import Space
+from lathe_explore.sweep.study import Study
+from lathe_explore.sweep.sweep import ignore
 from lathe_rc import jit
 from lathe_rc.cell import checkpoint, program, scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import profile_table
-from lathe_rc.sweep import row, study, tune
-from lathe_rc.sweep.folder import Folder, Request
-from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.study import Study
-from lathe_rc.sweep.sweep import ignore
 
 CONFIG = Path(__file__).parents[1] / "config"
 OWN = "learning_controller"
@@ -56,7 +56,7 @@ def swept(path: Path) -> Folder:
 
 
 def computed(_crew: object, order: Any, jobs: Any, *_: object) -> Any:
-    """Rows for the jobs of a tuning, in place of `lathe_rc.sweep.workers.rows`."""
+    """Rows for the jobs of a tuning, in place of `lathe_explore.sweep.workers.rows`."""
     yield pa.Table.from_pylist([made_up(job.number, job.key, job.values[LEAD]) for job in jobs], order.schema)
 
 

@@ -11,9 +11,9 @@ from bags import lathe
 from c_libraries import DONE, INPUT, REFUSED, STOPPED, Loaded, built, hostile, watched
 from cells import scenario
 
+from lathe_export.c_library.memory_image import MemoryImage
+from lathe_export.c_library.sources import export_nodes
 from lathe_rc import InputError
-from lathe_rc.c_library.memory_image import MemoryImage
-from lathe_rc.c_library.sources import export_nodes
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.stages.learning_controller import LearningController
 from lathe_rc.cell.stages.tool import Tool

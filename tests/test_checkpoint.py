@@ -12,14 +12,14 @@ from bags import lathe, sized
 from test_restart import OWN, Killer
 
 import lathe_rc
+from lathe_bagtools.resimulation.resim import resimulate
+from lathe_explore.sweep import row
 from lathe_rc import data_file, harness
 from lathe_rc.bag import check
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.recording import Recording
 from lathe_rc.errors import InputError
 from lathe_rc.harness.result import Mode
-from lathe_rc.sweep import row
 
 LONG = ["spindle_encoder.revolutions=5"]
 SCENARIOS = (

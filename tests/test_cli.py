@@ -20,7 +20,7 @@ from lathe_rc.cell.scenario import TABLES, load
 from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.stages.time_master import TimeMaster
 from lathe_rc.cli import main
-from lathe_rc.command_list import COMMANDS
+from lathe_rc.packages import COMMANDS
 
 CELL = """
 /spindle_encoder: {ros__parameters: {revolutions: 3.0}}
@@ -293,7 +293,7 @@ def test_commands_are_listed_without_being_imported():
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     *text, modules = listed.splitlines()
     ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
-    light = {"cli", "command_list", "errors", "extras", "allowed_code", "numba_settings", "public"}
+    light = {"cli", "packages", "errors", "extras", "allowed_code", "numba_settings", "public"}
     assert ours == {"lathe_rc", *(f"lathe_rc.{module}" for module in light)}
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_commission import form_correction, part_record
+from lathe_commission.form_correction import align, correction, evaluate, harmonics, outliers
 from lathe_rc import cli, harness
-from lathe_rc.analysis import form_correction, part_record
-from lathe_rc.analysis.form_correction import align, correction, evaluate, harmonics, outliers
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from machines import assert_refused
 from numpy.testing import assert_allclose
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stages.encoder_device import EncoderDevice

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lathe_commission.reduced_order import ChannelStep, fit_inverse
 from lathe_rc import harness, resources
-from lathe_rc.analysis.reduced_order import ChannelStep, fit_inverse
 from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stages.learner import Learner

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from lathe_explore.sweep.space import given
 from lathe_rc.signals import measured_profile, measurement_file, tachogram
 from lathe_rc.signals.counts import CsvReader
-from lathe_rc.sweep.space import given
 
 TEXTS = {
     "tachogram": "# of a µ-tachometer\ntime_s,rpm\n1700000000.25,999.5\n1700000000.5,1000.25\n1700000001,1001\n",

@@ -19,6 +19,7 @@ from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.commands.run import run
 from lathe_rc.messages import PACKAGE, store
+from lathe_rc.packages import OURS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -137,7 +138,7 @@ def exists(name: str) -> bool:
     first, _, rest = name.partition(".")
     if first in TABLES:
         return not rest or rest in TABLES[first].rows()
-    if first in {"lathe_rc", "lathe_papers"}:
+    if first in OURS:
         try:
             pkgutil.resolve_name(name)
         except (ImportError, AttributeError):

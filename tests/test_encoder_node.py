@@ -12,10 +12,10 @@ import pytest
 from cells import until
 from test_counts import COUNTS, TURN, follower, write_counts, write_edges
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import encoder_role

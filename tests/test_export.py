@@ -12,10 +12,10 @@ from cells import scenario
 from pyarrow import parquet
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from lathe_export.tables import export as exporting
+from lathe_export.tables.formats import FORMATS
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.bag.exporting import export as exporting
-from lathe_rc.bag.exporting.formats import FORMATS
 from lathe_rc.cell.columns import columns, dense_rows, units
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError

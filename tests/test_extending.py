@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from bags import lathe
 
-from lathe_rc import extensions, harness, hosts
+from lathe_bagtools import hosts
+from lathe_rc import extensions, harness
 from lathe_rc.cell import scenario
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cell.wiring import Cell

@@ -15,10 +15,10 @@ from cells import refusals, told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import process

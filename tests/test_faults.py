@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.faults import DISTURBANCES, KINDS, parse

@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
+from lathe_commission.commands import fit
+from lathe_commission.reduced_order import step_of
 from lathe_rc.analysis import pid_tuning
-from lathe_rc.analysis.reduced_order import step_of
 from lathe_rc.cli import main
-from lathe_rc.commands import fit
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.plants.hysteresis import THRESHOLDS, WEIGHTS, PrandtlIshlinskii
 

@@ -14,8 +14,9 @@ pytest.importorskip("fmpy")
 import fmu_builder
 from test_extending import lathe
 
-from lathe_rc import harness, hosts
-from lathe_rc.c_library.sources import export_nodes
+from lathe_bagtools import hosts
+from lathe_export.c_library.sources import export_nodes
+from lathe_rc import harness
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.wiring import Cell, new_stage

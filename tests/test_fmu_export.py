@@ -13,10 +13,10 @@ from bags import lathe
 from cells import scenario
 from fmpy import build, simulation, validation
 
+from lathe_export.c_library import sources
+from lathe_export.c_library.fmu import export_fmu
+from lathe_export.c_library.reference import Reference
 from lathe_rc import LatheError, harness
-from lathe_rc.c_library import sources
-from lathe_rc.c_library.fmu import export_fmu
-from lathe_rc.c_library.reference import Reference
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.scenario import TABLES, load
 from lathe_rc.cell.wiring import Cell

@@ -13,8 +13,8 @@ from machines import assert_refused, refusals
 from machines import run as run_in_blocks
 from numpy.testing import assert_allclose
 
+from lathe_commission.hysteresis_fit import Loop, from_signals, identify, read_csv
 from lathe_papers.formulas.vibration import describing_function
-from lathe_rc.analysis.hysteresis_fit import Loop, from_signals, identify, read_csv
 from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
 

@@ -9,8 +9,8 @@ import kept_files
 import pyarrow.parquet
 import pytest
 
+from lathe_explore.sweep.folder import Folder
 from lathe_rc.errors import InputError
-from lathe_rc.sweep.folder import Folder
 
 
 @pytest.mark.parametrize("kind", kept_files.KINDS)

@@ -19,17 +19,17 @@ pytest.importorskip("rerun")
 
 from test_view import View, lathe, refused
 
+from lathe_live import rerun_part as parts
+from lathe_live.live_runs import Backlog, RunOrder
+from lathe_live.rerun_live import Live
+from lathe_live.rerun_output import Output
+from lathe_live.rerun_signals import is_drawn
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import dds
-from lathe_rc.view import rerun_part as parts
-from lathe_rc.view.live_runs import Backlog, RunOrder
-from lathe_rc.view.rerun_live import Live
-from lathe_rc.view.rerun_output import Output
-from lathe_rc.view.rerun_signals import is_drawn
 
 PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
 STEP_NS = 15625

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from bags import lathe
 
+from lathe_live import loop_figures
+from lathe_live.block_diagram import block_diagram
+from lathe_live.loop_page import LoopPage
+from lathe_live.varied_loop import VariedLoop
 from lathe_rc import harness
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.varied_loop import VariedLoop
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.view import loop_figures
-from lathe_rc.view.block_diagram import block_diagram
-from lathe_rc.view.loop_page import LoopPage
 
 SVG = "{http://www.w3.org/2000/svg}"
 LEAD = "learning_controller.lead_time"

@@ -13,6 +13,8 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
+from lathe_explore.sweep import LOOP_FIGURES, row
+from lathe_explore.sweep.objectives import objectives
 from lathe_rc import harness
 from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.analysis.loop_errors import RunningLoop
@@ -21,8 +23,6 @@ from lathe_rc.cell.loops import FIGURES
 from lathe_rc.cli import main
 from lathe_rc.control.pid import Pid, PidGains
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import LOOP_FIGURES, row
-from lathe_rc.sweep.objectives import objectives
 
 TURN = 400  # samples of a revolution in the made-up runs
 WITHOUT_A_PART = [path.stem for path in SCENARIOS if "\n/tool:" not in path.read_text(encoding="utf-8")]

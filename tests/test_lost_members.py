@@ -10,6 +10,7 @@ import pytest
 from bags import lathe
 from cells import STEP, scenario
 
+from lathe_live.panel_player import Player
 from lathe_rc import harness, messages, read_bag
 from lathe_rc.analysis.tolerance import FORCE
 from lathe_rc.bag.loss import HELD, SOUND, loss_of
@@ -21,7 +22,6 @@ from lathe_rc.cell.loops import Loop, watches
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
-from lathe_rc.view.panel_player import Player
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_verdict import BAD, assess
 

@@ -17,16 +17,18 @@ from pyarrow import parquet, table
 
 import lathe_rc
 from drive_fit_accuracy import RATE, STEP, TURN, drawn, errors, measured, noisy, simulated
-from lathe_rc.analysis import frequency_response, modal_fit
-from lathe_rc.analysis.drive_measurement import data, step_response
+from lathe_commission import modal_fit
+from lathe_commission.drive_measurement import data, step_response
+from lathe_commission.modal_fit import ResponseData, StepData
+from lathe_explore.sweep.space import Space
+from lathe_rc.analysis import frequency_response
 from lathe_rc.analysis.frequency_response import FrequencyResponse, estimate
 from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.analysis.modal_fit import ResponseData, StepData
+from lathe_rc.cell import cells_file
 from lathe_rc.cli import main
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
-from lathe_rc.sweep.space import Space, given
 
 TRUE = ModalDrive(
     TURN * 165.0, 0.8, 7 * STEP, (TURN * 905.0, TURN * 1620.0), (0.02, 0.018), (0.012, -0.02)
@@ -269,7 +271,7 @@ def test_command_writes_parameters_set_and_points(tmp_path):
     assert table_of["ros__parameters"] == {
         name: pytest.approx(value, rel=1e-5) for name, value in TRUE.parameters().items()
     }
-    cells = given(tmp_path / "drive.drives.csv")
+    cells = cells_file.read(tmp_path / "drive.drives.csv")
     assert len(cells) == 33
     name = "electrodynamic_actuator.mode_damping"
     assert cells[0][name] == pytest.approx([0.02, 0.018], rel=1e-5)
@@ -294,7 +296,7 @@ def test_set_of_drives_without_modes_runs_in_a_scenario(tmp_path):
     done = lathe(tmp_path, response_file(tmp_path, PLAIN), "--json", "--drives", 4)
     assert json.loads(done.stdout)["modes"] == 0
     piston = lathe_rc.load("piston")
-    space = Space(given=given(tmp_path / "drive.drives.csv"))
+    space = Space(given=cells_file.read(tmp_path / "drive.drives.csv"))
     space.check(piston)
     assert space.count(piston) == 5
 
@@ -398,7 +400,7 @@ def test_set_of_several_measurements_covers_all_of_them(tmp_path):
     assert done.exit_code == 0, done.stderr
     (table_of,) = yaml.safe_load((tmp_path / "drive.yaml").read_text()).values()
     assert table_of["ros__parameters"]["natural_frequency"] == pytest.approx(TURN * 160.0, rel=1e-3)
-    cells = given(tmp_path / "drive.drives.csv")
+    cells = cells_file.read(tmp_path / "drive.drives.csv")
     found = [cell["electrodynamic_actuator.natural_frequency"] / TURN for cell in cells]
     assert_allclose(found, [160.0] * 5 + [172.0] * 5, rtol=5e-3)
     assert sorted(path.name for path in tmp_path.glob("drive.points*")) == [

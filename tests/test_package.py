@@ -42,8 +42,8 @@ def declared():
 
 
 def imported():
-    """The modules that lathe_rc and its launch file import, without their submodules."""
-    for path in [*(ROOT / "lathe_rc").rglob("*.py"), *(ROOT / "launch").glob("*.py")]:
+    """The modules that the packages and the launch file import, without their submodules."""
+    for path in [*ROOT.glob("lathe_*/**/*.py"), *(ROOT / "launch").glob("*.py")]:
         if "msg_defs" in path.parts:
             continue  # the package of the messages, which has a package.xml of its own
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

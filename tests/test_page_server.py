@@ -9,9 +9,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from lathe_live import page_server
+from lathe_live.page_server import Page, Site
 from lathe_rc.errors import InputError
-from lathe_rc.view import page_server
-from lathe_rc.view.page_server import Page, Site
 
 
 def refuse(question):

@@ -16,18 +16,18 @@ from bags import lathe
 from cells import until
 
 import lathe_rc
+from lathe_live import page_server, panel, panel_lamp, panel_view
+from lathe_live.live_runs import Backlog
+from lathe_live.page_server import Site
+from lathe_live.panel_live import LivePanel
+from lathe_live.panel_player import Player
+from lathe_live.panel_run import Driver, LiveCell
+from lathe_live.panel_view import Have, news
+from lathe_live.rerun_signals import is_drawn
 from lathe_rc import event_log, harness, messages
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
-from lathe_rc.view import page_server, panel, panel_lamp, panel_view
-from lathe_rc.view.live_runs import Backlog
-from lathe_rc.view.page_server import Site
-from lathe_rc.view.panel_live import LivePanel
-from lathe_rc.view.panel_player import Player
-from lathe_rc.view.panel_run import Driver, LiveCell
-from lathe_rc.view.panel_view import Have, news
-from lathe_rc.view.rerun_signals import is_drawn
 
 ROOT = Path(__file__).parents[1]
 

@@ -19,10 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import allowed_code, extensions, harness, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario

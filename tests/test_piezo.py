@@ -10,9 +10,9 @@ from machines import amplitude, assert_refused, refusals, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
+from lathe_commission.hysteresis_fit import from_signals, identify
 from lathe_papers.formulas.responses import second_order as ideal
 from lathe_rc import messages
-from lathe_rc.analysis.hysteresis_fit import from_signals, identify
 from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.stages.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_rc.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii

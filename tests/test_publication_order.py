@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lathe_rc.bag.writing.publication_order import Continuity, PublicationOrder, Recorded
+from lathe_bagtools.publication_order import Continuity, PublicationOrder, Recorded
 from lathe_rc.errors import LatheError
 
 HOLD = 1000  # [ns]
@@ -115,7 +115,7 @@ def test_a_clock_that_goes_back_or_tells_nothing_is_an_error(monkeypatch):
     assert list(order.rest()) == []  # silence alone is no error
     with pytest.raises(LatheError, match="1 messages are not recorded"):
         order.finish()
-    monkeypatch.setattr("lathe_rc.bag.writing.publication_order.MOST_EARLY", 3)
+    monkeypatch.setattr("lathe_bagtools.publication_order.MOST_EARLY", 3)
     order = new()
     give(order, (BEGAN + 1, "/a", 1, 0))
     with pytest.raises(LatheError, match="more than 3 B of messages wait"):

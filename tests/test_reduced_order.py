@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.reduced_order import ChannelStep, fit, fit_inverse, read_csv, step_of
+from lathe_commission.reduced_order import ChannelStep, fit, fit_inverse, read_csv, step_of
 from lathe_rc.control.decoupler import FULL_W1, LAG, PAPER, REALISTIC, gain, lags
 from lathe_rc.errors import InputError
 from lathe_rc.transfer import TransferFunction

@@ -23,12 +23,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosgraph_msgs.msg import Clock
 
+from lathe_bagtools.nodes import replayed_qos, replayer
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.errors import InputError
-from lathe_rc.nodes import replayed_qos, replayer
 
 try:
     from rosbag2_interfaces import srv

@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Empty, String
 
+from lathe_bagtools.nodes.topic_recorder import TopicRecorder, TopicRecorderParameters
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading.source import Source
@@ -25,7 +26,6 @@ from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import publisher_info
 from lathe_rc.nodes.ports import latched_qos
-from lathe_rc.nodes.topic_recorder import TopicRecorder, TopicRecorderParameters
 
 LATCHED = "transient_local"
 TOPICS = {

@@ -11,12 +11,12 @@ from cells import every_scenario, scenario
 from numpy.testing import assert_allclose
 from sealed_bags import retold
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
 from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import part
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.part import ErrorsByRevolution

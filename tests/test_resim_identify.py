@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages, resources
 from lathe_rc.analysis import drive_fit
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.errors import InputError
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive

@@ -11,12 +11,12 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from lathe_bagtools.nodes.replayer import _Pace
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.cell.beside import ReplayerParameters
 from lathe_rc.nodes import declare
 from lathe_rc.nodes.cell_node import CellNode
-from lathe_rc.nodes.replayer import _Pace
 from lathe_rc.nodes.report import Reporter
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.nodes.standalone_node import StandaloneNode

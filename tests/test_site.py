@@ -14,6 +14,7 @@ import architecture
 import equations
 import pictures
 from gfm import for_python_markdown
+from lathe_rc.packages import OURS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -42,30 +43,38 @@ def test_a_page_is_the_same_on_the_site_as_on_github(page):
 
 
 def imports():
-    """Which package of lathe_rc imports which, and where it does."""
-    root = ROOT / "lathe_rc"
-    for path in sorted(root.rglob("*.py")):
-        package = path.relative_to(root).parts[0].removesuffix(".py")
+    """Which package of the core, or beside it, imports which, and where it does."""
+
+    def box(parts):
+        return parts[1] if parts[0] == "lathe_rc" and len(parts) > 1 else parts[0]
+
+    for path in sorted(ROOT.glob("lathe_*/**/*.py")):
+        package = box(path.relative_to(ROOT).with_suffix("").parts)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Import | ast.ImportFrom):
                 continue
             module = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
             for alias in node.names:
-                top, _, rest = f"{module}{alias.name}".partition(".")
-                if top == "lathe_rc" and rest and (imported := rest.split(".")[0]) != package:
+                parts = f"{module}{alias.name}".split(".")
+                if parts[0].startswith("lathe_") and (imported := box(parts)) != package:
                     yield package, imported, path.relative_to(ROOT)
 
 
 def test_the_picture_of_the_architecture_is_true():
     layer = {name: index for index, level in enumerate(architecture.LAYERS) for name in level.boxes}
-    packages = {path.parent.name for path in (ROOT / "lathe_rc").glob("*/__init__.py")} - {"msg_defs"}
-    assert set(layer) == packages - {"templates"}
+    packages = {path.parent.name for path in (ROOT / "lathe_rc").glob("*/__init__.py")} - {"msg_defs", "templates"}
+    assert set(layer) == packages | (OURS - {"lathe_rc", "lathe_papers"})
     known = [found for found in imports() if found[0] in layer and found[1] in layer]
     upwards = [found for found in known if layer[found[1]] < layer[found[0]]]
     assert upwards == [], "an import from a layer above"
     beside = {(one, other) for one, other, _ in known if layer[one] == layer[other]}
     assert beside == set(architecture.BESIDE)
-    assert {one for one, other, _ in known if other == "nodes"} <= {"commands", "harness"}, "who knows of ROS"
+    assert {one for one, other, _ in known if other == "nodes"} <= {
+        "commands",
+        "harness",
+        "lathe_bagtools",
+        "lathe_live",
+    }, "which know of ROS"
     drawn = (ROOT / "docs" / "img" / "architecture.svg").read_text(encoding="utf-8")
     assert drawn == architecture.picture(), "run: ./lathe python figures/architecture.py"
 

@@ -21,9 +21,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from std_srvs.srv import Trigger
 
+from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages
 from lathe_rc.bag.check import check
-from lathe_rc.bag.resimulation.resim import resimulate
 from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots

@@ -15,16 +15,17 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import lathe_rc
+import lathe_explore
+from lathe_explore.sweep import LOOP_FIGURES, NUMBERS, alone, row, space, workers
+from lathe_explore.sweep.folder import Folder
+from lathe_explore.sweep.space import Space
+from lathe_explore.sweep.sweep import Sweep
 from lathe_papers import best_law, drive_tolerance, speed_deviation
 from lathe_rc import harness
+from lathe_rc.cell import cells_file
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import LOOP_FIGURES, NUMBERS, alone, row, space, workers
-from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.sweep import Sweep
 
 LEAD, Q, DAMPING = "learning_controller.lead_time", "learning_controller.q_time", "electrodynamic_actuator.damping"
 PISTON = Path(__file__).parents[1] / "config" / "piston.yaml"
@@ -75,13 +76,13 @@ def test_models_follow_the_drives_or_stay(client, tmp_path):
     space_ = Space(grid={"electrodynamic_actuator.natural_frequency": ["80%"]})
     own = two.nodes["electrodynamic_actuator"].natural_frequency
     for models, known in (("follow", 0.8 * own), ("nominal", own)):
-        found = lathe_rc.run_sweep(two, space_, tmp_path / models, client=client, models=models)
+        found = lathe_explore.run_sweep(two, space_, tmp_path / models, client=client, models=models)
         assert found.scenario(0).nodes["learning_controller"].model_natural_frequency == known
     kept = Folder(tmp_path / "follow").scenario
     assert kept == two
     assert kept.varied({DAMPING: 0.7}) == two.varied({DAMPING: 0.7})
     with pytest.raises(InputError, match=r"another cell: learning_controller.model_\w+ = .* there, and default here"):
-        lathe_rc.run_sweep(two, space_, tmp_path / "nominal", client=client)
+        lathe_explore.run_sweep(two, space_, tmp_path / "nominal", client=client)
 
 
 def test_ties_follow_what_they_depend_on_in_whatever_order_they_are_given(piston):
@@ -164,11 +165,11 @@ def test_a_sweep_of_nothing_is_refused():
 def test_cells_of_a_file(piston, tmp_path):
     (tmp_path / "cells.csv").write_text(f"{LEAD}, block_size\n1e-3,64\n2e-3,128\n")
     (tmp_path / "cells.yaml").write_text(f"- {{{LEAD}: 1e-3, block_size: 64}}\n- {LEAD}: 2e-3\n  block_size: 128\n")
-    found = [space.given(tmp_path / name) for name in ("cells.csv", "cells.yaml")]
+    found = [cells_file.read(tmp_path / name) for name in ("cells.csv", "cells.yaml")]
     assert found[0] == found[1] == [{LEAD: 1e-3, "block_size": 64}, {LEAD: 2e-3, "block_size": 128}]
     (tmp_path / "short.csv").write_text(f"{LEAD},{Q}\n1e-3\n")
     with pytest.raises(InputError, match=r"short.csv:2: 1 values; allowed: 2"):
-        space.given(tmp_path / "short.csv")
+        cells_file.read(tmp_path / "short.csv")
 
 
 # ---- rows of the table -----------------------------------------------------------------------------------------------
@@ -238,7 +239,9 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
             raise KeyboardInterrupt
 
     def sweep(count, watch=told.append):
-        return lathe_rc.run_sweep(piston, Space(grid={LEAD: count}), tmp_path / "leads", client=client, watch=watch)
+        return lathe_explore.run_sweep(
+            piston, Space(grid={LEAD: count}), tmp_path / "leads", client=client, watch=watch
+        )
 
     leads = "1.2e-3,1.3e-3,3e-3"
     with pytest.raises(KeyboardInterrupt):
@@ -257,7 +260,7 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
     assert more.table().column(LEAD).to_pylist() == [1.2e-3, 1.3e-3, 3e-3, 1.1e-3]
     assert more.table().column("cell").to_pylist() == [0, 1, 2, 3]
     # A further parameter: the rows so far have the scenario's own value of it.
-    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3], Q: "70e-6"}), tmp_path / "leads", client=client)
+    lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3], Q: "70e-6"}), tmp_path / "leads", client=client)
     both = Sweep(Folder(tmp_path / "leads"))
     own = piston.nodes["learning_controller"].q_time
     assert both.table().column(Q).to_pylist() == [own, own, own, own, 70e-6]
@@ -267,24 +270,24 @@ def test_a_sweep_goes_on_where_it_was_stopped_and_adds_what_is_new(piston, clien
 def test_a_folder_of_something_else_is_refused(piston, client, tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "_CONNECT", 0.1)  # [s] for which Dask calls a scheduler that is not there
     space_ = Space(grid={LEAD: [1.3e-3]})
-    lathe_rc.run_sweep(piston, space_, tmp_path / "one", client=client)
+    lathe_explore.run_sweep(piston, space_, tmp_path / "one", client=client)
     longer = piston.varied({"spindle_encoder.revolutions": 5.0})
     with pytest.raises(InputError, match="holds a sweep of another cell"):
-        lathe_rc.run_sweep(longer, space_, tmp_path / "one", client=client)
+        lathe_explore.run_sweep(longer, space_, tmp_path / "one", client=client)
     with pytest.raises(InputError, match="measures nothing beside the rest"):
-        lathe_rc.run_sweep(piston, space_, tmp_path / "one", client=client, measures=["tool.error:max"])
+        lathe_explore.run_sweep(piston, space_, tmp_path / "one", client=client, measures=["tool.error:max"])
     (tmp_path / "two").mkdir()
     (tmp_path / "two" / "thesis.tex").touch()
     with pytest.raises(InputError, match="holds something else than a sweep"):
-        lathe_rc.run_sweep(piston, space_, tmp_path / "two", client=client)
+        lathe_explore.run_sweep(piston, space_, tmp_path / "two", client=client)
     with Folder(tmp_path / "one").locked(), pytest.raises(InputError, match="another sweep computes into it"):
-        lathe_rc.run_sweep(piston, space_, tmp_path / "one", client=client)
+        lathe_explore.run_sweep(piston, space_, tmp_path / "one", client=client)
     with pytest.raises(InputError, match=r"tcp://127.0.0.1:9"):
-        lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.4e-3]}), tmp_path / "one", scheduler="tcp://127.0.0.1:9")
+        lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.4e-3]}), tmp_path / "one", scheduler="tcp://127.0.0.1:9")
 
 
 def test_the_command_of_a_finished_sweep(piston, client, tmp_path):
-    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3, 3e-3]}), tmp_path / "leads", client=client)
+    lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3, 3e-3]}), tmp_path / "leads", client=client)
     show = ["sweep", "show", str(tmp_path / "leads"), "--cell"]
     done = CliRunner().invoke(main, [*show, "0", "--bag", str(tmp_path / "bag")])
     assert (done.exit_code, "cell 0: the digest of its row" in done.stdout) == (0, True)
@@ -335,17 +338,17 @@ def test_a_job_that_blocks_has_a_time_limit_whatever_it_does(monkeypatch):
 )
 def test_a_failed_cell_is_computed_again_where_that_may_help(failed, options, again, piston, client, tmp_path):
     space_ = Space(grid={LEAD: [1.3e-3]})
-    found = lathe_rc.run_sweep(piston, space_, tmp_path / "rows", client=client)
+    found = lathe_explore.run_sweep(piston, space_, tmp_path / "rows", client=client)
     (done,) = found.table().to_pylist()
     (path,) = (tmp_path / "rows" / "rows").iterdir()
     path.unlink()
     found.folder.write([pa.Table.from_pylist([done | {"status": row.FAILED} | failed], found.folder.schema)])
-    repeated = lathe_rc.run_sweep(piston, space_, tmp_path / "rows", client=client, **options)
+    repeated = lathe_explore.run_sweep(piston, space_, tmp_path / "rows", client=client, **options)
     assert repeated.statuses() == {row.DONE if again else row.FAILED: 1}
 
 
 def test_reasons_stand_in_the_terminal_and_no_result_is_a_failure(client, monkeypatch, tmp_path):
-    monkeypatch.setattr("lathe_rc.sweep.sweep.client_of", lambda *_: contextlib.nullcontext(client))
+    monkeypatch.setattr("lathe_explore.sweep.sweep.client_of", lambda *_: contextlib.nullcontext(client))
     words = ["sweep", str(PISTON), "--revolutions", "2", "--vary", f"{LEAD}=3e-3,4e-3", "--out", str(tmp_path / "rows")]
     done = CliRunner().invoke(main, words)
     assert "2 refused, such as cell 0: learning_controller: learning diverges" in done.stdout

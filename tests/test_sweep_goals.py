@@ -9,16 +9,18 @@ import pytest
 import scipy
 from click.testing import CliRunner
 
+import lathe_explore
 import lathe_rc
+from lathe_explore.sweep import inputs, row
+from lathe_explore.sweep.comparison import compare
+from lathe_explore.sweep.expression import Expression
+from lathe_explore.sweep.objectives import front, objectives
+from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code, extensions
+from lathe_rc.cell import cells_file
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import inputs, row
-from lathe_rc.sweep.comparison import compare
-from lathe_rc.sweep.expression import Expression
-from lathe_rc.sweep.objectives import front, objectives
-from lathe_rc.sweep.space import Space, given
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 DAMPING, FREQUENCY = "electrodynamic_actuator.damping", "electrodynamic_actuator.natural_frequency"
@@ -98,8 +100,8 @@ def test_distributions_that_do_not_exist_are_refused_by_name(piston, of, said):
 def test_columns_of_given_cells_are_carried_into_the_rows_as_text(piston, client, tmp_path):
     """Two drives of the same values stay two rows, and the serial number its zeros."""
     (tmp_path / "drives.csv").write_text(f"serial,{DAMPING}\n0012,0.8\n0013,0.8\n")
-    space = Space(given=given(tmp_path / "drives.csv", ["serial"]), carried=["serial"])
-    rows = lathe_rc.run_sweep(piston, space, tmp_path / "rows", client=client).table().to_pylist()
+    space = Space(given=cells_file.read(tmp_path / "drives.csv", ["serial"]), carried=["serial"])
+    rows = lathe_explore.run_sweep(piston, space, tmp_path / "rows", client=client).table().to_pylist()
     assert [(each["serial"], each[DAMPING]) for each in rows] == [("0012", 0.8), ("0013", 0.8)]
     assert rows[0]["digest"] == rows[1]["digest"]
     for carried, cell, said in (
@@ -108,7 +110,7 @@ def test_columns_of_given_cells_are_carried_into_the_rows_as_text(piston, client
         (["status"], {"status": "1"}, "carried along, and a column of each row as well"),
     ):
         with pytest.raises(InputError, match=said):
-            lathe_rc.run_sweep(piston, Space(given=[cell], carried=carried), tmp_path / "other", client=client)
+            lathe_explore.run_sweep(piston, Space(given=[cell], carried=carried), tmp_path / "other", client=client)
 
 
 # ---- goals -----------------------------------------------------------------------------------------------------------
@@ -161,7 +163,7 @@ def test_front_is_what_no_other_point_equals_or_betters():
 
 def test_several_goals_of_a_sweep_give_a_front(piston, client, tmp_path):
     place = tmp_path / "rows"
-    found = lathe_rc.run_sweep(piston, Space(grid={LEAD: "1.2e-3:1.5e-3:7"}), place, client=client)
+    found = lathe_explore.run_sweep(piston, Space(grid={LEAD: "1.2e-3:1.5e-3:7"}), place, client=client)
     shown = found.best("tool.max_error / tool.first_max_error", "margin")
     rows = {each["cell"]: each for each in found.table().to_pylist() if each["status"] == row.DONE}
     points = [(each["tool.max_error"] / each["tool.first_max_error"], -each["margin"]) for each in rows.values()]
@@ -198,15 +200,17 @@ def test_a_function_of_a_recording_is_a_column_whose_code_is_pinned(piston, clie
     with allowed_code.call():
         allowed_code.allow("my_goal")
         (found,) = (
-            lathe_rc.run_sweep(piston, space, place, measures=["my_goal:settled"], client=client).table().to_pylist()
+            lathe_explore.run_sweep(piston, space, place, measures=["my_goal:settled"], client=client)
+            .table()
+            .to_pylist()
         )
         assert found["my_goal:settled"] == 2.0 * lathe_rc.run(piston.varied({LEAD: 1.3e-3})).errors.largest[-1]
         assert found["code"].startswith("xxh3:")
         write("float('nan')")
         with pytest.raises(InputError, match="my_goal:settled has the hash"):
-            lathe_rc.run_sweep(piston, space, place, measures=["my_goal:settled"], client=client)
+            lathe_explore.run_sweep(piston, space, place, measures=["my_goal:settled"], client=client)
         (failed,) = (
-            lathe_rc.run_sweep(piston, space, tmp_path / "other", measures=["my_goal:settled"], client=client)
+            lathe_explore.run_sweep(piston, space, tmp_path / "other", measures=["my_goal:settled"], client=client)
             .table()
             .to_pylist()
         )
@@ -219,10 +223,12 @@ def test_a_function_of_a_recording_is_a_column_whose_code_is_pinned(piston, clie
 def test_two_sweeps_are_compared_by_their_common_cells(piston, client, tmp_path):
     """Another law: the differing parameter, the change of each common cell, both best cells and effects."""
     law = "learning_controller.lead_law"
-    one = lathe_rc.run_sweep(
+    one = lathe_explore.run_sweep(
         piston.varied({law: "constant_angle"}), Space(grid={LEAD: "1.3e-3:1.5e-3:3"}), tmp_path / "a", client=client
     )
-    other = lathe_rc.run_sweep(piston, Space(grid={LEAD: "1.4e-3:1.6e-3:3", Q: [67e-6]}), tmp_path / "b", client=client)
+    other = lathe_explore.run_sweep(
+        piston, Space(grid={LEAD: "1.4e-3:1.6e-3:3", Q: [67e-6]}), tmp_path / "b", client=client
+    )
     found = compare(one.folder, other.folder)
     assert found.differences == [f"{law} = constant_angle there, and variable here"]
     before, after = ({each[LEAD]: each["tool.max_error"] for each in side.table().to_pylist()} for side in (one, other))
@@ -236,7 +242,7 @@ def test_two_sweeps_are_compared_by_their_common_cells(piston, client, tmp_path)
 
 
 def test_a_cell_gives_its_bag_and_its_report_in_one_command(piston, client, tmp_path):
-    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), tmp_path / "rows", client=client)
+    lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), tmp_path / "rows", client=client)
     shown = CliRunner().invoke(main, ["sweep", "show", str(tmp_path / "rows"), "--cell", "0", "--report"])
     assert shown.exit_code == 0, shown.output
     assert (tmp_path / "rows" / "cell-0" / "metadata.yaml").exists()

@@ -16,14 +16,14 @@ from matplotlib.image import imread
 from numpy.testing import assert_allclose
 from shown_page import ShownPage
 
+from lathe_explore.sweep import page, row, space
+from lathe_explore.sweep.effects import Axis, Yield, bins, effect, groups, is_grid, total_effect
+from lathe_explore.sweep.folder import Folder
+from lathe_explore.sweep.page_data import PageData
+from lathe_explore.sweep.space import Space
 from lathe_rc import cli, resources
 from lathe_rc.cell import scenario
 from lathe_rc.errors import LatheError
-from lathe_rc.sweep import page, row, space
-from lathe_rc.sweep.effects import Axis, Yield, bins, effect, groups, is_grid, total_effect
-from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.page_data import PageData
-from lathe_rc.sweep.space import Space
 from lathe_rc.view import charts
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"

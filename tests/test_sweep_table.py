@@ -10,15 +10,15 @@ import pyarrow.parquet
 import pytest
 from click.testing import CliRunner
 
-import lathe_rc
+import lathe_explore
+from lathe_explore.sweep import inputs, row
+from lathe_explore.sweep.folder import Folder
+from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import inputs, row
-from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import Space
 
 LEAD, OWN_MODEL = "learning_controller.lead_time", "learning_controller.model_natural_frequency"
 FREQUENCY, RPM = "electrodynamic_actuator.natural_frequency", "spindle_encoder.nominal_rpm"
@@ -61,7 +61,7 @@ def test_a_further_axis_is_a_column_of_all_rows_with_the_values_that_cells_had(t
         {RPM: "1000"},
         {FREQUENCY: "80%", OWN_MODEL: [own]},  # given, and therefore not the varied drive's
     ):
-        lathe_rc.run_sweep(two_channel, Space(grid=grid), place, client=client)
+        lathe_explore.run_sweep(two_channel, Space(grid=grid), place, client=client)
     frame = check_rows(place, two_channel)
     assert frame[RPM].tolist() == [500.0, 1000.0, 1000.0, 1000.0]
     assert frame[OWN_MODEL].tolist() == [own, 0.8 * own, own, own]
@@ -69,7 +69,7 @@ def test_a_further_axis_is_a_column_of_all_rows_with_the_values_that_cells_had(t
 
 def test_whole_numbers_are_the_same_cells_as_real_ones(piston, client, tmp_path):
     for given in ("900,1000", "900:1000:2", [900]):
-        found = lathe_rc.run_sweep(piston, Space(grid={"nominal_rpm": given}), tmp_path / "rows", client=client)
+        found = lathe_explore.run_sweep(piston, Space(grid={"nominal_rpm": given}), tmp_path / "rows", client=client)
     assert found.table()["nominal_rpm"].to_pylist() == [900.0, 1000.0]
 
 
@@ -173,25 +173,25 @@ def test_rows_of_other_code_are_not_mixed(own_drive, client, tmp_path):
     """A module that an own class imports is edited: the folder refuses further cells, and shows the old rows."""
     load, edit = own_drive
     place, space = tmp_path / "rows", Space(grid={LEAD: [1.3e-3]})
-    found = lathe_rc.run_sweep(load(), space, place, client=client)
+    found = lathe_explore.run_sweep(load(), space, place, client=client)
     (before,) = found.table().to_pylist()
     assert before["code"].startswith("xxh3:")
     edit("GAIN = 2.0\n")
     with pytest.raises(
         InputError, match=r"my_drive:Drive has the hash \w{12} here, and \w{12} in the rows; allowed: as "
     ):
-        lathe_rc.run_sweep(load(), space, place, client=client)
-    (other,) = lathe_rc.run_sweep(load(), space, tmp_path / "other", client=client).table().to_pylist()
+        lathe_explore.run_sweep(load(), space, place, client=client)
+    (other,) = lathe_explore.run_sweep(load(), space, tmp_path / "other", client=client).table().to_pylist()
     assert other["code"] != before["code"]
     assert other["key"] != before["key"]
     edit("GAIN = 1.0\n")
-    assert lathe_rc.run_sweep(load(), space, place, client=client).table().to_pylist() == [before]
+    assert lathe_explore.run_sweep(load(), space, place, client=client).table().to_pylist() == [before]
 
 
 def test_results_are_shown_without_the_files_and_code_of_the_cell(own_drive, client, tmp_path):
     load, _ = own_drive
     place = tmp_path / "rows"
-    lathe_rc.run_sweep(load(), Space(grid={LEAD: [1.3e-3, 1.4e-3]}), place, client=client)
+    lathe_explore.run_sweep(load(), Space(grid={LEAD: [1.3e-3, 1.4e-3]}), place, client=client)
     (tmp_path / "my_drive.py").unlink()
     sys.modules.pop("my_drive")
     STAGES._found.pop("my_drive:Drive")
@@ -203,7 +203,7 @@ def test_results_are_shown_without_the_files_and_code_of_the_cell(own_drive, cli
 
 def test_another_digest_than_in_the_row_is_a_failure(piston, client, tmp_path):
     place = tmp_path / "rows"
-    found = lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client)
+    found = lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client)
     (path,) = (place / "rows").iterdir()
     rows = found.table().to_pylist()
     rows[0] |= {"digest": "xxh3:0", "version": "0.0.1"}
@@ -213,7 +213,7 @@ def test_another_digest_than_in_the_row_is_a_failure(piston, client, tmp_path):
         done = CliRunner().invoke(main, ["sweep", "show", str(place), "--cell", "0", *words])
         assert done.exit_code == 1
     events = []
-    lathe_rc.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client, watch=events.append)
+    lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), place, client=client, watch=events.append)
     assert events[0]["others"] == {"0.0.1": 1}
 
 

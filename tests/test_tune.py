@@ -12,7 +12,13 @@ from click.testing import CliRunner
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-import lathe_rc
+import lathe_explore
+from lathe_explore.sweep import formulas, history, row, sweep, tune
+from lathe_explore.sweep.objectives import objectives
+from lathe_explore.sweep.search_space import Dimension, search_space
+from lathe_explore.sweep.space import Space
+from lathe_explore.sweep.study import Study
+from lathe_explore.sweep.tuning import Tuning
 from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
@@ -21,12 +27,6 @@ from lathe_rc.commands import progress
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
-from lathe_rc.sweep import formulas, history, row, sweep, tune
-from lathe_rc.sweep.objectives import objectives
-from lathe_rc.sweep.search_space import Dimension, search_space
-from lathe_rc.sweep.space import Space
-from lathe_rc.sweep.study import Study
-from lathe_rc.sweep.tuning import Tuning
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 FREE = {LEAD: "0.8e-3:2e-3", Q: "40e-6:300e-6:log"}
@@ -53,7 +53,7 @@ def search(piston, client, tmp_path_factory):
     place = tmp_path_factory.mktemp("tune")
 
     def go(folder, trials, goals=("tool.rms_error",), *, free=FREE, **more):
-        return lathe_rc.tune(piston, free, list(goals), place / folder, trials=trials, client=client, **more)
+        return lathe_explore.tune(piston, free, list(goals), place / folder, trials=trials, client=client, **more)
 
     return go
 
@@ -128,7 +128,7 @@ class TestAsking:
     def test_a_search_that_cannot_be_is_refused_before_anything_is_written(self, piston, tmp_path, more, said):
         goals = more.pop("goals", ["tool.max_error"])
         with pytest.raises(InputError, match=said):
-            lathe_rc.tune(piston, FREE, goals, tmp_path / "x", **more)
+            lathe_explore.tune(piston, FREE, goals, tmp_path / "x", **more)
         assert not (tmp_path / "x").exists()
 
 
@@ -289,7 +289,7 @@ class TestSearch:
 
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, search, client):
         with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):
-            lathe_rc.run_sweep(piston, Space(grid={LEAD: [1e-3]}), tuned.folder.path, client=client)
+            lathe_explore.run_sweep(piston, Space(grid={LEAD: [1e-3]}), tuned.folder.path, client=client)
         with pytest.raises(InputError, match=r'holds a tuning with goals \["tool.rms_error"\], not \["margin"\]'):
             search("whole", 20, ["margin"])
 
@@ -340,7 +340,7 @@ class TestSearch:
     def test_a_cell_without_a_tool_is_tuned_by_what_is_measured_in_its_last_revolution(self, client, tmp_path):
         cut = load("interrupted_cut", 4, f"{PID[0]}=1e-3")
         free, options = {PID[0]: "1e-4:0.05:log"}, {"trials": 3, "ask_formulas": False, "client": client}
-        found = lathe_rc.tune(cut, free, [ERROR], tmp_path / "x", **options)
+        found = lathe_explore.tune(cut, free, [ERROR], tmp_path / "x", **options)
         again = harness.run(found.sweep.scenario(2))
         kept = found.sweep.row(2)
         assert row.digest(again.recording, found.folder.measures) == kept["digest"]

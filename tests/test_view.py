@@ -16,6 +16,13 @@ rr = pytest.importorskip("rerun")
 rrb = pytest.importorskip("rerun.blueprint")
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 
+from lathe_live import rerun_part as parts  # noqa: E402
+from lathe_live.rerun_blueprint import blueprint  # noqa: E402
+from lathe_live.rerun_output import _free_port, end_viewer, viewer  # noqa: E402
+from lathe_live.rerun_pieces import Pieces  # noqa: E402
+from lathe_live.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
+from lathe_live.rerun_scene import Scene  # noqa: E402
+from lathe_live.rerun_signals import extreme_samples  # noqa: E402
 from lathe_rc import harness, messages, resources  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
@@ -23,13 +30,6 @@ from lathe_rc.cell.scenario import load  # noqa: E402
 from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.event_log import Conditions  # noqa: E402
-from lathe_rc.view import rerun_part as parts  # noqa: E402
-from lathe_rc.view.rerun_blueprint import blueprint  # noqa: E402
-from lathe_rc.view.rerun_output import _free_port, end_viewer, viewer  # noqa: E402
-from lathe_rc.view.rerun_pieces import Pieces  # noqa: E402
-from lathe_rc.view.rerun_revolutions import ANGLES, Revolutions  # noqa: E402
-from lathe_rc.view.rerun_scene import Scene  # noqa: E402
-from lathe_rc.view.rerun_signals import extreme_samples  # noqa: E402
 
 STEP_NS = 15625
 

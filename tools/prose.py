@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import yaml
 
-from workplace import ROOT
+from workplace import PACKAGES, ROOT
 
-FOLDERS = ("docs", "lathe_papers", "lathe_rc", "msg_defs", "tests", "tools")
+FOLDERS = (*PACKAGES, *(ROOT / name for name in ("docs", "msg_defs", "tests", "tools")))
 RULES = ROOT / "tools" / "prose.yaml"
 # These say nothing of their content.
 MODULES = {"both", "happened", "leftovers", "offered", "played", "story", "strangers", "trust", "walk", "watch"}
@@ -81,7 +81,7 @@ def found(path: Path, refused: list[Rule]) -> Iterator[str]:
 
 def files() -> list[Path]:
     """Return the pages and the Python files of the checkout."""
-    inside = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in {".md", ".py"}]
+    inside = [path for folder in FOLDERS for path in folder.rglob("*") if path.suffix in {".md", ".py"}]
     return sorted([*ROOT.glob("*.md"), *inside])
 
 

@@ -19,7 +19,7 @@ from environment import Changes, build_environment, changes, complete
 from ros import SourcedRos, site_packages
 from ros_wheels import FAST_DDS_ALONE, PYTHON_ALONE, cmake_options, mend_cmake_paths
 from steps import Step, clear, write_atomically
-from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PYTHON, REQUIREMENTS, ROOT, VENV, say
+from workplace import BASE_PYTHON, BUILD, HOME, INSTALL, LOG, PACKAGES, PYTHON, REQUIREMENTS, ROOT, VENV, say
 
 CONSTRAINTS = VENV / "constraints.txt"
 PACKAGES_STAMP = VENV / "packages.stamp"
@@ -87,7 +87,12 @@ class Recipe:
         linked = [path for folder in ("config", "launch", "urdf") for path in sources(ROOT / folder)]
         self._package_key = digest(
             [self._messages_key, *sorted(map(str, linked))],
-            [ROOT / "setup.py", ROOT / "setup.cfg", ROOT / "package.xml", tools / "environment.py"],
+            [
+                *(
+                    ROOT / name
+                    for name in ("setup.py", "setup.cfg", "package.xml", "lathe_rc/packages.py", "tools/environment.py")
+                )
+            ],
         )
 
     def ready(self, groups: Iterable[str] = ()) -> Changes | None:
@@ -181,7 +186,7 @@ class Recipe:
         with Step("lathe_rc", "3 s", advice, lock) as step:
             step.run(*colcon("--paths", ROOT, "--symlink-install"), environ=self._colcon_environment())
             # Some environments forbid Python to write byte code, and each start would compile a hundred modules anew.
-            step.run(PYTHON, "-m", "compileall", "-q", ROOT / "lathe_rc", environ=build_environment(self._ros))
+            step.run(PYTHON, "-m", "compileall", "-q", *PACKAGES, environ=build_environment(self._ros))
             for script in (INSTALL / "setup.sh", INSTALL / "setup.bash"):
                 script.write_text(complete(script.read_text(encoding="utf-8"), self._ros), encoding="utf-8")
             command = PYTHON.with_name("lathe")

@@ -13,6 +13,7 @@ BUILD = HOME / "build"
 INSTALL = HOME / "install"
 LOG = HOME / "log"
 REQUIREMENTS = ROOT / "requirements"
+PACKAGES = sorted(path.parent for path in ROOT.glob("lathe_*/__init__.py"))  #: folders of the Python packages
 
 # The interpreter itself, even if a virtual environment (perhaps the very one to be made anew) started us.
 BASE_PYTHON: str = getattr(sys, "_base_executable", sys.executable)

@@ -17,8 +17,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 import scipy
 
+from lathe_commission.reduced_order import refuse_unusable
 from lathe_papers.formulas.responses import second_order
-from lathe_rc.analysis.reduced_order import refuse_unusable
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file

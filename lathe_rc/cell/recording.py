@@ -153,7 +153,7 @@ class Recording:
     def frame(self, topic: str) -> Any:
         """Return a topic as a table with one row per sample or message, or per element of a message with lists.
 
-        The columns are those of `lathe_rc.bag.exporting.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
+        The columns are those of `lathe_export.tables.export`: ``sample``, ``time`` [s] (sample 0 is at 1 s) and the
         fields of the message. If the recording has an encoder, two more columns come before the fields: ``revolution``,
         counted from 1, and ``spindle_angle``, the true angle within the revolution [rad].
 

@@ -12,6 +12,7 @@ from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
 from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import help_or_refusal
+from lathe_rc.packages import STANDALONE
 
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
@@ -37,7 +38,7 @@ def node(name: str, arguments: tuple[str, ...]) -> None:
     kind = kind or own
     if name == MACHINE_STATE:
         if not help_or_refusal(f"lathe node {name}", name, MachineStateParameters, arguments):
-            sys.exit(load(f"lathe_rc.nodes.{name}").run({}, arguments))
+            sys.exit(load(STANDALONE[name]).run({}, arguments))
         return
     if kind not in TABLES:
         raise InputError(f"no node {kind!r}; {TABLES.instead(kind)}")

@@ -8,7 +8,7 @@
     exact                         Wk2, then Wk1 (000, eqs 13-14): the drive model with constant parameters in the
                                   angle domain, then its inverse in time
     fir                           Σ hk·e^{-pkT'}: the memory read with a lead of its own for each tap hk, from T0
-                                  in steps of T' back; an inverse of a response (`lathe_rc.analysis.fir_inverse`)
+                                  in steps of T' back; an inverse of a response (`lathe_commission.fir_inverse`)
 
 The drive model is e^{-pτ}/(1 + a1·p + a2·p²) with a1 = 2ζ/ωn and a2 = 1/ωn²; the lead compensates its delay τ.
 """

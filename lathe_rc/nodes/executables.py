@@ -4,7 +4,6 @@
 ``python -m lathe_rc.nodes.executables NAME ...`` does the same without an installation.
 """
 
-import importlib.util
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +13,7 @@ from lathe_rc import extras
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import exit_with
+from lathe_rc.packages import STANDALONE
 
 
 def __getattr__(name: str) -> Callable[[], None]:
@@ -22,17 +22,17 @@ def __getattr__(name: str) -> Callable[[], None]:
     Raises:
         AttributeError: no executable has this name.
     """
-    if name not in TABLES.own and importlib.util.find_spec(f"lathe_rc.nodes.{name}") is None:
+    if name not in TABLES.own and name not in STANDALONE:
         raise AttributeError(f"no node {name!r}")
     return partial(_main, name)
 
 
 def _main(name: str) -> NoReturn:
-    module, words = ("process", [name]) if name in TABLES.own else (name, [])
+    module, words = ("lathe_rc.nodes.process", [name]) if name in TABLES.own else (STANDALONE[name], [])
 
     def work() -> NoReturn:
         with extras.named():
-            load(f"lathe_rc.nodes.{module}").main(*words)
+            load(module).main(*words)
         raise AssertionError("an executable exits by itself")
 
     exit_with(work)

@@ -22,6 +22,8 @@ from lathe_rc.nodes import arguments, dds, declare
 
 T = TypeVar("T", bound=Table)
 
+LISTENS = "recording"  #: begin of the line that the topic recorder logs once it hears every publisher
+
 
 class StandaloneNode(Node):
     """Node whose parameters are those of a table.

@@ -28,9 +28,9 @@ class Grid:
     texts: Sequence[str]
 
 
-def own_file(name: str) -> str:
-    """Return the text of a style sheet or script beside this module."""
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+def own_file(name: str, folder: Path = Path(__file__).parent) -> str:
+    """Return the text of a style sheet or script of these pages, or of another folder."""
+    return (folder / name).read_text(encoding="utf-8")
 
 
 def printable(text: str, longest: int = _LONGEST_TEXT) -> str:

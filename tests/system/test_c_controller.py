@@ -14,9 +14,9 @@ pytest.importorskip("rclpy")
 
 import test_foreign
 
+from lathe_export.c_library.sources import export_nodes
 from lathe_rc import harness
 from lathe_rc.bag import reader
-from lathe_rc.c_library.sources import export_nodes
 
 pytestmark = pytest.mark.system
 

@@ -8,7 +8,7 @@ from bags import sized, some
 from c_libraries import built, hostile
 from cells import SCENARIOS
 
-from lathe_rc.c_library.sources import export_nodes
+from lathe_export.c_library.sources import export_nodes
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError

@@ -6,8 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from lathe_rc.sweep import space
-from lathe_rc.sweep.effects import Axis, groups, total_effect
+from lathe_explore.sweep import space
+from lathe_explore.sweep.effects import Axis, groups, total_effect
 
 pytestmark = pytest.mark.system
 

@@ -12,8 +12,8 @@ from cells import SCENARIOS
 from test_c_libraries import REFUSED
 from test_fmu_export import STEP, Run
 
-from lathe_rc.c_library.fmu import export_fmu
-from lathe_rc.c_library.reference import Reference
+from lathe_export.c_library.fmu import export_fmu
+from lathe_export.c_library.reference import Reference
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError

@@ -15,11 +15,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from bags import lathe
 from test_report_browser import Visit
 
+from lathe_live.loop_page import LoopPage
+from lathe_live.page_server import serving
+from lathe_live.varied_loop import VariedLoop
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.varied_loop import VariedLoop
-from lathe_rc.view.loop_page import LoopPage
-from lathe_rc.view.page_server import serving
 
 pytestmark = pytest.mark.system
 

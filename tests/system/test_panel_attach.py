@@ -17,10 +17,10 @@ import pytest
 from cells import until
 
 import lathe_rc
+from lathe_live.page_server import TOKEN
+from lathe_live.panel_view import Have
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-from lathe_rc.view.page_server import TOKEN
-from lathe_rc.view.panel_view import Have
 
 HELD = ["spindle_encoder.simulation_services=playing"]
 SUPERVISED = Path(__file__).parents[2] / "config" / "supervised.yaml"

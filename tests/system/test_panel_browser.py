@@ -13,13 +13,13 @@ from test_panel import attached, bag, hear, retracted, scenario
 
 import lathe_rc
 from chromium import Chromium
+from lathe_live import page_server, panel, panel_lamp
+from lathe_live.loop_page import LoopPage
+from lathe_live.panel_run import Driver, LiveCell
+from lathe_live.varied_loop import VariedLoop
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.varied_loop import VariedLoop
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.view import page_server, panel, panel_lamp
-from lathe_rc.view.loop_page import LoopPage
-from lathe_rc.view.panel_run import Driver, LiveCell
 
 pytestmark = pytest.mark.system
 __all__ = ["bag", "retracted"]  # fixtures

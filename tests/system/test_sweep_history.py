@@ -15,14 +15,14 @@ import distributed
 import pytest
 from uv import uv
 
-import lathe_rc
+import lathe_explore
+from lathe_explore.sweep import inputs, row, workers
+from lathe_explore.sweep.folder import Folder
+from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.sweep import inputs, row, workers
-from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import Space
 
 pytestmark = pytest.mark.system
 
@@ -79,8 +79,8 @@ from lathe_rc import allowed_code
 
 if __name__ == "__main__":
     allowed_code.allow("my_drive")
-    piston, space = lathe_rc.load({}, {}), lathe_rc.Space(grid={})
-    lathe_rc.run_sweep(piston, space, {}, workers=1, watch=lambda event: print(event["event"], flush=True))
+    piston, space = lathe_rc.load({}, {}), lathe_explore.Space(grid={})
+    lathe_explore.run_sweep(piston, space, {}, workers=1, watch=lambda event: print(event["event"], flush=True))
 """
 
 
@@ -111,7 +111,7 @@ def test_campaign_rows_of_a_random_history_are_those_of_direct_runs(small_disk, 
         piston = scenarios.load(PISTON, SCENARIO)
 
         def run(grid, client):
-            return lathe_rc.run_sweep(scenarios.load(PISTON, SCENARIO), Space(grid=grid), place, client=client)
+            return lathe_explore.run_sweep(scenarios.load(PISTON, SCENARIO), Space(grid=grid), place, client=client)
 
         for number in range(commands):
             axes = lot.sample(sorted(VALUES)[: 2 + 4 * number // commands], lot.randint(1, 2))

@@ -16,12 +16,12 @@ import pyarrow.parquet
 import pytest
 from cells import until
 
-import lathe_rc
+import lathe_explore
+from lathe_explore.sweep import row, workers
+from lathe_explore.sweep.folder import Folder
+from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code
 from lathe_rc.cell import scenario
-from lathe_rc.sweep import row, workers
-from lathe_rc.sweep.folder import Folder
-from lathe_rc.sweep.space import Space
 
 pytestmark = pytest.mark.system
 
@@ -38,7 +38,7 @@ def piston():
 WORKERS = """
 import os
 from cells import listening
-from lathe_rc.sweep.workers import client_of
+from lathe_explore.sweep.workers import client_of
 
 with client_of(None, 1):
     print(*listening(os.getpgrp()))
@@ -97,7 +97,7 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
                     start(worker(scheduler))
                 done += event["statuses"].total()
 
-        found = lathe_rc.run_sweep(piston, space, tmp_path / "rows", scheduler=scheduler, watch=watch)
+        found = lathe_explore.run_sweep(piston, space, tmp_path / "rows", scheduler=scheduler, watch=watch)
     assert first.wait() == -signal.SIGKILL
     rows = found.table().to_pylist()
     assert [each["cell"] for each in rows] == list(range(CELLS))
@@ -207,7 +207,7 @@ def test_poison_in_a_campaign_costs_its_own_cells_alone(tmp_path, monkeypatch):
         distributed.Client(cluster, set_as_default=False) as client,
     ):
         options = {"client": client, "cell_time": 5.0, "watch": watch}
-        found = lathe_rc.run_sweep(piston, space, place, **options)
+        found = lathe_explore.run_sweep(piston, space, place, **options)
         rows = found.table().to_pylist()
         assert [each["cell"] for each in rows] == list(range(poisoned + healthy))
         for each, damping in zip(rows, dampings, strict=True):
@@ -217,6 +217,6 @@ def test_poison_in_a_campaign_costs_its_own_cells_alone(tmp_path, monkeypatch):
                 assert each["reason"].startswith(REASONS[round(damping * 1e6) % 10])
             else:
                 assert each["status"] == row.DONE
-        again = lathe_rc.run_sweep(piston, space, place, **options)
+        again = lathe_explore.run_sweep(piston, space, place, **options)
         assert sum(computed) == poisoned + healthy  # the second call computes nothing
         assert again.table().to_pylist() == rows

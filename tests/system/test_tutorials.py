@@ -9,7 +9,7 @@ import distributed
 import pages
 import pytest
 
-from lathe_rc.sweep import sweep
+from lathe_explore.sweep import sweep
 
 pytestmark = pytest.mark.system
 

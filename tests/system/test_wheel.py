@@ -15,6 +15,7 @@ import workplace
 from lathe_rc import __version__
 from lathe_rc.cell.beside import BESIDE
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.packages import OURS
 
 pytestmark = pytest.mark.system
 
@@ -50,7 +51,9 @@ def test_wheel_holds_the_package_its_data_and_nothing_else(dist):
     prefix = f"lathe_rc-{__version__}.data/data"
     data = f"{prefix}/share"
     shared = {"package.xml", *files("config"), *files("launch"), *files("urdf")}
-    expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")} | files("lathe_papers")
+    expected = {name for name in files("lathe_rc") if not name.startswith("lathe_rc/msg_defs/")} | {
+        name for package in OURS - {"lathe_rc"} for name in files(package)
+    }
     expected |= {f"lathe_rc/{name}" for name in MESSAGES}
     expected |= {f"{data}/lathe_rc/{name}" for name in shared}
     expected |= {f"{data}/ament_index/resource_index/packages/lathe_rc"}

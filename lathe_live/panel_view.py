@@ -1,0 +1,432 @@
+# SPDX-License-Identifier: Apache-2.0
+"""View of a run in the panel: the newest values, the form by revolution, and the log; the lamp is beside it.
+
+The cell's thread feeds the view with chunks of samples and publishes a snapshot a few times a second; it never waits
+for a reader. Readers take the newest snapshot, and from lists that only grow what they do not have yet, so that a slow
+browser misses snapshots and delays nothing.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from lathe_live.panel_lamp import OUT, Lamp
+from lathe_live.panel_outlook import outlook
+from lathe_live.rerun_part import Outlook, Scale
+from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
+from lathe_rc import event_log, messages
+from lathe_rc.analysis.tolerance import LAST, growth
+from lathe_rc.arrays import Array
+from lathe_rc.cell.loops import Loop, loops, watches
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals, full
+from lathe_rc.view import machine_state
+from lathe_rc.view.form_limits import form_limits, varying_speed
+
+CELLS = 180  #: cells of a row of the map
+PERIOD = 0.125  #: least time between two snapshots [s]
+MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
+WATERFALL = 12  #: newest revolutions whose error is shown as curves
+_AT_ONCE = 16  # rows in an answer
+_SHAPE = 90  # points of the part's outline
+_MOST_LINES = 2000  # of the log in an answer
+_UM = 1e6
+_RPM = 60.0 / (2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topics of a cell that the panel shows, by fully qualified name; empty if there is none.
+
+    Attributes:
+        encoder, tool, cut: first topics of these kinds.
+        drives: states of the drives that move the tool.
+        slides: states of the slides, by axis.
+    """
+
+    encoder: str
+    tool: str
+    cut: str
+    drives: Sequence[str]
+    slides: Mapping[str, str]
+
+    @classmethod
+    def of(cls, types: Mapping[str, str]) -> "Topics":
+        """Return the topics of a cell, given the message type of each topic."""
+        named = {full(topic): kind for topic, kind in types.items()}
+        first = {kind: topic for topic, kind in reversed(named.items())}
+        slides = {
+            axis: topic
+            for topic, kind in named.items()
+            if kind == messages.STATE and (axis := machine_state.source(topic, kind))
+        }
+        drives = [t for t, kind in named.items() if kind == messages.STATE and t not in slides.values()]
+        return cls(
+            first.get(messages.ENCODER, ""), first.get(messages.TOOL, ""), first.get(messages.CUT, ""), drives, slides
+        )
+
+
+@dataclass(frozen=True)
+class Row:
+    """Revolution in the map.
+
+    Attributes:
+        revolution: its form.
+        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
+        out: whether the supervisor held the tool out of the part in some of it.
+    """
+
+    revolution: Revolution
+    cells: list[float]
+    out: bool = False
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of a run at a sample; the lists belong to the view, and only grow.
+
+    Attributes:
+        number: number of the snapshot, counted from 1.
+        run: number of the run; lists of another run start anew.
+        now: newest values, by name, in the units of the page.
+        epoch: number of times that every second row of the map was dropped.
+        rows, log: rows of the map, lines of the log.
+        history: number, RMS and largest error of each revolution [µm].
+        latest: newest revolutions.
+    """
+
+    number: int
+    run: int
+    now: Mapping[str, Any]
+    epoch: int
+    rows: list[Row]
+    log: list[dict[str, Any]]
+    history: list[tuple[int, float, float]]
+    latest: Sequence[Row] = ()
+
+
+def _short(values: Array) -> list[float]:
+    """Return numbers with four digits."""
+    return [float(f"{value:.4g}") for value in values.tolist()]
+
+
+def _row(revolution: Revolution, *, out: bool) -> Row:
+    parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
+    largest = np.abs(parts).argmax(axis=1)
+    return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
+
+
+class View:
+    """View of one run after the other; a sink of the engine.
+
+    Args:
+        types: message type by topic.
+        step_ns: sampling step [ns].
+        margin: stability margin before the first cycle; None: unknown.
+        live: whether the cell runs elsewhere.
+
+    Attributes:
+        outlook: see `lathe_live.panel_outlook`; empty: unknown.
+        lamp: state of the supervisor; a sink of its own, since it must not wait for the samples of a live view.
+    """
+
+    def __init__(
+        self, types: Mapping[str, str], step_ns: int, margin: float | None = None, *, live: bool = False
+    ) -> None:
+        self._news = threading.Condition()
+        self._due = 0.0
+        self.run = 0
+        self.latest: Snapshot | None = None
+        self.outlook: Mapping[str, Any] = {}
+        self.lamp = Lamp(live=live)
+        self._loops: Sequence[Loop] = ()
+        self.begin(types, step_ns, margin)
+
+    def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
+        """Begin with another run of another cell (arguments as for the class)."""
+        self._types: dict[str, str] = {}
+        self._form: set[str] = set()  # signals that the form error is made of
+        self._step_ns, self._margin = step_ns, margin
+        self.learn(types)
+        self.clear(margin)
+
+    def know(self, scenario: Scenario) -> None:
+        """Show what the samples do not tell: tolerance and shape of the scenario, results of its loops from now on."""
+        self.outlook, self._loops = outlook(scenario), loops(scenario.nodes)
+        self._watches = watches(self._loops, self._types)
+        for loop in self._loops:
+            loop.running(0).add(*np.zeros((4, loop.delay + 2)))  # compiles the kernel before the run
+
+    def learn(self, types: Mapping[str, str]) -> None:
+        """Add topics."""
+        self._types |= {full(topic): kind for topic, kind in types.items()}
+        self._form |= fields_of(types, FORM)
+        self.topics = Topics.of(self._types)
+
+    def clear(self, margin: float | None = None) -> None:
+        """Begin with another run of the same cell."""
+        self.run += 1
+        self._revolutions, self._soundness = Revolutions(), Soundness(self._form)
+        self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "learning": {}}
+        self._is_out = False
+        self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
+        self._end = 0  # sample after the last complete revolution
+        self._scale: Scale | None = None
+        self._epoch, self._every = 0, 1
+        self._rows: list[Row] = []
+        self._newest: list[Row] = []
+        self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
+        self._largest: list[float] = []  # form error of each revolution [m]
+        self._growth: tuple[int, dict[str, Any] | None] = (0, None)  # number of revolutions, and growth then
+        self._conditions = event_log.Conditions()
+        self._speeds = (math.inf, 0.0)  # extremes [rad/s]
+        self._watches = watches(self._loops, self._types)
+        self._log: list[dict[str, Any]] = []
+        self._history: list[tuple[int, float, float]] = []
+
+    @property
+    def reached(self) -> int:
+        """Sample after the newest."""
+        return int(self._now.get("sample", 0))
+
+    @property
+    def supervised(self) -> bool:
+        """Whether the cell has a supervisor, by its scenario or its topics."""
+        return bool(self.outlook.get("supervised")) or messages.SAFETY_STATUS in self._types.values()
+
+    @property
+    def turns(self) -> float:
+        """Spindle angle of the newest sample [revolution]."""
+        return float(self._now.get("angle", 0.0)) / (2.0 * np.pi)
+
+    # ---- the cell's thread --------------------------------------------------------------------------
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Take consecutive samples, as a sink of the engine."""
+        named = {full(topic): signals for topic, signals in dense.items()}
+        for message in sorted((each for found in sparse.values() for each in found), key=lambda each: each.index):
+            self._message(full(message.topic), message)
+        self._now["sample"] = first + samples
+        self._now["time"] = (first + samples) * self._step_ns * 1e-9
+        encoder, tool, cut = (named.get(topic) for topic in (self.topics.encoder, self.topics.tool, self.topics.cut))
+        if encoder:
+            slowest, fastest = float(encoder["speed_true"].min()), float(encoder["speed_true"].max())
+            self._speeds = (min(self._speeds[0], slowest), max(self._speeds[1], fastest))
+            self._now |= {"angle": float(encoder["angle_true"][-1]), "rpm": float(encoder["speed"][-1]) * _RPM}
+        if cut:
+            self._now |= {name: float(cut[name][-1]) for name in ("force", "measured_force")}
+        self._now["drives"] = {
+            topic.strip("/").removesuffix("/state"): float(named[topic]["position"][-1]) * _UM
+            for topic in self.topics.drives
+            if topic in named
+        }
+        self._now["slides"] = {
+            axis: float(named[topic]["position"][-1]) * 1e3
+            for axis, topic in self.topics.slides.items()
+            if topic in named
+        }
+        for watch in self._watches:
+            if named.keys() >= {*watch.topics}:  # a live view does not listen to controllers
+                watch.chunk(first, samples, named, sparse)
+        before, sound = self._soundness.why, self._soundness.sound(first, samples, sparse)
+        if self._soundness.why != before:
+            self.say(first + sound, "panel", f"form error {self._soundness.why}")
+        if encoder and tool:
+            self._part(first, encoder["angle_true"], tool, sound)
+
+    def _part(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:
+        if self._scale is None:
+            self._scale = Scale.of(Outlook(), tool["reference"])
+        self._now |= {
+            name: float(tool[name][-1]) * _UM for name in ("reference", "displacement", "error", "measured_error")
+        }
+        self._now["height"] = float(tool["height"][-1]) * 1e3
+        if sound:
+            fields = (tool[name][:sound] for name in ("error", "reference", "height"))
+            self._add(self._revolutions.add(first, angle[:sound], *fields))
+
+    def finish(self) -> None:
+        """Show the last revolution as well, at the end of a run."""
+        self._add(self._revolutions.finish())
+
+    def _add(self, complete: Iterable[Revolution]) -> None:
+        for revolution in complete:
+            row = _row(revolution, out=revolution.end > self._out[0] and self._end < self._out[1])
+            self._end = revolution.end
+            rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
+            self._history.append((revolution.number, rms, largest))
+            self._largest.append(revolution.largest)
+            self._newest = [*self._newest[1 - WATERFALL :], row]
+            if (revolution.number - 1) % self._every == 0:
+                self._rows.append(row)
+            if len(self._rows) == MOST_ROWS:
+                # A new list: readers of older snapshots keep the old one.
+                self._rows, self._epoch, self._every = self._rows[::2], self._epoch + 1, 2 * self._every
+
+    def _message(self, topic: str, message: Sparse) -> None:
+        if message.type == messages.LEARNING:
+            self._now["learning"] = {**self._now["learning"], topic: bool(message.values["learning"])}
+        if message.type == messages.LEARNING and np.isfinite(message.values["stability_margin"]):
+            self._now["margin"] = float(message.values["stability_margin"])
+        if message.type in event_log.LOGGED:
+            self.say(message.index, topic.strip("/"), event_log.text(message))
+        if message.type == messages.SAFETY_STATUS:
+            out = event_log.supervisor_state(message) in OUT
+            if out != self._is_out:
+                self._is_out, self._out = out, (message.index, math.inf) if out else (self._out[0], message.index)
+        if message.type == messages.EVENT:
+            self._conditions.take(message)
+
+    def _growing(self) -> dict[str, Any] | None:
+        """Return the growth of the form error as `lathe_rc.harness.Result` evaluates it; None if it does not grow."""
+        count = len(self._largest)
+        if self._growth[0] != count:
+            found = growth(np.array(self._largest))
+            # A live view may lack revolutions.
+            found = found and replace(found, since=self._history[found.since - 1][0])
+            self._growth = count, {"text": found.told(), "diverges": found.diverges} if found else None
+        return self._growth[1]
+
+    def _limiting(self) -> list[str]:
+        """Return what limits the form error, in sentences."""
+        rows = self._newest[-LAST:]
+        if self._limits[0] != len(self._history) and rows:
+            tolerance = self.outlook.get("tolerance")
+            found = form_limits(
+                np.array([row.revolution.error for row in rows]) * _UM,
+                excess=rows[-1].revolution.largest * _UM / tolerance if tolerance else 0.0,
+                learning=messages.LEARNING in self._types.values(),
+                causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
+            )
+            out = ["The supervisor held the tool out of the part in the last revolutions."]
+            self._limits = len(self._history), out if any(row.out for row in rows) else [each.text for each in found]
+        return [
+            *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
+            *self._limits[1],
+        ]
+
+    def _looped(self) -> list[str]:
+        """Return verdict and behaviour of the force and position loops, in sentences."""
+        results = (watch.result() for watch in self._watches)
+        return [
+            f"{result.loop.node}: {text}."
+            for result in results
+            if result.found.errors.rms.size
+            for text in (*(told for told, _ in result.judged()), *result.behaviour())
+        ]
+
+    def say(self, sample: int, source: str, text: str) -> None:
+        """Add a line to the log."""
+        self._log.append({"sample": sample, "source": source, "text": text[:300]})
+
+    def publish(self, told: Mapping[str, Any], *, at_once: bool = False) -> None:
+        """Publish a snapshot, unless the last one was a moment ago.
+
+        Args:
+            told: status of the run.
+            at_once: whether to publish in any case.
+        """
+        now = time.monotonic()
+        if not at_once and now < self._due:
+            return
+        self._due = now + PERIOD
+        with self._news:
+            number = self.latest.number + 1 if self.latest else 1
+            scale = self._scale.deviation / 1e3 if self._scale else 1.0
+            current = {**self._now, **told, "exaggeration": scale, "growth": self._growing()}
+            current |= {"limits": self._limiting(), "loops": self._looped()}
+            self.latest = Snapshot(
+                number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
+            )
+            self._news.notify_all()
+
+    # ---- readers ------------------------------------------------------------------------------------
+
+    def wait(self, after: int, seconds: float) -> Snapshot:
+        """Return the newest snapshot, as soon as its number is not ``after``, or after some seconds.
+
+        Raises:
+            LatheError: there is none yet.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self.latest is not None and self.latest.number != after, seconds)
+            if self.latest is None:
+                raise LatheError("the run has not begun yet")
+            return self.latest
+
+
+@dataclass(frozen=True)
+class Have:
+    """Contents of a page so far.
+
+    Attributes:
+        number: number of its newest snapshot.
+        run: number of its run.
+        epoch, rows: state of its map, see `Snapshot`.
+        log, history: number of lines and of revolutions.
+        latest: newest revolution in its waterfall.
+    """
+
+    number: int = 0
+    run: int = 0
+    epoch: int = 0
+    rows: int = 0
+    log: int = 0
+    history: int = 0
+    latest: int = 0
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> "Have":
+        """Read the state of a page from its question.
+
+        Raises:
+            InputError: a number is missing or negative.
+        """
+        found: dict[str, int] = {}
+        for name in (each.name for each in fields(cls)):
+            value = told.get(name)
+            if not isinstance(value, int) or not 0 <= value < 2**53:
+                raise InputError(f"{name} = {str(value)[:80]}; allowed: a whole number from 0 on")
+            found[name] = value
+        return cls(**found)
+
+
+def _told(row: Row) -> dict[str, Any]:
+    return {"revolution": row.revolution.number, "cells": row.cells, "out": row.out}
+
+
+def news(view: View, have: Have, patience: float) -> dict[str, Any]:
+    """Return what a page lacks, as JSON data, once there is a new snapshot, or after some seconds; the lamp is current.
+
+    Rows of the map come a few at a time. A page with an older epoch first drops every second row for each later one,
+    which leaves ⌈n/2⌉ of n rows.
+
+    Raises:
+        LatheError: there is no snapshot yet.
+    """
+    snapshot = view.wait(have.number, patience)
+    if have.run != snapshot.run or have.epoch > snapshot.epoch:
+        have = Have(have.number)
+    had = -(-have.rows // 2 ** (snapshot.epoch - have.epoch))
+    rows = snapshot.rows[had : had + _AT_ONCE]
+    latest = [row for row in snapshot.latest if row.revolution.number > have.latest]
+    return {
+        "number": snapshot.number,
+        "run": snapshot.run,
+        "epoch": snapshot.epoch,
+        "now": {**snapshot.now, **view.lamp.now(supervised=view.supervised)},
+        "rows": [{**_told(row), "height": round(row.revolution.height * 1e3, 6)} for row in rows],
+        "more": had + len(rows) < len(snapshot.rows),
+        "log": snapshot.log[have.log : have.log + _MOST_LINES],
+        "history": snapshot.history[have.history : have.history + _MOST_LINES],
+        "latest": [_told(row) for row in latest],
+        "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
+    }
