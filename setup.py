@@ -11,11 +11,10 @@ from setuptools import Distribution, find_packages, setup
 
 # colcon's --symlink-install runs a link to this file from its build folder
 HERE = Path(__file__).resolve().parent
-# read, not imported: nothing that the stages need is there yet
-STAGES = re.findall(r'^    "(\w+)": "\w+:\w+",$', (HERE / "lathe_rc/cell/stages/__init__.py").read_text(), re.MULTILINE)
-NODES = [*STAGES, "recorder"]
-TABLES = runpy.run_path(str(HERE / "lathe_rc/packages.py"))
-PACKAGES, ALONE = sorted(TABLES["OURS"]), TABLES["STANDALONE"]
+# read, not imported: nothing that the package needs is there yet
+CATALOGUE = runpy.run_path(str(HERE / "lathe_rc/catalogue.py"))
+NODES = [*CATALOGUE["STAGES"], "recorder"]
+PACKAGES, ALONE = sorted(CATALOGUE["OURS"]), CATALOGUE["STANDALONE"]
 PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
 STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
 EXECUTABLES = {

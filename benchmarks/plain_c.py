@@ -14,21 +14,21 @@ import numpy.typing as npt
 
 from lathe_rc import messages
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages.cutting_process import CuttingProcessStage
-from lathe_rc.cell.stages.decoupler import DecouplerStage
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
-from lathe_rc.cell.stages.feed_drive import FeedDriveStage
-from lathe_rc.cell.stages.force_controller import ForceController
-from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.piezo_actuator import PiezoActuator
-from lathe_rc.cell.stages.position_controller import PositionController
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
-from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.lead import LeadLaw
 from lathe_rc.errors import LatheError
 from lathe_rc.signals.encoder import EncoderTable
 from lathe_rc.signals.noise import DRAWN
+from lathe_rc.stages.cut.cutting_process import CuttingProcessStage
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.stages.drive.piezo_actuator import PiezoActuator
+from lathe_rc.stages.feed.decoupler import DecouplerStage
+from lathe_rc.stages.feed.feed_drive import FeedDriveStage
+from lathe_rc.stages.feed.force_controller import ForceController
+from lathe_rc.stages.feed.position_controller import PositionController
+from lathe_rc.stages.learning.learning_controller import LearningController
+from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
+from lathe_rc.stages.tool.tool import Tool
 from lathe_rc.transfer import System
 
 FLAGS = ("-O3", "-march=native", "-std=c11")

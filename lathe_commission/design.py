@@ -19,7 +19,6 @@ import numpy as np
 from lathe_commission.cycle_weights import of_gaussian_process
 from lathe_commission.fir_inverse import fir_inverse
 from lathe_rc import messages
-from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive
@@ -29,11 +28,12 @@ from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Values
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.learner import Learner, Loop, lag
-from lathe_rc.cell.stages.speed_law import SpeedLawParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals
+from lathe_rc.signals.form_errors import FormErrors
+from lathe_rc.stages.learning.learner import Learner, Loop, lag
+from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
 
 _LEADS = np.linspace(0.5, 1.3, 9)  # over the lag that the correction leaves
 _GAINS = (1.0, 0.5)

@@ -11,11 +11,11 @@ from lathe_live import block_diagram, loop_figures
 from lathe_live.page_server import Page, Site
 from lathe_live.varied_loop import Along, LoopState, Setting, VariedLoop, drive_curves
 from lathe_rc import __version__, files
-from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.tolerance import LAST, judge
-from lathe_rc.cell import part
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.judge import part
 from lathe_rc.names import instead
+from lathe_rc.signals.form_errors import FormErrors
 from lathe_rc.view import report_loop
 from lathe_rc.view.charts import Charts, Spec, page_template
 from lathe_rc.view.pages import own_file

@@ -3,13 +3,13 @@
 
 from typing import Any
 
-from lathe_rc.cell.budget import changing
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
-from lathe_rc.cell.stages.force_controller import ForceControllerParameters
-from lathe_rc.cell.stages.supervisor import SupervisorParameters
-from lathe_rc.cell.stages.time_master import TimeMasterParameters
-from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.time_master import TimeMasterParameters
+from lathe_rc.judge.budget import changing
+from lathe_rc.stages.cut.cutting_process import CuttingProcessParameters
+from lathe_rc.stages.feed.force_controller import ForceControllerParameters
+from lathe_rc.stages.supervisor import SupervisorParameters
+from lathe_rc.stages.tool.tool import ToolParameters
 
 
 def outlook(scenario: Scenario) -> dict[str, Any]:

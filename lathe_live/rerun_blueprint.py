@@ -8,8 +8,8 @@ import rerun.blueprint as rrb
 from lathe_live import rerun_part as parts
 from lathe_live.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 from lathe_rc import messages
-from lathe_rc.cell.loops import Loop
 from lathe_rc.event_log import LOGGED
+from lathe_rc.judge.loops import Loop
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # range before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}

@@ -14,8 +14,8 @@ from lathe_live import diverging
 from lathe_live.rerun_revolutions import ANGLES, Revolution
 from lathe_rc.arrays import Array
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.time_master import TimeMasterParameters
-from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.cell.time_master import TimeMasterParameters
+from lathe_rc.stages.tool.tool import ToolParameters
 
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]

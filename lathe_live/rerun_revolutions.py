@@ -67,7 +67,7 @@ def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
 class Revolutions:
     """Accumulator of samples that yields complete revolutions.
 
-    RMS and largest error agree with `lathe_rc.analysis.form_errors`.
+    RMS and largest error agree with `lathe_rc.signals.form_errors`.
     """
 
     def __init__(self) -> None:

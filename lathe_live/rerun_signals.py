@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from lathe_rc import messages
 from lathe_rc.analysis.tolerance import FORCE as NEWTONS
-from lathe_rc.cell.loops import Loop, watches
 from lathe_rc.event_log import LOGGED
+from lathe_rc.judge.loops import Loop, watches
 from lathe_rc.messages import Samples, full
 
 

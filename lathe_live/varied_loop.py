@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.batch import CellRunner, Errors
-from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
 from lathe_rc.cell.parameters import Values
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
+from lathe_rc.signals.form_errors import FormErrors
+from lathe_rc.stages.learning.learner import Learner
 
 _WIDEST = 2.5  # end of a range, in values of the scenario
 _POINTS = 400  # of a response

@@ -17,8 +17,8 @@ from lathe_papers.judge import finite
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.drive import Drive
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.stages.drive.drive import Drive
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -24,11 +24,11 @@ from lathe_rc.arrays import Array
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import SharedParameters, Value, Values, parameter
 from lathe_rc.cell.scenario import TABLES, Scenario
-from lathe_rc.cell.stages.drive import Drive
-from lathe_rc.cell.stages.learner import LawParameters, Learner, Loop
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import in_words
+from lathe_rc.stages.drive.drive import Drive
+from lathe_rc.stages.learning.learner import LawParameters, Learner, Loop
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from lathe_papers.multichannel import SCENARIOS, analytic
 from lathe_rc import messages
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.cell.stages.form import FormParameters
+from lathe_rc.stages.tool.form import FormParameters
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

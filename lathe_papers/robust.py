@@ -21,9 +21,9 @@ from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import Values, parameter
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.drive import Drive
-from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.stages.drive.drive import Drive
+from lathe_rc.stages.learning.learner import Learner
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import Value, Values, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.learner import Learner
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
+from lathe_rc.stages.learning.learner import Learner
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

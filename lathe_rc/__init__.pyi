@@ -10,7 +10,6 @@ from lathe_rc import messages as messages
 from lathe_rc import study as study
 from lathe_rc.bag.reader import read_bag as read_bag
 from lathe_rc.cell.batch import run_many as run_many
-from lathe_rc.cell.budget import budget as budget
 from lathe_rc.cell.parameters import NodeParameters as NodeParameters
 from lathe_rc.cell.parameters import parameter as parameter
 from lathe_rc.cell.recording import Recording as Recording
@@ -20,16 +19,17 @@ from lathe_rc.cell.stage import DONE as DONE
 from lathe_rc.cell.stage import Input as Input
 from lathe_rc.cell.stage import Output as Output
 from lathe_rc.cell.stage import Stage as Stage
-from lathe_rc.cell.stages.law import Law as Law
-from lathe_rc.cell.stages.law import Now as Now
-from lathe_rc.cell.stages.learner import LawParameters as LawParameters
-from lathe_rc.cell.stages.plant import Plant as Plant
-from lathe_rc.cell.stages.plant import PlantParameters as PlantParameters
 from lathe_rc.errors import InputError as InputError
 from lathe_rc.errors import LatheError as LatheError
 from lathe_rc.harness.result import Result as Result
 from lathe_rc.harness.runner import run as run
 from lathe_rc.jit import kernel as kernel
+from lathe_rc.judge.budget import budget as budget
+from lathe_rc.stages.drive.plant import Plant as Plant
+from lathe_rc.stages.drive.plant import PlantParameters as PlantParameters
+from lathe_rc.stages.learning.law import Law as Law
+from lathe_rc.stages.learning.law import Now as Now
+from lathe_rc.stages.learning.learner import LawParameters as LawParameters
 from lathe_rc.view.report import write_report as write_report
 
 __version__: str

@@ -14,8 +14,8 @@ import click
 from click.shell_completion import CompletionItem
 
 from lathe_rc import __version__, allowed_code, extras
+from lathe_rc.catalogue import COMMANDS
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.packages import COMMANDS
 
 
 class _Command(click.Command):

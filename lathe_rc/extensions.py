@@ -26,8 +26,8 @@ from typing import Any, Generic, TypeVar
 from pydantic_core import core_schema
 
 from lathe_rc import allowed_code
+from lathe_rc.catalogue import OURS
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.packages import OURS
 
 T = TypeVar("T")
 V = TypeVar("V")

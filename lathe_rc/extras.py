@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, cast
 
-from lathe_rc import packages
+from lathe_rc import catalogue
 from lathe_rc.errors import LatheError
 
 if TYPE_CHECKING:  # a checkout imports this module before any package is installed
@@ -92,4 +92,4 @@ def load(name: str) -> ModuleType:
 
 def command(name: str) -> "click.Command":
     """Return a command of the command line after importing its module."""
-    return cast("click.Command", getattr(load(packages.module_of(name)), name))
+    return cast("click.Command", getattr(load(catalogue.module_of(name)), name))

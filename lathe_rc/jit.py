@@ -47,7 +47,7 @@ _KERNELS = (
     "safety/*.py",
     "cell/ahead.py",
     "cell/program.py",
-    "cell/stages/*.py",
+    "stages/**/*.py",
     "../lathe_bagtools/resimulation/bag_spindle.py",
     "../lathe_papers/formulas/*.py",
 )

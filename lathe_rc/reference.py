@@ -10,10 +10,10 @@ from importlib.resources import files
 from lathe_rc import messages
 from lathe_rc.cell.beside import BESIDE
 from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS, signal_depth
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Input, Stage
-from lathe_rc.cell.stages import STAGES
 
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 _WHEN = {

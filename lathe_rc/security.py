@@ -13,10 +13,10 @@ from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.cell.beside import MACHINE_STATE, PANEL, PANEL_COMMANDS, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.cell.host_topics import HOST_TOPICS
+from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import ALIVE
 from lathe_rc.names import absolute, checked_namespace

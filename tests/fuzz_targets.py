@@ -41,13 +41,13 @@ from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario, new_stage
-from lathe_rc.cell.stages.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import measured_profile, profile_table
+from lathe_rc.stages.feed.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.view import report
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS

@@ -20,7 +20,6 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.stage import Input
-from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import (
@@ -36,6 +35,7 @@ from lathe_rc.protocol import (
 )
 from lathe_rc.protocol.inputs import Inputs
 from lathe_rc.protocol.kept_states import KeptStates
+from lathe_rc.stages.tool.tool import ToolParameters
 
 SIZE = 4  # samples in a block
 HOST = "here"

@@ -23,8 +23,8 @@ from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import graph
 from lathe_rc.nodes.ports import message_class
@@ -64,7 +64,7 @@ class Received:
         os.chdir(here)
         shutil.copytree(bag, self.bag)
         text = (
-            f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\nfrom lathe_rc.cell.stages.tool import Tool\n"
+            f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\nfrom lathe_rc.stages.tool.tool import Tool\n"
         )
         for place in (here, self.bag):
             (place / f"{self.module}.py").write_text(text)

@@ -13,9 +13,9 @@ import lathe_rc
 from lathe_rc import harness
 from lathe_rc.analysis.budget import Decomposition
 from lathe_rc.analysis.tolerance import LAST
-from lathe_rc.cell import budget as budgets
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
+from lathe_rc.judge import budget as budgets
 
 PRODUCTS = ["direct_compensation", "lead_lag", "series", "supervised_two_channel", "two_channel", "two_coarse"]
 ANGLE = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)[None]

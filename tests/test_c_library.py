@@ -15,8 +15,8 @@ from lathe_export.c_library.memory_image import MemoryImage
 from lathe_export.c_library.sources import export_nodes
 from lathe_rc import InputError
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.stages.learning.learning_controller import LearningController
+from lathe_rc.stages.tool.tool import Tool
 
 WORDS = ("int", "lathe", "lathe_cell", "class", "main", "memcpy", "tapes", "math", "all", "write")
 

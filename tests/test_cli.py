@@ -16,11 +16,11 @@ from bags import lathe
 from click.testing import CliRunner
 
 from lathe_rc import extras, harness
+from lathe_rc.catalogue import COMMANDS
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.scenario import TABLES, load
-from lathe_rc.cell.stages import MASTERS, STAGES
-from lathe_rc.cell.stages.time_master import TimeMaster
+from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.cli import main
-from lathe_rc.packages import COMMANDS
 
 CELL = """
 /spindle_encoder: {ros__parameters: {revolutions: 3.0}}
@@ -293,7 +293,7 @@ def test_commands_are_listed_without_being_imported():
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     *text, modules = listed.splitlines()
     ours = {module for module in modules.split() if module.partition(".")[0] in ("lathe_rc", "numpy", "numba", "rich")}
-    light = {"cli", "packages", "errors", "extras", "allowed_code", "numba_settings", "public"}
+    light = {"cli", "catalogue", "errors", "extras", "allowed_code", "numba_settings", "public"}
     assert ours == {"lathe_rc", *(f"lathe_rc.{module}" for module in light)}
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 
@@ -305,7 +305,7 @@ def test_a_run_prints_its_object_alone_and_imports_the_stages_that_its_cell_has(
     assert list(json.loads(done.stdout)) == KEYS
     assert not re.search("Traceback|Warning", done.stderr)
     modules = done.stderr.splitlines()[-1]
-    begin = "lathe_rc.cell.stages."
+    begin = "lathe_rc.stages."
     imported = {module.removeprefix(begin) for module in modules.split() if module.startswith(begin)}
     assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "form", "tool"}
     assert not imported & {"compound_controller", "cutting_process", "feed_drive", "loaded_drive", "piezo_actuator"}

@@ -14,12 +14,12 @@ import pytest
 from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
+from lathe_rc.catalogue import OURS
 from lathe_rc.cell.host_topics import HOST_TOPICS, HostTopic
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages import STAGES
 from lathe_rc.commands.run import run
 from lathe_rc.messages import PACKAGE, store
-from lathe_rc.packages import OURS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])

@@ -16,9 +16,9 @@ from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import encoder_role
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 
 pytest.importorskip("rclpy")
 

@@ -13,7 +13,7 @@ from bags import lathe
 from lathe_bagtools import hosts
 from lathe_rc import extensions, harness
 from lathe_rc.cell import scenario
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.compiled.struct_view import explain_unfit
 from lathe_rc.errors import InputError, LatheError

@@ -8,8 +8,8 @@ from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import harness, messages
-from lathe_rc.cell.stages.gauge import Gauge, GaugeParameters
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.stages.tool.gauge import Gauge, GaugeParameters
 
 TURN = 2 * np.pi
 DELAY = 64

@@ -13,8 +13,8 @@ import pytest
 import lathe_rc
 from lathe_rc import jit
 from lathe_rc.cell import ahead, program
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError, LatheError
 
 PACKAGE = Path(lathe_rc.__file__).parent

@@ -16,13 +16,13 @@ from shown_page import ShownPage
 from lathe_explore.sweep import LOOP_FIGURES, row
 from lathe_explore.sweep.objectives import objectives
 from lathe_rc import harness
-from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.analysis.loop_errors import RunningLoop
 from lathe_rc.analysis.tolerance import FORCE, growth, swing_growth
-from lathe_rc.cell.loops import FIGURES
 from lathe_rc.cli import main
 from lathe_rc.control.pid import Pid, PidGains
 from lathe_rc.errors import InputError
+from lathe_rc.judge.loops import FIGURES
+from lathe_rc.signals.form_errors import form_errors
 
 TURN = 400  # samples of a revolution in the made-up runs
 WITHOUT_A_PART = [path.stem for path in SCENARIOS if "\n/tool:" not in path.read_text(encoding="utf-8")]

@@ -17,11 +17,11 @@ from lathe_rc.bag.loss import HELD, SOUND, loss_of
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import SNAPSHOT
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
-from lathe_rc.cell import part
-from lathe_rc.cell.loops import Loop, watches
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
+from lathe_rc.judge import part
+from lathe_rc.judge.loops import Loop, watches
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_verdict import BAD, assess
 

@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import cli, harness
 from lathe_rc.analysis import profile_csv
-from lathe_rc.analysis.form_errors import RunningErrors, form_errors, that_count
 from lathe_rc.analysis.metrology import (
     POINTS,
     evenly,
@@ -27,6 +26,7 @@ from lathe_rc.analysis.metrology import (
 )
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
+from lathe_rc.signals.form_errors import RunningErrors, form_errors, that_count
 from lathe_rc.signals.measured_profile import read_csv
 from lathe_rc.signals.profile import Harmonics
 

@@ -11,9 +11,9 @@ from lathe_rc import harness
 from lathe_rc.analysis import feedback
 from lathe_rc.analysis.learning import smallest_errors
 from lathe_rc.analysis.resonance_grid import with_images
-from lathe_rc.cell.loop_curves import loop_curves
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.judge.loop_curves import loop_curves
 
 TURN = 2.0 * np.pi
 LAWS = {

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from lathe_rc import messages
 from lathe_rc.cell.delay_buffer import DelayBuffer
-from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.protocol import BadBlock, ForeignMessage
 from lathe_rc.protocol.block_queue import BlockQueue
 from lathe_rc.protocol.exchange import Run
+from lathe_rc.stages.tool.tool import ToolParameters
 
 SIZE = 4
 

@@ -12,12 +12,12 @@ from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
 from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
-from lathe_rc.cell.stages.form import FormTable
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.compiled.step import CompiledStep
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import COMMAND, ENCODER
+from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
+from lathe_rc.stages.tool.form import FormTable
 
 
 @given(

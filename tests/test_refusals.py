@@ -5,8 +5,8 @@ import re
 
 import pytest
 
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stages import STAGES
 from lathe_rc.errors import InputError
 
 NODE = "some_node"

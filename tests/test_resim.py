@@ -13,14 +13,14 @@ from sealed_bags import retold
 
 from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
-from lathe_rc.analysis.form_errors import form_errors
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
-from lathe_rc.cell import part
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.part import ErrorsByRevolution
 from lathe_rc.errors import InputError
+from lathe_rc.judge import part
+from lathe_rc.judge.part import ErrorsByRevolution
+from lathe_rc.signals.form_errors import form_errors
 
 EVENTS = {"events": ["revolution 5.5: freeze", "second 0.3: learn"]}
 DEVIATION = {"deviation_amplitude": [0.1], "deviation_frequency": [10.7]}

@@ -19,12 +19,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import event_log, harness, messages
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
-from lathe_rc.cell.stages.feed_drive import FeedDriveParameters, FeedDriveStage
-from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError
@@ -33,6 +29,10 @@ from lathe_rc.safety import state_machine
 from lathe_rc.safety.monitors import Clearance, Lookout, Monitor, below, growth, index_pulses, rate, threshold
 from lathe_rc.safety.rules import walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.stages.feed.feed_drive import FeedDriveParameters, FeedDriveStage
+from lathe_rc.stages.learning.learning_controller import LearningController
+from lathe_rc.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 
 STEP = 1.0 / 64000
 CONFIG = SCENARIOS[0].parent

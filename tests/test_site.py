@@ -14,7 +14,7 @@ import architecture
 import equations
 import pictures
 from gfm import for_python_markdown
-from lathe_rc.packages import OURS
+from lathe_rc.catalogue import OURS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])

@@ -16,7 +16,7 @@ from lathe_explore.sweep.folder import Folder
 from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError
 
@@ -130,7 +130,7 @@ def test_a_further_axis_survives_an_end_at_any_write(call, piston, tmp_path, mon
 
 
 LAW = '''
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 import my_gain
 
 class Drive(ElectrodynamicActuator):

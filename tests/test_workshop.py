@@ -10,7 +10,7 @@ from cells import scenario
 from numpy.testing import assert_allclose
 
 from lathe_rc import harness
-from lathe_rc.cell import part
+from lathe_rc.judge import part
 from lathe_rc.signals import measured_profile
 
 ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]

@@ -80,7 +80,7 @@ def show_help(ready: Changes | None, arguments: Sequence[str]) -> int:
         os.execve(PYTHON, [str(PYTHON), *command(arguments)], run_environment(ready, os.environ))
     else:
         sys.path.append(str(ROOT))
-        from lathe_rc.packages import COMMANDS
+        from lathe_rc.catalogue import COMMANDS
 
         print("Usage: ./lathe COMMAND [OPTIONS]. Nothing is set up yet: ./lathe setup, or the first command, does it;")
         print("after that each COMMAND has its own --help.\n")

@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from lathe_rc.packages import COMMANDS
+from lathe_rc.catalogue import COMMANDS
 from workplace import ROOT
 
 SCENARIOS = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))

@@ -90,7 +90,13 @@ class Recipe:
             [
                 *(
                     ROOT / name
-                    for name in ("setup.py", "setup.cfg", "package.xml", "lathe_rc/packages.py", "tools/environment.py")
+                    for name in (
+                        "setup.py",
+                        "setup.cfg",
+                        "package.xml",
+                        "lathe_rc/catalogue.py",
+                        "tools/environment.py",
+                    )
                 )
             ],
         )

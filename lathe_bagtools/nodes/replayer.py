@@ -37,7 +37,7 @@ from lathe_rc.cell.beside import REPLAYER as KIND
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import kind_of
-from lathe_rc.cell.stages.time_master import TimeMaster
+from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.names import instead

@@ -14,15 +14,15 @@ from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import SampleReader, first_of
 from lathe_rc.cell.parameters import remapped
-from lathe_rc.cell.part import ErrorsByRevolution
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import DONE, Fields, Reached, Sparse
-from lathe_rc.cell.stages.time_master import TimeMaster
-from lathe_rc.cell.stages.tool import Tool
+from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
+from lathe_rc.judge.part import ErrorsByRevolution
 from lathe_rc.messages import Samples, Signals
+from lathe_rc.stages.tool.tool import Tool
 
 _TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
 

@@ -17,9 +17,9 @@ from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.cell import models
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 
 _BEYOND = ("mode_frequency", "lag_time")  # parameters of which the identified model has none
 _FORM_POINTS = 720

@@ -16,16 +16,16 @@ from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
-from lathe_rc.cell import part
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, fields_of, refuse_faults
-from lathe_rc.cell.stages.form import FormParameters
 from lathe_rc.commands import completers, lossy, measured, options, tables
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
+from lathe_rc.judge import part
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.profile import Profile
+from lathe_rc.stages.tool.form import FormParameters
 
 _TURN = 2.0 * np.pi
 _ANGLES = _TURN * np.arange(1024) / 1024  # of the file

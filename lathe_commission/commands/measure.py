@@ -12,10 +12,10 @@ from rich.table import Table
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.cell import part
 from lathe_rc.cell.recording import Recording
 from lathe_rc.commands import lossy, measured, options, tables
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.judge import part
 
 _COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
 

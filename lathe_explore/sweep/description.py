@@ -7,10 +7,10 @@ from typing import Literal, cast
 
 from lathe_explore.sweep import NUMBERS, row
 from lathe_explore.sweep.row import Measure
-from lathe_rc.cell.loops import loops
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.tool import ToolParameters
+from lathe_rc.judge.loops import loops
+from lathe_rc.stages.tool.tool import ToolParameters
 
 GOAL = "tool.max_error"  #: default goal; without a tool the largest error of the first loop
 

@@ -26,16 +26,16 @@ import scipy
 
 from lathe_rc.analysis.pid_tuning import fastest
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.cutting_process import CuttingProcessParameters
-from lathe_rc.cell.stages.feed_drive import FeedDriveParameters
-from lathe_rc.cell.stages.force_controller import ForceController
-from lathe_rc.cell.stages.learner import Loop
-from lathe_rc.cell.stages.learner import lag as drive_lag
-from lathe_rc.cell.stages.learning_controller import LearningController
-from lathe_rc.cell.stages.learning_parameters import LearningControllerParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.plants.cutting_force import SpecificForce
+from lathe_rc.stages.cut.cutting_process import CuttingProcessParameters
+from lathe_rc.stages.feed.feed_drive import FeedDriveParameters
+from lathe_rc.stages.feed.force_controller import ForceController
+from lathe_rc.stages.learning.learner import Loop
+from lathe_rc.stages.learning.learner import lag as drive_lag
+from lathe_rc.stages.learning.learning_controller import LearningController
+from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
 from lathe_rc.transfer import TransferFunction
 
 _PID = ("proportional", "integral", "derivative", "derivative_filter")

@@ -40,23 +40,23 @@ from numpy.typing import NDArray
 
 from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
-from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
-from lathe_rc.cell.loops import FIGURES, loops, watches
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.stages.command_limits import LIMITED
-from lathe_rc.cell.stages.form import form_doubt
-from lathe_rc.cell.stages.obedience import OUT_OF_REACH
-from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.extensions import attribute
+from lathe_rc.judge.loops import FIGURES, loops, watches
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
+from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
+from lathe_rc.stages.common.command_limits import LIMITED
+from lathe_rc.stages.common.obedience import OUT_OF_REACH
+from lathe_rc.stages.tool.form import form_doubt
+from lathe_rc.stages.tool.tool import Tool
 
 if TYPE_CHECKING:
     from lathe_explore.sweep.description import Target
@@ -96,7 +96,7 @@ class Measure(NamedTuple):
     Attributes:
         topic, field: signal; for a loop the error that its controller sees, which is part of the digest; empty for a
             function.
-        statistic: one of `STATISTICS`, or of `lathe_rc.cell.loops.FIGURES`; or a function ``package.module:name``.
+        statistic: one of `STATISTICS`, or of `lathe_rc.judge.loops.FIGURES`; or a function ``package.module:name``.
         node: controller of the loop; empty for a signal.
     """
 

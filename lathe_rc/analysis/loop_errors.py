@@ -27,11 +27,11 @@ from typing import Literal
 
 import numpy as np
 
-from lathe_rc.analysis.form_errors import FormErrors, RunningErrors
 from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.signals.form_errors import FormErrors, RunningErrors
 
 BAND = 0.02  #: share of a step within which it is settled, without a tolerance
 _TURN = 2.0 * np.pi

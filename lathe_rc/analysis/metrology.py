@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Form metrology of the part per revolution: roundness, undulations, roughness and lay.
 
-`lathe_rc.analysis.form_errors` weights the samples of a run by their angle. All other figures start from `evenly`,
+`lathe_rc.signals.form_errors` weights the samples of a run by their angle. All other figures start from `evenly`,
 which interpolates the samples at equidistant angles and thus removes the influence of the spindle speed; a profile is
 then an array of shape (revolutions, points) whose last axis is one revolution from angle 0.
 
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from lathe_rc.analysis.form_errors import FormErrors, form_errors, turns_at_end
 from lathe_rc.arrays import Array, Integers
 from lathe_rc.errors import InputError
+from lathe_rc.signals.form_errors import FormErrors, form_errors, turns_at_end
 
 POINTS = 4096  #: angles per revolution, about the number of the cell's samples at 1000 rpm
 _STANDSTILL = 1e-3  # of the largest step of the angle between samples

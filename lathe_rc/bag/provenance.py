@@ -18,17 +18,17 @@ from lathe_rc import __version__, allowed_code, resources
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
-from lathe_rc.cell.loops import Loop, loops
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
-from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.stages.force_controller import ForceController, ForceControllerParameters
-from lathe_rc.cell.stages.form import form_doubt
-from lathe_rc.cell.stages.position_controller import PositionController, PositionControllerParameters
-from lathe_rc.cell.stages.tool import Tool
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
+from lathe_rc.judge.loops import Loop, loops
+from lathe_rc.stages.feed.force_controller import ForceController, ForceControllerParameters
+from lathe_rc.stages.feed.position_controller import PositionController, PositionControllerParameters
+from lathe_rc.stages.tool.form import form_doubt
+from lathe_rc.stages.tool.tool import Tool
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"

@@ -16,10 +16,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 
 from lathe_rc import allowed_code
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.program import compile_loop
 from lathe_rc.cell.scenario import TABLES, kind_of
 from lathe_rc.cell.stage import Stage, compile_kernels
-from lathe_rc.cell.stages import STAGES
 from lathe_rc.compiled.step import is_kept
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import search_path

@@ -20,7 +20,6 @@ from functools import partial
 from typing import Any, Generic, Protocol, TypeVar, overload
 
 from lathe_rc import messages
-from lathe_rc.analysis.form_errors import FormErrors, RunningErrors, turns_before
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
@@ -31,6 +30,7 @@ from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
+from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
 
 K_co = TypeVar("K_co", covariant=True)
 

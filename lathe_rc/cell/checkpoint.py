@@ -21,11 +21,11 @@ import numpy as np
 from lathe_rc import __version__, data_file
 from lathe_rc.cell.changes import Change, ClashError, Restoring, changes
 from lathe_rc.cell.events import Trigger
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, remapped_by
 from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of, new_stage
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages import MASTERS, STAGES
-from lathe_rc.cell.stages.time_master import TimeMaster
+from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.files import written

@@ -3,9 +3,9 @@
 
 from typing import NamedTuple
 
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import KIND as RECORDER
-from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.messages import PACKAGE
 
 _SPARE, _FREE_RUNNING = 32, 2080  # messages

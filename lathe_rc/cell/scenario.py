@@ -17,11 +17,11 @@ import yaml
 
 from lathe_rc import allowed_code, files, resources
 from lathe_rc.cell import models, ros_yaml
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value, Values
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import in_words

@@ -109,7 +109,7 @@ class WiredCell(Protocol):
 
     @property
     def master(self) -> Any:
-        """Time master of the cell (see `lathe_rc.cell.stages.time_master.TimeMaster`)."""
+        """Time master of the cell (see `lathe_rc.cell.time_master.TimeMaster`)."""
 
     @property
     def speed_range(self) -> tuple[float, float]:

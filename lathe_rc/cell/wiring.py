@@ -9,17 +9,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.cell.checkpoint import Checkpoint, begun_of
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
 from lathe_rc.cell.scenario import kind_of, new_stage
 from lathe_rc.cell.stage import Input, Output, Stage
-from lathe_rc.cell.stages import MASTERS, STAGES
-from lathe_rc.cell.stages.learner import Loop
-from lathe_rc.cell.stages.time_master import TimeMaster
+from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
+
+if TYPE_CHECKING:
+    from lathe_rc.analysis.learning import DriveMargin
+    from lathe_rc.stages.learning.learner import Loop
 
 
 @dataclass(frozen=True)
@@ -325,7 +327,7 @@ class Cell:
         return {name: 1.0 - self.factors[name] if name in self.factors else None for name in learners}
 
     @property
-    def drive_margins(self) -> dict[str, DriveMargin]:
+    def drive_margins(self) -> "dict[str, DriveMargin]":
         """Return the drive margin of each learning controller that provides its factors or characteristic function."""
         found: dict[str, DriveMargin] = {}
         for name, loops in self.loops.items():

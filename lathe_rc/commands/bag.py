@@ -21,9 +21,9 @@ from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
-from lathe_rc.cell import part
 from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
+from lathe_rc.judge import part
 from lathe_rc.names import instead
 
 _BAG = click.argument("path", metavar="BAG", type=options.PATH)

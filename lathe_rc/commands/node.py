@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import click
 
+from lathe_rc.catalogue import STANDALONE
 from lathe_rc.cell.beside import MACHINE_STATE, MachineStateParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError
 from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import help_or_refusal
-from lathe_rc.packages import STANDALONE
 
 _PASS_THROUGH = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 

@@ -12,9 +12,9 @@ from rich.text import Text
 from lathe_rc import harness
 from lathe_rc.analysis.budget import Budget, Part
 from lathe_rc.analysis.metrology import Lay
-from lathe_rc.cell import part
-from lathe_rc.cell.loops import LoopResult
 from lathe_rc.commands import plot, tables
+from lathe_rc.judge import part
+from lathe_rc.judge.loops import LoopResult
 
 _MOST_EVENTS = 12  # rows of the event table
 _ALIKE = 4  # length of a series of similar events from which its inner events are left out

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from lathe_rc import harness, messages
-from lathe_rc.analysis.form_errors import turns_before
+from lathe_rc.signals.form_errors import turns_before
 
 _ROWS = 12  # approximate height of the plot without frame and ticks [lines]
 _FRAME = 3  # lines of frame and ticks

@@ -9,13 +9,13 @@ import click
 from rich.console import Console
 
 from lathe_rc import harness
-from lathe_rc.cell import part
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import outcome, picture
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch, watched_budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
+from lathe_rc.judge import part
 from lathe_rc.process_launcher import Start
 
 _NO_SNAPSHOTS = "no snapshots: no --bag was given"

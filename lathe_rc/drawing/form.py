@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import MaxNLocator
 
-from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.signals.form_errors import FormErrors
 
 _FIRST, _LAST, _PEER = "#c0392b", "#1f6f8b", "#e08e0b"
 _IN_NOTEBOOK = 72.0  # [dots per inch]

@@ -5,7 +5,7 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from lathe_rc.analysis.form_errors import FormErrors
+from lathe_rc.signals.form_errors import FormErrors
 
 
 def errors_picture(errors: FormErrors, before: int) -> str:

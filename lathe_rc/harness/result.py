@@ -8,18 +8,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from lathe_rc.analysis.form_errors import FormErrors
 from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
-from lathe_rc.cell import loops, part
 from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages.tool import ToolParameters
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
 from lathe_rc.event_log import LogEntry, entries
+from lathe_rc.judge import loops, part
+from lathe_rc.signals.form_errors import FormErrors
+from lathe_rc.stages.tool.tool import ToolParameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,7 +140,7 @@ class Result:
 
     @cached_property
     def part(self) -> Measurement:
-        """Workshop measurements of the part (`lathe_rc.cell.part`)."""
+        """Workshop measurements of the part (`lathe_rc.judge.part`)."""
         return part.measured(self.recording)
 
     @property
@@ -155,7 +155,7 @@ class Result:
 
     @cached_property
     def loops(self) -> dict[str, loops.LoopResult]:
-        """Results of the force and position loops, by controller (`lathe_rc.cell.loops`)."""
+        """Results of the force and position loops, by controller (`lathe_rc.judge.loops`)."""
         return loops.evaluated(loops.loops(self.scenario.nodes), self.recording)
 
     @cached_property

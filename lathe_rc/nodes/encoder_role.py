@@ -10,12 +10,12 @@ from typing import Any, cast
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from lathe_rc.cell.stages.encoder_device import EncoderDevice, EncoderDeviceParameters
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.signals.counts import LineReader, Reading
+from lathe_rc.stages.spindle.encoder_device import EncoderDevice, EncoderDeviceParameters
 
 _POLL = 0.5e-3  # [s] between polls of a line
 

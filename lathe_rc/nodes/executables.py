@@ -10,10 +10,10 @@ from functools import partial
 from typing import NoReturn
 
 from lathe_rc import extras
+from lathe_rc.catalogue import STANDALONE
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.extras import load
 from lathe_rc.nodes.arguments import exit_with
-from lathe_rc.packages import STANDALONE
 
 
 def __getattr__(name: str) -> Callable[[], None]:

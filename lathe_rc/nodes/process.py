@@ -24,14 +24,11 @@ from rclpy.type_support import check_for_type_support
 
 from lathe_rc import allowed_code
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
-from lathe_rc.cell.stages import STAGES
-from lathe_rc.cell.stages.encoder_device import EncoderDevice
-from lathe_rc.cell.stages.loaded_spindle import LoadedSpindleStage
-from lathe_rc.cell.stages.spindle_encoder import SpindleEncoder
 from lathe_rc.control import bounded
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
@@ -43,6 +40,9 @@ from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol.exchange import Exchange
+from lathe_rc.stages.spindle.encoder_device import EncoderDevice
+from lathe_rc.stages.spindle.loaded_spindle import LoadedSpindleStage
+from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
 
 _MESSAGES = (  # message and service types of the nodes, rclpy's own services included
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),

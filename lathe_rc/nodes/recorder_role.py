@@ -21,10 +21,10 @@ from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Durability, Output, offered_qos
 from lathe_rc.cell.block import Block
 from lathe_rc.cell.host_topics import HOST_TOPICS, signal_depth
+from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stages import MASTERS
 from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes import publisher_info

@@ -13,10 +13,10 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lathe_rc import messages
+from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, PERCENT
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.stages import MASTERS
-from lathe_rc.cell.stages.time_master import TimeMaster, TimeMasterParameters
+from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, PaceError
 from lathe_rc.nodes.cell_node import CellNode, from_ros

@@ -11,9 +11,9 @@ from lathe_rc import messages
 from lathe_rc.cell import events
 from lathe_rc.cell.ahead import uncompiled
 from lathe_rc.cell.checkpoint import Checkpoint
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import Value, explain_overflow
 from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
-from lathe_rc.cell.stages import MASTERS, STAGES
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals

@@ -36,7 +36,7 @@ _GONE = 0.2  # [s] to wait for acknowledgements after a member has died
 
 @dataclass(frozen=True)
 class Reactions:
-    """Reactions of a time master to silence and death (see `lathe_rc.cell.stages.time_master.TimeMasterParameters`)."""
+    """Reactions of a time master to silence and death (see `lathe_rc.cell.time_master.TimeMasterParameters`)."""
 
     stall_reaction: str
     stall_time: float

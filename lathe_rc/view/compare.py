@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import __version__
-from lathe_rc.cell.loops import FIGURES
 from lathe_rc.errors import InputError
+from lathe_rc.judge.loops import FIGURES
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view import report_figures
 from lathe_rc.view.charts import Charts, page_template

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Causes that limit a form error, judged by its last revolutions: learning that goes on, what repeats, what changes.
 
-Only a budget (`lathe_rc.cell.budget`) gives the share of each cause.
+Only a budget (`lathe_rc.judge.budget`) gives the share of each cause.
 """
 
 import math

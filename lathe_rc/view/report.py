@@ -17,11 +17,11 @@ from lathe_rc.analysis.budget import TOLD, Budget
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.bag.provenance import FILE, ORIGINS, SCENARIO, VERSIONS, origin, origins, scenario_of
 from lathe_rc.bag.reading.source import name_of
-from lathe_rc.cell.budget import budget
-from lathe_rc.cell.loop_curves import LoopCurve, loop_curves
-from lathe_rc.cell.part import along_in_words
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
+from lathe_rc.judge.budget import budget
+from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
+from lathe_rc.judge.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view import report_loop
 from lathe_rc.view.charts import Charts, page_template

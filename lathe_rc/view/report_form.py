@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.analysis.form_errors import that_count
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
-from lathe_rc.cell import part
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
+from lathe_rc.judge import part
 from lathe_rc.messages import Samples, Signals
+from lathe_rc.signals.form_errors import that_count
 from lathe_rc.view.report_series import Envelope, MeanRows
 
 ACROSS = 512  #: number of angles in the map
@@ -34,7 +34,7 @@ class Revolution:
     """Form of one revolution in the report.
 
     Attributes:
-        numbers: key figures of the revolution (see `lathe_rc.cell.part.numbers`).
+        numbers: key figures of the revolution (see `lathe_rc.judge.part.numbers`).
         profile: radius deviation at uniformly spaced angles [m], shape (points,).
         amplitude: amplitudes of the undulations [m], starting at 0 UPR.
     """

@@ -15,12 +15,12 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder, first_of
 from lathe_rc.bag.snapshot import span_of
-from lathe_rc.cell.loops import watches
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.event_log import LOGGED, LogEntry
+from lathe_rc.judge.loops import watches
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES

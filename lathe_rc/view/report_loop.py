@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lathe_rc.cell.loop_curves import LEAST, LoopCurve
+from lathe_rc.judge.loop_curves import LEAST, LoopCurve
 from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
 

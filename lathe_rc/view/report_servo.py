@@ -5,9 +5,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lathe_rc.cell.loops import LoopResult, LoopWatch
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
+from lathe_rc.judge.loops import LoopResult, LoopWatch
 from lathe_rc.messages import Signals
 from lathe_rc.view.report_series import Envelope
 

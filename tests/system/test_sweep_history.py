@@ -21,7 +21,7 @@ from lathe_explore.sweep.folder import Folder
 from lathe_explore.sweep.space import Space
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.stages import STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.errors import InputError, LatheError
 
 pytestmark = pytest.mark.system
@@ -38,7 +38,7 @@ VALUES = {
 SCENARIO = ["spindle_encoder.revolutions=2", "electrodynamic_actuator.stage=my_drive:Drive"]
 PISTON = Path(__file__).parents[2] / "config" / "piston.yaml"
 DRIVE = '''
-from lathe_rc.cell.stages.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 
 class Drive(ElectrodynamicActuator):
     """A drive of one's own, version {}."""

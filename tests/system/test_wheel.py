@@ -13,9 +13,9 @@ from uv import uv
 
 import workplace
 from lathe_rc import __version__
+from lathe_rc.catalogue import OURS
 from lathe_rc.cell.beside import BESIDE
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.packages import OURS
 
 pytestmark = pytest.mark.system
 

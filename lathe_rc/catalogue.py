@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What this distribution contains, by name: packages with their commands and executables, and stages.
+
+Nothing is imported here, and nothing else in the core names what lies beside or above it.
+
+The core, ``lathe_rc``, runs cells, reads and writes bags, and judges and shows a run. The other packages import the
+core and never each other; only this table knows all of them. A package that is taken away takes its commands along.
+"""
+
+COMMANDS_OF = {
+    "lathe_rc": {
+        "bag": "Show, check, copy and recover bags; extract a tachogram.",
+        "budget": "Split the form error of a scenario by its causes.",
+        "compare": "Write several runs side by side as an HTML page.",
+        "container": "Run several nodes in one process.",
+        "demo": "Turn a piston with ROS 2 processes and draw it.",
+        "new": "Create a law, drive, stage or study of your own.",
+        "node": "Run one node, or list its parameters.",
+        "policy": "Write the SROS2 policy of a scenario.",
+        "reference": "Print the reference of nodes and topics.",
+        "report": "Write a recording as an HTML page.",
+        "run": "Run a scenario to its end.",
+        "study": "Compute a table or figure of the papers.",
+    },
+    "lathe_bagtools": {
+        "record": "Record any topics into a new bag.",
+        "replay": "Publish the messages of a bag again.",
+        "resim": "Re-simulate a recorded cell, optionally with changes.",
+    },
+    "lathe_commission": {
+        "correct": "Correct the programmed form of the next part.",
+        "design": "Find the learning law of a scenario for a measured drive.",
+        "fit": "Fit models to measurements.",
+        "measure": "Measure the part turned in a recorded run.",
+    },
+    "lathe_explore": {
+        "sweep": "Compute many variations of a scenario into a table.",
+        "tune": "Search for the parameters that best meet given goals.",
+    },
+    "lathe_export": {
+        "export": "Export a recording as tables, or stages as C libraries or FMUs.",
+    },
+    "lathe_live": {
+        "loop": "Show block diagram and learning loops, with settings to drag.",
+        "panel": "Show a cell at work in the browser, and command it.",
+        "view": "Show a bag in Rerun.",
+    },
+}  #: summaries of the commands, by package and name
+
+OURS = frozenset([*COMMANDS_OF, "lathe_papers"])  #: packages of this distribution
+
+COMMANDS = dict(sorted((name, text) for table in COMMANDS_OF.values() for name, text in table.items()))
+_BESIDES = {"container": "node"}  # commands defined in another command's module
+
+#: modules of the executables that are no member of a cell
+STANDALONE = {
+    "container": "lathe_rc.nodes.container",
+    "machine_state": "lathe_rc.nodes.machine_state",
+    "replayer": "lathe_bagtools.nodes.replayer",
+    "rerun_bridge": "lathe_live.nodes.rerun_bridge",
+    "topic_recorder": "lathe_bagtools.nodes.topic_recorder",
+}
+
+#: built-in stages by kind; their modules are imported on demand, which for all takes as long as a hundred revolutions
+STAGES = {
+    "spindle_encoder": "lathe_rc.stages.spindle.spindle_encoder:SpindleEncoder",
+    "encoder_device": "lathe_rc.stages.spindle.encoder_device:EncoderDevice",
+    "loaded_spindle": "lathe_rc.stages.spindle.loaded_spindle:LoadedSpindleStage",
+    "learning_controller": "lathe_rc.stages.learning.learning_controller:LearningController",
+    "disturbance_controller": "lathe_rc.stages.learning.disturbance_controller:DisturbanceController",
+    "compound_controller": "lathe_rc.stages.learning.compound_controller:CompoundController",
+    "resonant_controller": "lathe_rc.stages.learning.resonant_controller:ResonantController",
+    "norm_optimal_controller": "lathe_rc.stages.learning.norm_optimal_controller:NormOptimalController",
+    "electrodynamic_actuator": "lathe_rc.stages.drive.electrodynamic_actuator:ElectrodynamicActuator",
+    "piezo_actuator": "lathe_rc.stages.drive.piezo_actuator:PiezoActuator",
+    "series_drive": "lathe_rc.stages.drive.series_drive:SeriesDriveStage",
+    "loaded_drive": "lathe_rc.stages.drive.loaded_drive:LoadedDriveStage",
+    "loaded_series_drive": "lathe_rc.stages.drive.loaded_drive:LoadedSeriesDrive",
+    "vibration": "lathe_rc.stages.cut.vibration:Vibration",
+    "profile": "lathe_rc.stages.tool.form:ProfileStage",
+    "tool": "lathe_rc.stages.tool.tool:Tool",
+    "gauge": "lathe_rc.stages.tool.gauge:Gauge",
+    "feed_drive": "lathe_rc.stages.feed.feed_drive:FeedDriveStage",
+    "cutting_process": "lathe_rc.stages.cut.cutting_process:CuttingProcessStage",
+    "position_controller": "lathe_rc.stages.feed.position_controller:PositionController",
+    "force_controller": "lathe_rc.stages.feed.force_controller:ForceController",
+    "decoupler": "lathe_rc.stages.feed.decoupler:DecouplerStage",
+    "supervisor": "lathe_rc.stages.supervisor:Supervisor",
+    "fmu": "lathe_rc.stages.fmu:FmuStage",
+}
+#: kinds of built-in stages that can be the time master of a cell
+MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle")
+
+
+def module_of(command: str) -> str:
+    """Return the module of a command, which has an object of the command's name."""
+    (package,) = [package for package, table in COMMANDS_OF.items() if command in table]
+    return f"{package}.commands.{_BESIDES.get(command, command)}"

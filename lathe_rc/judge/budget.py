@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Error budget of a scenario: contributions to the form error, determined by runs with causes switched off."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lathe_rc import messages
+from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
+from lathe_rc.analysis.metrology import evenly
+from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.cell import batch, models
+from lathe_rc.cell.parameters import NodeParameters, Value, Values
+from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Sparse
+from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError, LatheError
+from lathe_rc.messages import Samples, Signals
+from lathe_rc.stages.cut.vibration import VibrationParameters
+from lathe_rc.stages.learning.learning_controller import LearningController
+from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
+from lathe_rc.stages.spindle.loaded_spindle import LoadedSpindleParameters
+from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
+from lathe_rc.stages.tool.form import FormParameters
+from lathe_rc.stages.tool.tool import ToolParameters
+
+_TURN = 2.0 * np.pi
+_PREFIXES = ("", "coarse_", "fine_", "cut_")  # parameter prefixes of stages composed of several devices
+_FACTOR = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
+_CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
+
+#: Parameters by cause, in nodes with a table of a given kind, with the values that switch the cause off.
+_CAUSES: Mapping[str, tuple[type[NodeParameters], Values]] = {
+    "force": (NodeParameters, {"deflects": False, "cross_slide": False, "radial_ratio": 0.0}),
+    "load": (LoadedSpindleParameters, {"part_radius": 0.0}),
+    "vibration": (
+        VibrationParameters,
+        {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []},
+    ),
+    "noise": (NodeParameters, {"noise_rms": 0.0}),
+    "quantisation": (
+        NodeParameters,
+        {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
+    ),
+    "hysteresis": (NodeParameters, {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0}),
+    "backlash": (NodeParameters, {"backlash": 0.0}),
+    "limits": (
+        NodeParameters,
+        {f"command_{name}": 0.0 for name in ("stroke", "velocity", "acceleration", "jerk")}
+        | {f"{name}_limit": 0.0 for name in ("current", "voltage", "torque")}
+        | {"slew_rate": 0.0},
+    ),
+    "faults": (NodeParameters, {"faults": []}),
+}
+#: The causes that make one revolution differ from the next.
+_CHANGING = {name: _CAUSES[name][1] for name in ("noise", "quantisation", "vibration")}
+_CONSTANT = ("harmonics", "polygon")  # profiles that are constant along the part
+_SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Cause of form error that can be switched off.
+
+    Attributes:
+        off: parameter values that switch the cause off, by NODE.PARAM.
+        needs: another cause without which this one has no effect; empty if there is none.
+    """
+
+    off: Values
+    needs: str = ""
+
+
+@dataclass(frozen=True)
+class _Tail:
+    """Last revolutions of a run.
+
+    Attributes:
+        whole: number of complete revolutions in the run.
+        error: form error at equally spaced angles [m], shape (revolutions, points).
+        height: height of the tool along the part [m], shape (samples,).
+    """
+
+    whole: int
+    error: Samples
+    height: Samples
+
+
+class _Keep:
+    """Keeper of the last revolutions of a run (see `lathe_rc.cell.batch.Keeper`)."""
+
+    def __init__(self, cell: Cell, samples: int) -> None:
+        named = {source.type: topic for topic, source in reversed(cell.dense.items())}
+        if not {messages.ENCODER, messages.TOOL} <= named.keys():
+            raise InputError("no form error to budget: the cell has no encoder and tool; allowed: a scenario with both")
+        encoder, tool = named[messages.ENCODER], named[messages.TOOL]
+        self._fields = {"angle": (encoder, "angle_true"), "error": (tool, "error"), "height": (tool, "height")}
+        self.heard: Collection[str] = [".".join(place) for place in self._fields.values()]
+        self._kept = {name: np.empty(samples) for name in self._fields}
+
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Process a chunk of the run, as a sink of the engine."""
+        for name, (topic, of) in self._fields.items():
+            self._kept[name][first : first + samples] = dense[topic][of]
+
+    def kept(self) -> _Tail:
+        """Return the last complete revolutions of the run."""
+        angle = self._kept["angle"]
+        if angle.size < 2:
+            return _Tail(0, np.empty((0, 0)), angle)
+        # Keep one revolution more than reported, for the spline; the last one may lack two samples.
+        before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
+        begin = int(np.searchsorted(angle, before * _TURN))
+        error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
+        return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:])
+
+
+def _not_yet(scenario: Scenario, values: Values) -> dict[str, Value]:
+    """Return the values that differ from those of the scenario."""
+    parts = {target: target.partition(".") for target in values}
+    return {t: v for t, v in values.items() if getattr(scenario.nodes[parts[t][0]], parts[t][2]) != v}
+
+
+def _simple(scenario: Scenario) -> dict[str, Cause]:
+    """Return the causes that fixed parameter values switch off."""
+    return {
+        name: Cause(
+            {
+                f"{node}.{prefix}{each}": value
+                for node, table in scenario.nodes.items()
+                if isinstance(table, kind)
+                for prefix in _PREFIXES
+                for each, value in values.items()
+                if f"{prefix}{each}" in type(table).model_fields
+            }
+        )
+        for name, (kind, values) in _CAUSES.items()
+    }
+
+
+def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
+    return {node: table for node, table in scenario.nodes.items() if isinstance(table, LearningControllerParameters)}
+
+
+def _speed(scenario: Scenario) -> dict[str, Cause]:
+    """Return the causes ``speed`` (it varies) and ``lead`` (it follows the speed; off: exact preview of the speed)."""
+    (master,) = scenario.masters
+    law, learners = scenario.nodes[master], _learners(scenario)
+    if not isinstance(law, SpeedLawParameters):
+        return {}
+    rows = type(law).rows()
+    steady = {name: rows[name].default for name in _SPEED}
+    if all(getattr(law, name) == value for name, value in steady.items()):
+        return {}
+    followed = {f"{node}.{name}": getattr(law, name) for node in learners for name in _SPEED}
+    followed |= {f"{node}.law": "angle_domain" for node in learners}
+    followed |= {f"{node}.lead_law": "exact_preview" for node in learners}
+    everywhere = {f"{node}.{name}": value for node in (master, *learners) for name, value in steady.items()}
+    return {"speed": Cause(everywhere), "lead": Cause(followed, needs="speed")}
+
+
+def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
+    """Return the cause ``feed``: the form changes along the part. Off: the tool stays at the middle reported height."""
+    forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
+    off: dict[str, Value] = {}
+    for node, table in forms.items():
+        still = not (isinstance(table, ToolParameters) and table.reference == "topic")
+        if still and not table.part_revolutions and np.ptp(height) > 0.0:
+            middle = max(float(height.min() + height.max()) / 2.0, 0.0)
+            off |= {f"{node}.height_from": "feed", f"{node}.feed": 0.0, f"{node}.start_height": middle}
+    return {"feed": Cause(off)}
+
+
+def _model(scenario: Scenario) -> dict[str, Cause]:
+    """Return the cause ``model``: the model of a correction differs from the drive."""
+    off: dict[str, Value] = {}
+    for node, table in _learners(scenario).items():
+        if table.correction not in ("none", "lead_lag", "fir"):
+            off |= {f"{node}.{name}": value for name, value in models.of_drives(node, scenario.nodes).items()}
+    return {"model": Cause(off)}
+
+
+def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
+    """Return the cause ``Q floor``: Q is below 1. Off: each Q is 1 as far as its channel then converges."""
+    off: dict[str, Value] = {}
+    for stage in cell.stages.values():
+        if isinstance(stage, LearningController):
+            loop = stage.checked_loop(cell)
+            flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
+            if flat is None:
+                left_out["Q floor"] = f"{stage.name} converges with no flat Q"
+                return {}
+            off |= {f"{stage.name}.{name}": value for name, value in flat.items()}
+    return {"Q floor": Cause(off)}
+
+
+def changing(nodes: Mapping[str, Values]) -> list[str]:
+    """Return the names of the causes that make revolutions differ from each other, except for speed and cut.
+
+    Args:
+        nodes: all values by node and parameter, unchecked; empty lists may be omitted.
+    """
+    found = [
+        name
+        for name, off in _CHANGING.items()
+        if any(
+            values.get(f"{prefix}{each}", none) != none
+            for values in nodes.values()
+            for prefix in _PREFIXES
+            for each, none in off.items()
+        )
+    ]
+    fed = any(
+        values.get("profile", _CONSTANT[0]) not in _CONSTANT
+        and (values.get("feed", 0.0) != 0.0 or values.get("height_from") == "slide")
+        for values in nodes.values()
+    )
+    return [*found, *(["feed"] if fed else [])]
+
+
+def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
+    """Return the causes that can be switched off in a scenario.
+
+    Args:
+        scenario: a valid scenario.
+        height: height of the tool along the part in the reported revolutions [m].
+
+    Returns:
+        The causes, each after its prerequisite; and the causes that cannot be switched off, with the reasons.
+    """
+    left_out: dict[str, str] = {}
+    found = {
+        **_q_floor(Cell(scenario.nodes), left_out),
+        **_model(scenario),
+        **_speed(scenario),
+        **_feed(scenario, height),
+        **_simple(scenario),
+    }
+    kept: dict[str, Cause] = {}
+    for name, cause in found.items():
+        off = _not_yet(scenario, cause.off)
+        if not off or cause.needs not in ("", *kept):
+            continue
+        try:
+            Cell(scenario.varied(off).nodes).check(cures=False)
+        except InputError as error:
+            left_out[name] = str(error)
+        else:
+            kept[name] = Cause(off, cause.needs)
+    return kept, left_out
+
+
+def _with(scenario: Scenario, found: Mapping[str, Cause], acting: Causes) -> Scenario:
+    """Return the scenario with only some causes active; causes that need an inactive one are left unchanged."""
+    off: dict[str, Value] = {}
+    for name, cause in found.items():
+        if name not in acting and (not cause.needs or cause.needs in acting):
+            off |= cause.off
+    return scenario.varied(off)
+
+
+def _compared(scenario: Scenario, runs: Mapping[Causes, _Tail]) -> dict[Causes, Samples]:
+    """Return the form errors of the runs, provided that all cover the same revolutions."""
+    if len({tail.whole for tail in runs.values()}) > 1:
+        (master,) = scenario.masters
+        raise InputError(
+            f"budget of {scenario.name}: its runs end with another revolution each, a sample or two before it is "
+            f"complete; allowed: a whole number of {master}.revolutions"
+        )
+    return {acting: tail.error for acting, tail in runs.items()}
+
+
+def budget(
+    scenario: Scenario, *, threads: int | None = None, watch: Callable[[int, int], None] | None = None
+) -> Budget:
+    """Return the error budget of a scenario in its last ten revolutions (see `lathe_rc.analysis.budget`).
+
+    The scenario runs offline, as a batch, with one cause after another switched off: about 10 runs, or 30 if causes
+    interact.
+
+    Args:
+        scenario: scenario with all causes active; its spindle must have a number of revolutions.
+        threads: number of computing threads; None: one per core.
+        watch: called after each run with the number of completed runs and the known total.
+
+    Raises:
+        InputError: the scenario is invalid, or it has no tool or no complete revolution.
+        LatheError: a run failed.
+
+    Example:
+        >>> import lathe_rc
+        >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=60"])
+        >>> for found in lathe_rc.budget(piston).causes:
+        ...     print(f"{found.name}: {found.percent()} %")
+        Q floor: -0.3 %
+        speed: 83.5 %
+        lead: 0.0 %
+        feed: 16.9 %
+    """
+    done = 0
+
+    def run(sets: Iterable[Causes], made: Mapping[str, Cause]) -> dict[Causes, _Tail]:
+        nonlocal done
+        order = sorted(sets, key=sorted)
+        known = done + len(order)
+        outcomes = batch.run_many((_with(scenario, made, acting) for acting in order), _Keep, threads=threads)
+        tails: dict[Causes, _Tail] = {}
+        for acting, outcome in zip(order, outcomes, strict=True):
+            done += 1
+            if watch is not None:
+                watch(done, known)
+            if outcome.error is not None:
+                without = ", ".join(name for name in made if name not in acting)
+                about = f"budget of {scenario.name} without {without}: " if without else ""
+                kind = InputError if isinstance(outcome.error, InputError) else LatheError
+                raise kind(f"{about}{outcome.error}")
+            assert outcome.kept is not None, "it has not failed"
+            tails[acting] = outcome.kept
+        return tails
+
+    (whole,) = run([frozenset()], {}).values()
+    if not whole.error.size:
+        raise InputError(f"budget of {scenario.name}: no complete revolution; allowed: a longer run")
+    found, left_out = causes(scenario, whole.height)
+    split = Decomposition({name: cause.needs for name, cause in found.items()})
+    runs = {frozenset(found): whole}
+    runs |= run(split.alone() - runs.keys(), found)
+    told = split.split(_compared(scenario, runs), left_out)
+    if abs(told.interactions.share) >= TOLD:
+        runs |= run(split.together() - runs.keys(), found)
+        told = split.split(_compared(scenario, runs), left_out)
+    return told

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coarse electrodynamic tool drive."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Ge, Le
+
+from lathe_rc import resources
+from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.measured_drive import MeasuredDrive, read_points
+from lathe_rc.cell.parameters import Positive, about, parameter
+from lathe_rc.cell.stage import DONE, Fields, Reached
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
+from lathe_rc.plants.linear import Discretisation
+from lathe_rc.plants.modes import Modes
+from lathe_rc.signals.noise import measure
+from lathe_rc.stages.common.command_limits import limited
+from lathe_rc.stages.common.tables import made_of
+from lathe_rc.stages.drive.drive import OwnRetraction, followed
+from lathe_rc.stages.drive.plant import PlantMemory, PlantParameters, SingleDrive
+
+
+class ElectrodynamicActuatorParameters(PlantParameters):
+    """Drive with closed internal loops, g·e^{-pτ}/(1 + 2ζp/ωn + p²/ωn²), its limits and its sensor."""
+
+    natural_frequency: Positive = parameter(1038.0, "natural frequency ωn", "rad/s")
+    damping: Positive = parameter(0.804, "damping ratio ζ", "1")
+    delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "delay τ", "s")
+    gain: float = parameter(1.0, "static gain g from command to position, of either sign", "1")
+    discretisation: Discretisation = parameter("foh", "foh: exact for a command linear between samples; or tustin")
+    moving_mass: Positive = parameter(1.2, "carriage, coil and tool", "kg")
+    force_constant: Positive = parameter(30.0, "force of the coil per current", "N/A")
+    mode_frequency: list[Positive] = parameter([], "further resonances: frequency of each", "rad/s")
+    mode_damping: list[Positive] = parameter([], "their damping ratios", "1")
+    mode_participation: list[float] = parameter(
+        [], "their parts in the motion of the position sensor; the part of the drive itself is the rest to 1", "1"
+    )
+    mode_edge: list[float] = parameter([], "their parts in the motion of the edge; empty: as at the sensor", "1")
+    mode_velocity: list[float] = parameter(
+        [], "parts of their velocities over their frequencies in the motion (complex residues); empty: none", "1"
+    )
+    lag_time: list[Positive] = parameter([], "further first-order lags (real poles): time constant of each", "s")
+    lag_participation: list[float] = parameter([], "their parts in the motion, as of modes", "1")
+    response_file: str = parameter(
+        "",
+        "measured frequency response of the drive, CSV as of lathe fit drive: checks and drive margin then hold for "
+        "its points as well",
+        path=True,
+    )
+
+    def measured(self, node: str, model: Response, prefix: str = "") -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Return the response measured in each state by topic; ``prefix`` precedes the parameter in a composed table.
+
+        Args:
+            node: name of the node.
+            model: response outside of the measured range.
+            prefix: prefix of the parameters.
+
+        Raises:
+            InputError: the file cannot be used.
+        """
+        if not self.response_file:
+            return {}
+        with about(node, f"{prefix}response_file"):
+            states = read_points(resources.find(Path(self.response_file)))
+        return {"coarse/command": [MeasuredDrive(*points, model) for points in states]}
+
+    def modes(self, node: str, prefix: str = "") -> Modes:
+        """Return the modes and lags of a node; ``prefix`` precedes its parameters in a composed table.
+
+        Raises:
+            InputError: they cannot be, or the gain is 0.
+        """
+        if not self.gain:
+            raise InputError(f"{node}.{prefix}gain = 0; allowed: of either sign, not 0")
+        names = [f"{prefix}mode_{each}" for each in ("frequency", "damping", "participation", "edge")]
+        if self.mode_velocity or self.lag_time or self.lag_participation:
+            names += [f"{prefix}{each}" for each in ("mode_velocity", "lag_time", "lag_participation")]
+        for frequency in self.mode_frequency:
+            if frequency >= math.pi / self.step:
+                raise InputError(
+                    f"{node}.{names[0]} = {frequency:g} rad/s; allowed: below half the sample rate, "
+                    f"{math.pi / self.step:.6g} rad/s (a higher sample_rate, or without this mode)"
+                )
+        with about(node, *names):
+            return self._modes()
+
+    def _modes(self) -> Modes:
+        sensor, edge = self.mode_participation, self.mode_edge
+        of_modes = (self.mode_frequency, self.mode_damping, sensor, edge or sensor, self.mode_velocity)
+        return Modes(*map(tuple, (*of_modes, self.lag_time, self.lag_participation)))
+
+    def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
+        """Quantities of the second-order drive that controllers may know, by command topic."""
+        frequency, damping = self.natural_frequency, self.damping
+        if self.mode_velocity or self.lag_time:
+            frequency, damping = self._modes().model(frequency, damping)
+        return {"coarse/command": {"natural_frequency": frequency, "damping": damping, "delay": self.delay}}
+
+
+@kernel
+def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """Move the drive through one block, within its limits."""
+    command, (position, velocity, effort, measured_position) = inputs[0], outputs
+    given = limited(memory.limits, first, followed(memory.retraction, command))
+    advance(memory.plant, given, position, velocity, effort, measured_position)
+    measure(memory.sensor, measured_position, measured_position)
+    return command.size, DONE
+
+
+class ElectrodynamicActuator(SingleDrive):
+    """Coarse electrodynamic drive in air (see `lathe_rc.plants.electrodynamic`).
+
+    Attributes:
+        drive: machine of the drive.
+    """
+
+    parameters: ElectrodynamicActuatorParameters
+    kind = "electrodynamic_actuator"
+    Parameters = ElectrodynamicActuatorParameters
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
+        self.drive = made_of(
+            ElectrodynamicDrive, parameters, method=parameters.discretisation, modes=parameters.modes(name)
+        )
+        super().__init__(name, parameters)
+        self._retraction = OwnRetraction(parameters, parameters.stroke, parameters.gain)
+
+    @property
+    def machine(self) -> CoarseTable:
+        """Parameter and state table of the machine, used by the step."""
+        return self.drive.table
+
+    def responses(self) -> Mapping[str, Response]:
+        """Response of the sensor's position to the command, by topic."""
+        return {"coarse/command": self.drive.plant.response}
+
+    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
+        """Response of the sensor's position to the command as measured in each state, by topic."""
+        return self.parameters.measured(self.name, self.drive.plant.response)

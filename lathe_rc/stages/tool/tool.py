@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tool and part: desired form, displacement, form error."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Le, MinLen
+
+from lathe_rc import messages
+from lathe_rc.arrays import put
+from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
+from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
+from lathe_rc.errors import InputError
+from lathe_rc.jit import kernel
+from lathe_rc.messages import Samples
+from lathe_rc.signals.profile_table import Demand
+from lathe_rc.signals.tip_path import steepest_fall
+from lathe_rc.stages.drive.drive import Drive, Limits
+from lathe_rc.stages.tool.form import Form, FormParameters, FormTable, ProfileStage, evaluate
+from lathe_rc.stages.tool.gauge import Gauge
+
+
+class ToolParameters(FormParameters):
+    """Drives that move the tool, and the desired form of the part unless a profile node publishes it."""
+
+    reference: Literal["own", "topic"] = parameter(
+        "own", "own: the form below; topic: what a profile node publishes, which others can read before the tool"
+    )
+    drives: Annotated[list[str], MinLen(1)] = parameter(
+        ["coarse"], "what moves the tool against the part, by the first word of its state topic; motions add up"
+    )
+    cross_slide: bool = parameter(
+        default=False,
+        doc="the cross slide, positive into the part, counts in the form error; no drive's sensor sees it",
+    )
+    nose_radius: NonNegative = parameter(
+        0.0, "radius of its nose in the plane of the feed: the result tells the roughness along the part; 0: not", "m"
+    )
+    deflects: bool = parameter(
+        default=False, doc="the deflection by the cutting force is part of the form error; no drive's sensor sees it"
+    )
+    deflection_delay: Annotated[int, Ge(0), Le(2**31 - 1)] = parameter(
+        64,
+        "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
+        "sample",
+    )
+    tolerance: NonNegative = parameter(
+        0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"
+    )
+
+    judging = frozenset({"tolerance"})
+
+    def known(self) -> Mapping[str, Value]:
+        """Form of the part for control laws, unless a profile node provides it."""
+        return super().known() if self.reference == "own" else {}
+
+
+class Memory(NamedTuple):
+    """State of the tool's step function.
+
+    Attributes:
+        form: form of the part; without a table if a profile node provides it.
+        begin: index of the first input of the drives.
+        drives: number of drives, each with a true and a measured position.
+        cross_slide, deflects: whether inputs of the cross slide and the edge's deflection follow those of the drives.
+    """
+
+    form: FormTable
+    begin: int
+    drives: int
+    cross_slide: bool
+    deflects: bool
+
+
+@kernel
+def add_drive(
+    begins: bool,  # noqa: FBT001 - kernels take their arguments by position
+    reference: Samples,
+    expected: Samples,
+    position: Samples,
+    measured: Samples,
+    displacement: Samples,
+    known: Samples,
+    error: Samples,
+) -> None:
+    """Add the motion of a drive; all arrays in m, shape (n,). The first drive (``begins``) starts the sum.
+
+    The error is Xd - X of the true signals (paper 000, Fig. 1); the known error is the expected form at the measured
+    angle minus the measured motions.
+    """
+    for k in range(reference.size):
+        displacement[k] = position[k] if begins else displacement[k] + position[k]
+        known[k] = (expected[k] if begins else known[k]) - measured[k]
+        error[k] = reference[k] - displacement[k]
+
+
+@kernel
+def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
+    """Sum the motions of one block, and compare the sum with the form."""
+    reference, displacement, error, known, height = outputs
+    if memory.form.heights.size:
+        evaluate(memory.form, inputs, reference, known, height)
+    else:
+        put(reference, inputs[0])
+        put(known, inputs[1])
+        put(height, inputs[2])
+    place = memory.begin
+    for drive in range(memory.drives):
+        add_drive(drive == 0, reference, known, inputs[place], inputs[place + 1], displacement, known, error)
+        place += 2
+    if memory.cross_slide:
+        position = inputs[place]
+        for k in range(error.size):
+            error[k] += position[k]
+        place += 1
+    if memory.deflects:
+        deflection = inputs[place]
+        for k in range(error.size):
+            error[k] -= deflection[k]
+    return error.size, DONE
+
+
+_ELSEWHERE = FormTable(
+    heights=np.empty(0),
+    table=np.empty((0, 0, 0)),
+    told=np.empty((0, 0, 0)),
+    alike=True,
+    slide=0,
+    feed=0.0,
+    start=0.0,
+    part=0,
+    told_heights=np.empty(0),
+)
+
+
+class Tool(Stage):
+    """Tool position as the sum of the motions (paper 001, Fig. 1a), compared with the desired form.
+
+    Attributes:
+        form: form of the part; None if a profile node provides it.
+    """
+
+    kind = "tool"
+    Parameters = ToolParameters
+    parameters: ToolParameters
+    step = staticmethod(step)
+
+    def __init__(self, name: str, parameters: ToolParameters) -> None:
+        super().__init__(name, parameters)
+        self.form = Form(name, parameters) if parameters.reference == "own" else None
+        if len(set(parameters.drives)) < len(parameters.drives):
+            raise InputError(f"{name}.drives = {parameters.drives}; allowed: each drive once")
+        what = [Input("reference", messages.REFERENCE, ("reference", "expected", "height"))]
+        if self.form is not None:
+            what = self.form.inputs
+        inputs = what + [
+            Input(f"{drive}/state", messages.STATE, ("position", "measured_position")) for drive in parameters.drives
+        ]
+        if parameters.cross_slide:
+            inputs.append(Input("cross/state", messages.STATE, ("position",)))
+        if parameters.deflects:
+            inputs.append(Input("cut", messages.CUT, ("deflection",), parameters.deflection_delay))
+        self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
+
+    def warnings(self, seconds: float) -> list[str]:
+        """Return the warnings about the form, one line each."""
+        return self.form.warnings(self.name, self.parameters.tolerance) if self.form else []
+
+    def check_cell(self, cell: WiredCell, *, cures: bool = True) -> None:
+        """Check that the first drive can follow the profile and that the flank does not rub."""
+        super().check_cell(cell, cures=cures)
+        owner = self._form_owner(cell)
+        topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
+        source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
+        if isinstance(source, Gauge):
+            topic = remapped(source.shared, source.drive_topic)
+            source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
+        if owner is None or owner.form is None:
+            return
+        if isinstance(source, Drive):
+            speed, acceleration = cell.speed_range[1], cell.master.largest_acceleration()
+            demand = owner.form.profile.demand(speed, acceleration, owner.parameters.feed)
+            for of, limits in source.limits().items():
+                if remapped(source.shared, of) == topic:
+                    _check_demand(owner.name, source.name, demand, limits, speed)
+        if owner.parameters.clearance:
+            _check_flank(owner.name, owner.parameters, owner.form)
+
+    def _form_owner(self, cell: WiredCell) -> "Tool | ProfileStage | None":
+        """Return the stage that provides the tool's desired form."""
+        if self.form is not None:
+            return self
+        source = cell.publisher(
+            remapped(self.shared, "reference"), f"whether a drive can follow what {self.name} reads"
+        )
+        return source if isinstance(source, ProfileStage) else None
+
+    @property
+    def memory(self) -> Memory:
+        """Current state of the tool's step function."""
+        parameters = self.parameters
+        form = self.form.table if self.form else _ELSEWHERE
+        # Each input of a form has two fields; that of a profile node has three.
+        begin = 3 if self.form is None else 2 * len(self.form.inputs)
+        return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
+
+
+def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed: float) -> None:
+    """Check that a drive can follow a profile at a speed [rad/s]."""
+    for what, asked, allowed, unit in (
+        ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),
+        ("velocity", demand.velocity, limits.velocity, "m/s"),
+        ("acceleration", demand.acceleration, limits.acceleration, "m/s^2"),
+    ):
+        if asked > allowed:
+            raise InputError(
+                f"{owner}.profile: {drive} cannot follow it at {speed:.4g} rad/s: {what} "
+                f"{asked:.4g} {unit}; allowed: {allowed:.4g} {unit} (turn slower or change the form)"
+            )
+
+
+def _check_flank(owner: str, parameters: FormParameters, form: Form) -> None:
+    """Check that the flank clears the surface behind the edge."""
+    fall = steepest_fall(form.surface, parameters.part_radius, parameters.feed)
+    if fall.clearance >= parameters.clearance:
+        raise InputError(
+            f"{owner}.clearance = {parameters.clearance:g} rad: the tool's flank would rub, since the form falls "
+            f"by {fall.clearance:.4g} rad at {fall.angle:.4g} rad, height {fall.height:g} m; allowed: above that, or a "
+            "flatter form"
+        )
