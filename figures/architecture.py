@@ -39,7 +39,9 @@ LAYERS = (
             "protocol": "joining, progress, the end",
         },
     ),
-    Layer("the cell", {"cell": "stages, blocks, scenario, checks, offline run"}),
+    Layer("judgement", {"judge": "part, loops, budget, against tolerances"}),
+    Layer("the catalogue", {"stages": "spindle, learning, drives, cut, tool, feed, supervisor"}),
+    Layer("the framework", {"cell": "wiring, scenario, stage, checks, offline run"}),
     Layer(
         "around it",
         {
@@ -94,10 +96,10 @@ def picture() -> str:
             drawn.append(arrow(f"M {LEFT + WIDTH / 2:g} {top - GAP + 1} V {top - 3}"))
         for name, what in layer.boxes.items():
             x, y, width = found[name]
-            kind = "box ros" if name == "nodes" else "box"
+            kind, shown = "box ros" if name == "nodes" else "box", name.removeprefix("lathe_")
             drawn += [
                 f'<rect class="{kind}" x="{x:g}" y="{y}" width="{width:g}" height="{HEIGHT}" rx="6"/>',
-                f'<text class="name" x="{x + width / 2:g}" y="{y + 21}" text-anchor="middle">{name.removeprefix("lathe_")}</text>',
+                f'<text class="name" x="{x + width / 2:g}" y="{y + 21}" text-anchor="middle">{shown}</text>',
                 f'<text class="what" x="{x + width / 2:g}" y="{y + 39}" text-anchor="middle">{what}</text>',
             ]
     for start, end in BESIDE:

@@ -12,6 +12,7 @@ from lathe_live.page_server import Page, Site
 from lathe_live.varied_loop import Along, LoopState, Setting, VariedLoop, drive_curves
 from lathe_rc import __version__, files
 from lathe_rc.analysis.tolerance import LAST, judge
+from lathe_rc.cell.parameters import judged
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.judge import part
 from lathe_rc.names import instead
@@ -188,5 +189,5 @@ def _errors(loop: VariedLoop, errors: FormErrors) -> list[Row]:
         (f"form error, largest {over}", f"{largest * 1e6:.4g} µm", repr(largest)),
         ("form error, RMS of the last revolution", f"{rms * 1e6:.4g} µm", repr(rms)),
     ]
-    allowed = next(iter(part.tolerances(loop.scenario).values()), 0.0)
+    allowed = next(iter(part.tolerances(judged(loop.scenario.nodes)).values()), 0.0)
     return found + ([("verdict", judge(errors.largest, allowed).told(), "")] if allowed else [])

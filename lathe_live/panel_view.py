@@ -22,6 +22,7 @@ from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.arrays import Array
+from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
@@ -160,7 +161,7 @@ class View:
 
     def know(self, scenario: Scenario) -> None:
         """Show what the samples do not tell: tolerance and shape of the scenario, results of its loops from now on."""
-        self.outlook, self._loops = outlook(scenario), loops(scenario.nodes)
+        self.outlook, self._loops = outlook(scenario), loops(judged(scenario.nodes))
         self._watches = watches(self._loops, self._types)
         for loop in self._loops:
             loop.running(0).add(*np.zeros((4, loop.delay + 2)))  # compiles the kernel before the run

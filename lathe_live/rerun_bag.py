@@ -16,6 +16,7 @@ from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.block import Block
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.judge.loops import Loop, loops
 from lathe_rc.messages import START_NS
 
 if TYPE_CHECKING:
@@ -61,10 +62,10 @@ def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
             )
         silent = [topic for topic in types if not source.topics[topic].count]
         rate = min(rate, _POINTS / max((source.last_ns - START_NS) * 1e-9, 1e-9))
-        nodes = {}
-        with contextlib.suppress(InputError):  # a bag without a readable scenario shows no results of loops
-            nodes = provenance.values_of(source.about)
-    outlook, found = Outlook(turned, travel), provenance.servo_loops(nodes)
+        found: list[Loop] = []
+        with contextlib.suppress(InputError):  # a bag that does not state them shows no results of loops
+            found = loops(provenance.judged(source.about))
+    outlook = Outlook(turned, travel)
     return Scene(recording, types, step_ns, outlook=outlook, rate=rate, silent=silent, loops=found)
 
 

@@ -13,6 +13,7 @@ from lathe_live.live_runs import LiveRuns, RunView, ShownRun
 from lathe_live.rerun_part import Outlook
 from lathe_live.rerun_scene import Scene
 from lathe_rc.cell.block import Block
+from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.judge.loops import loops
@@ -51,7 +52,7 @@ class _RunView(RunView):
         self._name, self._say, self._begun = f"run {block.run_id or '(no id)'}", say, False
         known: dict[str, Any] = {}
         if scenario:
-            known = {"outlook": Outlook.of(scenario), "loops": loops(scenario.nodes)}
+            known = {"outlook": Outlook.of(scenario), "loops": loops(judged(scenario.nodes))}
         self._scene = Scene(self._recording, types, block.step_ns, rate=rate, live=True, **known)
         size = math.ceil(PIECE * 1e9 / block.step_ns / self._scene.window) * self._scene.window
         super().__init__(block, types, self._scene, size, file)

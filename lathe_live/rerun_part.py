@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_live import diverging
+from lathe_live.panel_outlook import properties
 from lathe_live.rerun_revolutions import ANGLES, Revolution
 from lathe_rc.arrays import Array
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.time_master import TimeMasterParameters
-from lathe_rc.stages.tool.tool import ToolParameters
 
 #: A ring of vertices, its normals and colours, each shape (vertices, 3 or 4).
 Ring = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.uint8]]
@@ -64,9 +63,9 @@ class Outlook:
     @classmethod
     def of(cls, scenario: Scenario) -> "Outlook":
         """Return the properties of a run of a scenario; the travel of a slide is not known in advance."""
-        master, tool = scenario.first(TimeMasterParameters), scenario.first(ToolParameters)
-        turns = master.revolutions if master else 0.0
-        return cls(turns, turns * tool.feed if tool and tool.height_from == "feed" else 0.0)
+        shown = properties(table.shown() for table in scenario.nodes.values())
+        turns = shown.get("revolutions", 0.0)
+        return cls(turns, turns * shown.get("feed", 0.0))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +19,17 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
 from lathe_rc.signals.form_errors import FormErrors
-from lathe_rc.stages.learning.learner import Learner
+
+if TYPE_CHECKING:
+    from lathe_rc.stages.learning.learner import Learner
 
 _WIDEST = 2.5  # end of a range, in values of the scenario
 _POINTS = 400  # of a response
 _REVOLUTIONS = 30.0  # longest run for the form error
+
+
+def _learners(cell: Cell) -> "list[Learner]":
+    return [cast("Learner", stage) for stage in cell.stages.values() if stage.learns]
 
 
 @dataclass(frozen=True)
@@ -121,15 +127,15 @@ class VariedLoop:
         self.revolutions = revolutions or min(own, _REVOLUTIONS)
 
     @property
-    def learners(self) -> list[Learner]:
+    def learners(self) -> "list[Learner]":
         """Learning controllers, in order of computation."""
-        return [stage for stage in self.cell.stages.values() if isinstance(stage, Learner)]
+        return _learners(self.cell)
 
     def settings(self) -> list[Setting]:
         """Return the parameters that can be varied."""
         return [self._setting(stage, name) for stage in self.learners for name in stage.adjustable]
 
-    def _setting(self, stage: Learner, name: str) -> Setting:
+    def _setting(self, stage: "Learner", name: str) -> Setting:
         row, value = type(stage.shared).rows()[name], float(getattr(stage.shared, name))
         span = _WIDEST * (value or float(row.default) or 1.0)  # type: ignore[arg-type]
         low, high = max(row.low, min(0.0, span)), min(row.high, max(0.0, span))
@@ -188,9 +194,7 @@ def drive_curves(cell: Cell) -> list[DriveCurve]:
     """Return the responses of all drives that are learned, and the controllers' models of them."""
     found = []
     frequency = np.geomspace(2.0 * np.pi, np.pi / cell.master.shared.step, _POINTS)
-    for stage in cell.stages.values():
-        if not isinstance(stage, Learner):
-            continue
+    for stage in _learners(cell):
         for response, drive in stage.learned(cell.stages.values()):
             measured = isinstance(response, MeasuredDrive)
             at = response.frequency if isinstance(response, MeasuredDrive) else frequency

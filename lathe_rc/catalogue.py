@@ -90,6 +90,7 @@ STAGES = {
 }
 #: kinds of built-in stages that can be the time master of a cell
 MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle")
+DEVICES = ("encoder_device",)  #: those that follow a real encoder, instead of a clock of their own
 
 
 def module_of(command: str) -> str:

@@ -16,6 +16,7 @@ from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.arrays import Complex
 from lathe_rc.bag import reader
+from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, fields_of, refuse_faults
 from lathe_rc.commands import completers, lossy, measured, options, tables
@@ -221,7 +222,7 @@ def _hidden(made: Correction, lowest: int, guard: float, scenario: Scenario) -> 
         LatheError: in addition, nothing is corrected.
     """
     most = guard * float(made.noise[lowest:].max())
-    allowed = min(part.tolerances(scenario).values(), default=0.0)
+    allowed = min(part.tolerances(judged(scenario.nodes)).values(), default=0.0)
     if most <= allowed:
         return ""
     told = f"tolerance: ±{allowed * 1e6:.4g} µm" if allowed else "no tolerance"

@@ -60,8 +60,9 @@ def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float
     if nose_mm:
         return part.surface(recording, found, nose_mm * 1e-3)
     with Source(bag) as source:
-        radius = provenance.nose_radius(source.about)
+        about = source.about
     try:
+        radius = part.nose_radius(provenance.judged(about))
         return part.surface(recording, found, radius) if radius else None
     except InputError as error:
         return str(error)

@@ -7,10 +7,9 @@ from typing import Literal, cast
 
 from lathe_explore.sweep import NUMBERS, row
 from lathe_explore.sweep.row import Measure
-from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.parameters import Value, judged
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.judge.loops import loops
-from lathe_rc.stages.tool.tool import ToolParameters
 
 GOAL = "tool.max_error"  #: default goal; without a tool the largest error of the first loop
 
@@ -61,9 +60,9 @@ class Description:
 def describe(scenario: Scenario, targets: Iterable[str], measures: Sequence[Measure]) -> Description:
     """Return the description of a scenario, its varied parameters and its measures."""
     of_loops = (each.name for each in measures if each.node and each.statistic == "max_error")
-    tools = [cast("ToolParameters", scenario.nodes[node]) for node in scenario.of_kind("tool")]
-    tolerances = {GOAL: tools[0].tolerance} if tools else {}
-    tolerances |= {f"{loop.node}.max_error": loop.tolerance for loop in loops(scenario.nodes)}
+    forms = [each for each in judged(scenario.nodes).values() if each.quantity == "form"]
+    tolerances = {GOAL: forms[0].tolerance} if forms else {}
+    tolerances |= {f"{loop.node}.max_error": loop.tolerance for loop in loops(judged(scenario.nodes))}
     rows = {target: scenario.parameter(target) for target in targets}
     return Description(
         targets={

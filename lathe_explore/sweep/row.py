@@ -42,7 +42,8 @@ from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
-from lathe_rc.cell.parameters import Value
+from lathe_rc.cell.events import LIMITED, OUT_OF_REACH
+from lathe_rc.cell.parameters import Value, form_doubt, judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
@@ -53,10 +54,6 @@ from lathe_rc.judge.loops import FIGURES, loops, watches
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
-from lathe_rc.stages.common.command_limits import LIMITED
-from lathe_rc.stages.common.obedience import OUT_OF_REACH
-from lathe_rc.stages.tool.form import form_doubt
-from lathe_rc.stages.tool.tool import Tool
 
 if TYPE_CHECKING:
     from lathe_explore.sweep.description import Target
@@ -115,7 +112,9 @@ class Measure(NamedTuple):
 
 def figures(scenario: Scenario) -> dict[str, Measure]:
     """Return the figures of a scenario's force and position loops, by column."""
-    measures = [Measure(loop.topic, "error", figure, loop.node) for loop in loops(scenario.nodes) for figure in FIGURES]
+    measures = [
+        Measure(loop.topic, "error", figure, loop.node) for loop in loops(judged(scenario.nodes)) for figure in FIGURES
+    ]
     return {each.name: each for each in measures}
 
 
@@ -129,7 +128,7 @@ def unit(column: str, scenario: Scenario) -> tuple[float, str]:
     node, _, name = column.rpartition(".")
     if not re.fullmatch(r"[\w/]*", node):  # a formula of columns
         return 1.0, ""
-    loop = next((loop for loop in loops(scenario.nodes) if loop.node == node), None)
+    loop = next((loop for loop in loops(judged(scenario.nodes)) if loop.node == node), None)
     if loop and name in FIGURES:
         told = FIGURES[name][1]
         return (1.0, told.removeprefix("1")) if told else (loop.quantity.scale, loop.quantity.unit)
@@ -222,14 +221,15 @@ class _Keeper(Errors):
         self.heard = [*self.heard, *self._events, *(f"{asked.topic}.{asked.field}" for asked in measures)]
         asked_of = {asked.node for asked in measures}
         tables = {name: stage.shared for name, stage in cell.stages.items() if name in asked_of}
-        self._loops = watches(loops(tables), {topic: source.type for topic, source in cell.dense.items()})
+        self._loops = watches(loops(judged(tables)), {topic: source.type for topic, source in cell.dense.items()})
         self.heard += [f"{watch.topics[1]}.{field}" for watch in self._loops for field in ("set_point", "command")]
         if self._whole:
             self.heard = self._whole.heard
         self._limited: set[str] = set()
-        tools = [stage for stage in cell.stages.values() if isinstance(stage, Tool)]
-        self._tolerance = tools[0].parameters.tolerance if tools else 0.0
-        self._doubt = form_doubt({n: each.parameters for n, each in cell.stages.items()}) if self._tolerance else 0.0
+        parameters = {name: stage.shared for name, stage in cell.stages.items()}
+        forms = [each for each in judged(parameters).values() if each.quantity == "form"]
+        self._tolerance = forms[0].tolerance if forms else 0.0
+        self._doubt = form_doubt(parameters) if self._tolerance else 0.0
         self._measures = measures
         # The digest of a cell without a tool is that of what is measured.
         self._signals = {

@@ -18,17 +18,14 @@ from lathe_rc import __version__, allowed_code, resources
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
+from lathe_rc.cell.judged import Judged, from_text, to_text
 from lathe_rc.cell.kinds import STAGES
-from lathe_rc.cell.parameters import NodeParameters, Value
+from lathe_rc.cell.parameters import NodeParameters, Value, form_doubt
+from lathe_rc.cell.parameters import judged as judged_of
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
-from lathe_rc.judge.loops import Loop, loops
-from lathe_rc.stages.feed.force_controller import ForceController, ForceControllerParameters
-from lathe_rc.stages.feed.position_controller import PositionController, PositionControllerParameters
-from lathe_rc.stages.tool.form import form_doubt
-from lathe_rc.stages.tool.tool import Tool
 
 SCENARIO, NAME, VERSIONS = "lathe_rc.scenario", "lathe_rc.name", "lathe_rc.versions"
 RUN_ID, HOST_TOPICS = "lathe_rc.run_id", "lathe_rc.host_topics"
@@ -37,15 +34,12 @@ ORIGINS = "lathe_rc.origins"  #: origins of third-party classes, if there are an
 RECOVERED = "lathe_rc.recovered"  #: recovery report, including the losses
 COPIED = "lathe_rc.copied"  #: number of messages copied from each source bag
 FORM_DOUBT = "lathe_rc.form_doubt"  #: how far the form may be off between the points of its table [m], if at all
+JUDGED = "lathe_rc.judged"  #: errors by which a run is judged, by node (`lathe_rc.cell.judged`)
 _LEAST_DOUBT = 1e-8  # [m] of a form; no lathe turns a smaller one
 _MOST_FILE = 2**19  # longest file that is stored [B]
 _CODE = re.compile(r"[\w.]+:[\w.]+")  # package.module:Class
 _HASH = 12  # number of characters displayed of a hash
 _MOST_ORIGINS = 256
-_SERVOS: Mapping[str, type[NodeParameters]] = {
-    ForceController.kind: ForceControllerParameters,
-    PositionController.kind: PositionControllerParameters,
-}
 _PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
 
 
@@ -74,6 +68,7 @@ def tell(scenario: Scenario, host_topics: Sequence[str]) -> dict[str, str]:
         HOST_TOPICS: json.dumps(list(host_topics)),
         VERSIONS: json.dumps(_versions()),
         SCENARIO: Scenario(scenario.name, nodes).to_yaml(),
+        JUDGED: to_text(judged_of(nodes)),
         **({FORM_DOUBT: f"{off:.3g}"} if (off := form_doubt(nodes)) > _LEAST_DOUBT else {}),
         **({ORIGINS: json.dumps(found)} if (found := origins_of(nodes)) else {}),
         **files,
@@ -232,15 +227,15 @@ def values_of(about: Mapping[str, str]) -> dict[str, dict[str, Value]]:
     return ros_yaml.parse(about[SCENARIO], f"{SCENARIO} of the bag") if SCENARIO in about else {}
 
 
-def tolerances(nodes: Mapping[str, Mapping[str, Value]]) -> dict[str, float]:
-    """Return the tolerance [m] of each tool that has one, by relative topic, from the result of `values_of`."""
-    found: dict[str, float] = {}
-    for node, values in nodes.items():
-        allowed, remap = values.get("tolerance", 0.0), values.get("remap", [])
-        if str(values.get("stage") or node) == Tool.kind and isinstance(allowed, float) and 0.0 < allowed < math.inf:
-            rules = [str(rule).partition(":=") for rule in remap] if isinstance(remap, list) else []
-            found[next((new for old, _, new in rules if old == "tool"), "tool")] = allowed
-    return found
+def judged(about: Mapping[str, str]) -> dict[str, Judged]:
+    """Return by node the errors by which the run of a bag is judged; empty without a scenario.
+
+    Raises:
+        InputError: the bag has a scenario, but does not state what is judged, or states it wrongly.
+    """
+    if JUDGED not in about and SCENARIO in about:
+        raise InputError(f"the bag has no {JUDGED}, as those of earlier versions; lathe resim makes one that has")
+    return from_text(about[JUDGED], f"{JUDGED} of the bag") if JUDGED in about else {}
 
 
 def doubt_of(about: Mapping[str, str]) -> float:
@@ -250,16 +245,6 @@ def doubt_of(about: Mapping[str, str]) -> float:
     except ValueError:
         return math.inf
     return doubt if doubt >= 0.0 else math.inf
-
-
-def servo_loops(nodes: Mapping[str, Mapping[str, Value]]) -> list[Loop]:
-    """Return the force and position loops of a bag's scenario, from the result of `values_of`."""
-    tables: dict[str, NodeParameters] = {}
-    for node, values in nodes.items():
-        kind = _SERVOS.get(str(values.get("stage") or node))
-        with contextlib.suppress(InputError):  # of another version, or absurd
-            tables |= {node: kind.read(node, values)} if kind else {}
-    return loops(tables)
 
 
 def _versions() -> dict[str, str]:
@@ -300,12 +285,3 @@ def scenario_of(about: Mapping[str, str], folder: Path, overrides: Sequence[str]
             ) from None
     loaded = scenarios.load(file, overrides, complete=True, copies=copies)
     return Scenario(about.get(NAME, "") or loaded.name, loaded.nodes)
-
-
-def nose_radius(about: Mapping[str, str]) -> float:
-    """Return the tool nose radius in the scenario of a bag [m]; 0 if the scenario has none."""
-    for text in re.findall(r"\bnose_radius: ([\d.e+-]{1,30})(?![^\s,}])", about.get(SCENARIO, "")):
-        with contextlib.suppress(ValueError):
-            if 0.0 < float(text) < math.inf:
-                return float(text)
-    return 0.0

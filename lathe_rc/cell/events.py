@@ -11,6 +11,8 @@ from lathe_rc.errors import InputError
 FAULT, REPAIR = "fault", "repair"  #: verbs of the events that all stages know: fault FAULT, repair FAULT or TARGET
 SET = "set"  #: verb of an event that changes a parameter of a stage: set PARAM VALUE
 SAFE = "safe"  #: event that only a host may ask for: members of the cell are lost
+LIMITED, FREE = "limited", "free"  #: events: a sample of a command is clipped; none has been clipped for a while
+OUT_OF_REACH = "out of reach"  #: event: a takeover could not begin at the command's position
 NOTHING_TO_REPAIR = "nothing to repair"  #: event of a repair of what is not broken
 
 _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([0-9.eE+-]+))?\s*:\s*(\S.*?)\s*")

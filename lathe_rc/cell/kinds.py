@@ -5,7 +5,7 @@ from lathe_rc import catalogue
 from lathe_rc.cell.stage import Stage
 from lathe_rc.extensions import Registry
 
-MASTERS = catalogue.MASTERS  #: kinds of built-in stages that can be the time master of a cell
+MASTERS, DEVICES = catalogue.MASTERS, catalogue.DEVICES
 
 #: built-in and third-party stages, by name
 STAGES: Registry[Stage] = Registry("stage", Stage, catalogue.STAGES, "lathe_rc.stages")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast, get_args, get_origin
 
 import numpy as np
@@ -17,6 +18,7 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
+from lathe_rc.cell.judged import Judged
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
 from lathe_rc.messages import MAX_BLOCK
@@ -285,11 +287,13 @@ class NodeParameters(SharedParameters):
 
     Attributes:
         judging: parameters that affect only the assessment of a run, not its samples or messages.
+        causes: values that switch a cause of error off, by name of the cause (`lathe_rc.judge.budget`).
     """
 
     listing: ClassVar[str] = "lathe node {} --help"
     asks: ClassVar[tuple[frozenset[str], ...]] = ()  #: parameters taken from the node that knows them, unless given
     judging: ClassVar[frozenset[str]] = frozenset()
+    causes: ClassVar[Mapping[str, Values]] = MappingProxyType({})
 
     stage: str = parameter("", "what the node is; empty: its name says it")
     remap: list[str] = parameter([], "topic names to replace, as old:=new")
@@ -327,6 +331,18 @@ class NodeParameters(SharedParameters):
         """Return the values of the node that other nodes may use, by parameter name."""
         return {}
 
+    def judged(self) -> Judged | None:
+        """Return the error of the node by which a run is judged; None if there is none."""
+        return None
+
+    def form_doubt(self, node: str) -> float:
+        """Return how far the form of a node may be off between the points of its table [m]; 0 without a table."""
+        return 0.0
+
+    def shown(self) -> Mapping[str, Any]:
+        """Return properties of the node that drawings of the cell show, by name; lengths in µm and mm."""
+        return {}
+
 
 class ObedientParameters(NodeParameters):
     """Parameters of a node that obeys the supervisor."""
@@ -342,6 +358,16 @@ class RestartParameters(NodeParameters):
     restart_file: str = parameter(
         "", "the node's state is kept in this file, and another process of it goes on from there; empty: it is not"
     )
+
+
+def judged(nodes: Mapping[str, NodeParameters]) -> dict[str, Judged]:
+    """Return by node the errors by which a run of some nodes is judged."""
+    return {name: found for name, table in nodes.items() if (found := table.judged())}
+
+
+def form_doubt(nodes: Mapping[str, NodeParameters]) -> float:
+    """Return how far the form of some nodes may be off between the points of its table [m]; 0 without a form."""
+    return max((table.form_doubt(name) for name, table in nodes.items()), default=0.0)
 
 
 def remapped(table: NodeParameters, topic: str) -> str:

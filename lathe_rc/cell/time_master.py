@@ -75,6 +75,10 @@ class TimeMasterParameters(NodeParameters):
         """Counts of the encoder and resolution of their edges' times, for laws that filter its angle."""
         return {"encoder_counts": self.counts_per_revolution, "encoder_edge_clock": self.edge_resolution}
 
+    def shown(self) -> Mapping[str, Any]:
+        """Length of the run."""
+        return {"revolutions": self.revolutions}
+
 
 class TimeMaster(Stage):
     """Stage that provides time and angle to all others, and reads no other stage.

@@ -12,6 +12,7 @@ from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.cell.latency_histogram import Lateness
+from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.drawing import html
@@ -19,7 +20,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.event_log import LogEntry, entries
 from lathe_rc.judge import loops, part
 from lathe_rc.signals.form_errors import FormErrors
-from lathe_rc.stages.tool.tool import ToolParameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,13 +156,12 @@ class Result:
     @cached_property
     def loops(self) -> dict[str, loops.LoopResult]:
         """Results of the force and position loops, by controller (`lathe_rc.judge.loops`)."""
-        return loops.evaluated(loops.loops(self.scenario.nodes), self.recording)
+        return loops.evaluated(loops.loops(judged(self.scenario.nodes)), self.recording)
 
     @cached_property
     def surface(self) -> Lay | str | None:
         """Surface along the part, or why it is absent; None if no tool of the scenario has a `nose_radius`."""
-        tools = [table for table in self.scenario.nodes.values() if isinstance(table, ToolParameters)]
-        radius = next((table.nose_radius for table in tools if table.nose_radius), 0.0)
+        radius = part.nose_radius(judged(self.scenario.nodes))
         if not radius or not self.errors.rms.size:
             return None
         try:

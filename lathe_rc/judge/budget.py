@@ -16,46 +16,18 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.judge.causes import EVERYWHERE, ORDER, PREFIXES
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.stages.cut.vibration import VibrationParameters
 from lathe_rc.stages.learning.learning_controller import LearningController
 from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
-from lathe_rc.stages.spindle.loaded_spindle import LoadedSpindleParameters
 from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
 from lathe_rc.stages.tool.form import FormParameters
 from lathe_rc.stages.tool.tool import ToolParameters
 
 _TURN = 2.0 * np.pi
-_PREFIXES = ("", "coarse_", "fine_", "cut_")  # parameter prefixes of stages composed of several devices
 _FACTOR = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
 _CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
 
-#: Parameters by cause, in nodes with a table of a given kind, with the values that switch the cause off.
-_CAUSES: Mapping[str, tuple[type[NodeParameters], Values]] = {
-    "force": (NodeParameters, {"deflects": False, "cross_slide": False, "radial_ratio": 0.0}),
-    "load": (LoadedSpindleParameters, {"part_radius": 0.0}),
-    "vibration": (
-        VibrationParameters,
-        {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []},
-    ),
-    "noise": (NodeParameters, {"noise_rms": 0.0}),
-    "quantisation": (
-        NodeParameters,
-        {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
-    ),
-    "hysteresis": (NodeParameters, {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0}),
-    "backlash": (NodeParameters, {"backlash": 0.0}),
-    "limits": (
-        NodeParameters,
-        {f"command_{name}": 0.0 for name in ("stroke", "velocity", "acceleration", "jerk")}
-        | {f"{name}_limit": 0.0 for name in ("current", "voltage", "torque")}
-        | {"slew_rate": 0.0},
-    ),
-    "faults": (NodeParameters, {"faults": []}),
-}
-#: The causes that make one revolution differ from the next.
-_CHANGING = {name: _CAUSES[name][1] for name in ("noise", "quantisation", "vibration")}
-_CONSTANT = ("harmonics", "polygon")  # profiles that are constant along the part
 _SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
 
 
@@ -129,13 +101,12 @@ def _simple(scenario: Scenario) -> dict[str, Cause]:
             {
                 f"{node}.{prefix}{each}": value
                 for node, table in scenario.nodes.items()
-                if isinstance(table, kind)
-                for prefix in _PREFIXES
-                for each, value in values.items()
+                for prefix in PREFIXES
+                for each, value in table.causes.get(name, EVERYWHERE.get(name, {})).items()
                 if f"{prefix}{each}" in type(table).model_fields
             }
         )
-        for name, (kind, values) in _CAUSES.items()
+        for name in ORDER
     }
 
 
@@ -193,30 +164,6 @@ def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
                 return {}
             off |= {f"{stage.name}.{name}": value for name, value in flat.items()}
     return {"Q floor": Cause(off)}
-
-
-def changing(nodes: Mapping[str, Values]) -> list[str]:
-    """Return the names of the causes that make revolutions differ from each other, except for speed and cut.
-
-    Args:
-        nodes: all values by node and parameter, unchecked; empty lists may be omitted.
-    """
-    found = [
-        name
-        for name, off in _CHANGING.items()
-        if any(
-            values.get(f"{prefix}{each}", none) != none
-            for values in nodes.values()
-            for prefix in _PREFIXES
-            for each, none in off.items()
-        )
-    ]
-    fed = any(
-        values.get("profile", _CONSTANT[0]) not in _CONSTANT
-        and (values.get("feed", 0.0) != 0.0 or values.get("height_from") == "slide")
-        for values in nodes.values()
-    )
-    return [*found, *(["feed"] if fed else [])]
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:

@@ -9,16 +9,14 @@ from typing import Any
 from lathe_rc import messages
 from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, Step
 from lathe_rc.analysis.tolerance import FORCE, LAST, POSITION, Growth, Quantity, Verdict, judge, swing_growth
-from lathe_rc.cell.parameters import NodeParameters, remapped
+from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.soundness import Soundness, fields_of
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Signals, full
 from lathe_rc.signals.form_errors import turns_before
-from lathe_rc.stages.feed.servo import ServoParameters
 
 _PIECE = 2**16  # samples evaluated at a time
-_ROUNDED = 1e-9  # relative distance from a limit within which a command is at the limit
 _AWAY = 0.25  # share of the samples at a limit from which on a growing error diverges
 _FAILURES = {
     "swings": "{} loop diverges: its command swings between its limits",
@@ -59,20 +57,15 @@ class Loop:
         return RunningLoop(before, self.delay, self.limit, self.tolerance)
 
 
-def loops(tables: Mapping[str, NodeParameters]) -> list[Loop]:
-    """Return the force and position loops among nodes with these parameter tables."""
+_QUANTITIES = {"force": FORCE, "position": POSITION}
+
+
+def loops(declared: Mapping[str, Judged]) -> list[Loop]:
+    """Return the force and position loops among what nodes declare that a run is judged by."""
     return [
-        Loop(
-            node=node,
-            topic=remapped(table, table.commanded_topic),
-            quantity=FORCE if table.rows()["set_point"].unit == "N" else POSITION,
-            delay=table.feedback_delay,
-            limit=(table.command_limit - table.dac_step / 2.0) * (1.0 - _ROUNDED),
-            tolerance=table.tolerance,
-            step=table.step,
-        )
-        for node, table in tables.items()
-        if isinstance(table, ServoParameters)
+        Loop(node, each.topic, _QUANTITIES[each.quantity], each.delay, each.limit, each.tolerance, each.step)
+        for node, each in declared.items()
+        if each.quantity in _QUANTITIES
     ]
 
 

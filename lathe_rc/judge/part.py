@@ -11,7 +11,8 @@ from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
-from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.judged import Judged
+from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import Soundness
@@ -19,8 +20,6 @@ from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
 from lathe_rc.signals.form_errors import RunningErrors, that_count, turns_before
-from lathe_rc.stages.tool.form import form_doubt
-from lathe_rc.stages.tool.tool import ToolParameters
 
 _CUTOFF = 50.0  # cutoff of the roundness and roughness filters [undulations per revolution]
 _TOGETHER = 16  # number of revolutions evaluated together
@@ -50,16 +49,21 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
     return found
 
 
-def tolerances(scenario: Scenario) -> dict[str, float]:
-    """Return the tolerance [m] of each tool that has one, by relative topic."""
-    tools = [table for table in scenario.nodes.values() if isinstance(table, ToolParameters)]
-    return {remapped(table, "tool"): table.tolerance for table in tools if table.tolerance}
+def tolerances(declared: Mapping[str, Judged]) -> dict[str, float]:
+    """Return the tolerance [m] of each tool that declares one, by relative topic."""
+    forms = [each for each in declared.values() if each.quantity == "form"]
+    return {each.topic: each.tolerance for each in forms if each.tolerance}
+
+
+def nose_radius(declared: Mapping[str, Judged]) -> float:
+    """Return the nose radius of the tool [m] that nodes declare; 0 if none does."""
+    return next((each.nose_radius for each in declared.values() if each.nose_radius), 0.0)
 
 
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
-    for of, allowed in tolerances(scenario).items():
+    for of, allowed in tolerances(judged(scenario.nodes)).items():
         if topic.endswith(f"/{of}"):
             why, doubt = recording.sound_form[1], form_doubt(scenario.nodes)
             return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=why, doubt=doubt)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from sensor_msgs.msg import JointState
@@ -15,7 +15,9 @@ from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.signals.counts import LineReader, Reading
-from lathe_rc.stages.spindle.encoder_device import EncoderDevice, EncoderDeviceParameters
+
+if TYPE_CHECKING:
+    from lathe_rc.stages.spindle.encoder_device import EncoderDevice, EncoderDeviceParameters
 
 _POLL = 0.5e-3  # [s] between polls of a line
 
@@ -40,7 +42,7 @@ class EncoderRole(SpindleRole):
     so far.
     """
 
-    stage: EncoderDevice
+    stage: "EncoderDevice"
 
     def __init__(self, node: CellNode) -> None:
         super().__init__(node)

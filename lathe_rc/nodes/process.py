@@ -24,7 +24,7 @@ from rclpy.type_support import check_for_type_support
 
 from lathe_rc import allowed_code
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.kinds import STAGES
+from lathe_rc.cell.kinds import DEVICES, MASTERS, STAGES
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
@@ -40,9 +40,6 @@ from lathe_rc.nodes.report import THROUGHPUT, Reporter
 from lathe_rc.nodes.spindle_role import SpindleRole
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol.exchange import Exchange
-from lathe_rc.stages.spindle.encoder_device import EncoderDevice
-from lathe_rc.stages.spindle.loaded_spindle import LoadedSpindleStage
-from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
 
 _MESSAGES = (  # message and service types of the nodes, rclpy's own services included
     *("lathe_rc_msgs.msg", "lathe_rc_msgs.srv", "rcl_interfaces.msg", "rcl_interfaces.srv", "lifecycle_msgs.msg"),
@@ -60,9 +57,8 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
         raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
     roles: dict[str, Callable[[CellNode], Role]] = {
         RECORDER: RecorderRole,
-        SpindleEncoder.kind: SpindleRole,
-        LoadedSpindleStage.kind: SpindleRole,
-        EncoderDevice.kind: EncoderRole,
+        **dict.fromkeys(MASTERS, SpindleRole),
+        **dict.fromkeys(DEVICES, EncoderRole),
     }
     try:
         return CellNode(name, kind, roles.get(kind, StageRole), reporter, exchange)

@@ -4,7 +4,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -115,6 +115,10 @@ class SupervisorParameters(NodeParameters):
         0.25e-3, "the tool is out of the part where the first drive's measured position is beyond this", "m"
     )
     clear_time: NonNegative = parameter(1e-3, "for so long", "s")
+
+    def shown(self) -> Mapping[str, Any]:
+        """Supervision and largest allowed margin of the drives."""
+        return {"supervised": True, "margin": max(self.margin_limit, default=0.0)}
 
 
 MEMBERS_LOST = "members_lost"  #: name in place of a monitor's: the host reports that members of the cell are lost

@@ -15,12 +15,14 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder, first_of
 from lathe_rc.bag.snapshot import span_of
+from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.event_log import LOGGED, LogEntry
-from lathe_rc.judge.loops import watches
+from lathe_rc.judge import part
+from lathe_rc.judge.loops import loops, watches
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
@@ -206,12 +208,13 @@ def gather(path: Path) -> Gathered:
     """
     with Source(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
-        nodes, unjudged = {}, ""
+        nodes, declared, unjudged = {}, dict[str, Judged](), ""
         try:
             nodes = provenance.values_of(source.about)
+            declared = provenance.judged(source.about)
         except InputError as error:
             unjudged = str(error)
-        allowed, nose = provenance.tolerances(nodes), provenance.nose_radius(source.about)
+        allowed, nose = part.tolerances(declared), part.nose_radius(declared)
         doubt = provenance.doubt_of(source.about)
         forms = [
             Form(
@@ -226,7 +229,7 @@ def gather(path: Path) -> Gathered:
             for tool in of_type(types, messages.TOOL)
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
-        servos = [Servo(watch) for watch in watches(provenance.servo_loops(nodes), types)]
+        servos = [Servo(watch) for watch in watches(loops(declared), types)]
         gathered = Gathered(source.about, tallies, forms, Curves(types), servos, nodes=nodes, unjudged=unjudged)
         first = first_of(source)
         feeder = Feeder(types, [*forms, *servos, gathered.curves], _PIECE, first, source.loss)

@@ -12,8 +12,8 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.budget import Budget
-from lathe_rc.judge.budget import changing
-from lathe_rc.stages.common.command_limits import LIMITED
+from lathe_rc.cell.events import LIMITED
+from lathe_rc.judge.causes import changing
 from lathe_rc.view.form_limits import WARN, Finding, form_limits, varying_speed
 from lathe_rc.view.report_figures import um
 from lathe_rc.view.report_form import Form

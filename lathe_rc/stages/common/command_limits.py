@@ -5,13 +5,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter
 from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 
-LIMITED, FREE = "limited", "free"  #: events: a sample is clipped; no sample has been clipped for a while
 _TELL = 0.1  # interval of reports about a command that remains clipped [s]
 _QUIET = 10e-3  # time without a clipped sample until a command counts as free again [s]
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.arrays import Array, Integers
+from lathe_rc.cell.events import OUT_OF_REACH
 from lathe_rc.cell.parameters import ObedientParameters, Positive, parameter
 from lathe_rc.cell.stage import Input, Sparse, Stage
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
@@ -17,7 +18,6 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.safety.state_machine import Reaction
 
-OUT_OF_REACH = "out of reach"  #: event: a takeover could not begin at the command's position
 OBEY = 100  #: stop reason of a step function: a reaction must be obeyed
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cutting process: from tool, feed and part to the force and the resulting deflection of the edge."""
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le, Lt
@@ -168,6 +168,11 @@ class CuttingProcessParameters(NodeParameters):
                 overlap=self.regeneration,
                 flank=made_of(Flank, self, "flank_"),
             )
+
+    def shown(self) -> Mapping[str, Any]:
+        """Cut, radius of the part, and places without material."""
+        gaps = list(zip(self.gap_start, self.gap_width, strict=True))
+        return {"cut": True, "cut_radius": self.radius * 1e3, "gaps": gaps}
 
 
 class Memory(NamedTuple):

@@ -2,6 +2,7 @@
 """Vibration of the tool against the part, as a source of displacement."""
 
 import zlib
+from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -20,6 +21,10 @@ from lathe_rc.stages.common.tables import made_of
 
 class VibrationParameters(NodeParameters):
     """Random vibration within a band, harmonic lines, and the sensor that measures their sum."""
+
+    causes = MappingProxyType(
+        {"vibration": {"random_rms": 0.0, "line_amplitude": [], "line_frequency": [], "line_phase": []}}
+    )
 
     random_rms: NonNegative = parameter(0.2e-6, "random vibration: RMS; 0: none", "m")
     random_low: Positive = parameter(200.0, "lower end of its band", "rad/s")

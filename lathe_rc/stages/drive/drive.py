@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, Positive, parameter
 from lathe_rc.cell.stage import Sparse, Stage
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
-from lathe_rc.stages.common.command_limits import FREE, LIMITED, Clipping, LimitedCommand
+from lathe_rc.stages.common.command_limits import Clipping, LimitedCommand
 from lathe_rc.stages.common.tables import made_of
 
 

@@ -10,6 +10,7 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
+from lathe_rc.cell.events import FREE, LIMITED, OUT_OF_REACH
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
 from lathe_rc.errors import InputError
@@ -22,10 +23,9 @@ from lathe_rc.plants.screw import Screw
 from lathe_rc.safety.state_machine import Reaction
 from lathe_rc.signals.example_002 import fill_disturbance
 from lathe_rc.signals.noise import Sensor, SensorTable, measure
-from lathe_rc.stages.common.command_limits import FREE, LIMITED, Clipping, LimitedParameters
+from lathe_rc.stages.common.command_limits import Clipping, LimitedParameters
 from lathe_rc.stages.common.obedience import (
     OBEY,
-    OUT_OF_REACH,
     FeedObedientParameters,
     Listener,
     Obedience,

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controller of the main cutting force through the longitudinal feed (paper 004)."""
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
@@ -31,6 +32,10 @@ class ForceControllerParameters(ServoParameters):
     )
 
     commanded_topic: ClassVar[str] = "longitudinal/command"
+
+    def shown(self) -> Mapping[str, Any]:
+        """Largest set point [N]."""
+        return {"force": max(self.set_point, default=0.0)}
 
 
 class Memory(NamedTuple):

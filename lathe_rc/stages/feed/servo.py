@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
-from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
+from lathe_rc.cell.judged import Judged
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter, remapped
 from lathe_rc.cell.stage import DONE
 from lathe_rc.control.pid import Pid, PidGains, PidTable, control_along, enable_integrator
 from lathe_rc.jit import kernel
@@ -24,6 +25,8 @@ from lathe_rc.stages.common.obedience import (
 )
 from lathe_rc.stages.common.tables import made_of
 from lathe_rc.stages.feed.trajectory import Trajectory, TrajectoryParameters
+
+_ROUNDED = 1e-9  # relative distance from a limit within which a command is at the limit
 
 
 class ServoParameters(TrajectoryParameters, FeedObedientParameters):
@@ -55,6 +58,17 @@ class ServoParameters(TrajectoryParameters, FeedObedientParameters):
     )
 
     judging = frozenset({"tolerance"})
+
+    def judged(self) -> Judged:
+        """Following error of the loop."""
+        return Judged(
+            topic=remapped(self, self.commanded_topic),
+            quantity="force" if self.rows()["set_point"].unit == "N" else "position",
+            step=self.step,
+            tolerance=self.tolerance,
+            delay=self.feedback_delay,
+            limit=(self.command_limit - self.dac_step / 2.0) * (1.0 - _ROUNDED),
+        )
 
     def obeys(self, name: str) -> Obedience | None:
         """Return the obedience of a node to the supervisor; None without a supervisor input.

@@ -14,6 +14,7 @@ from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, Response, highest_waves
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.cell.events import OUT_OF_REACH
 from lathe_rc.cell.parameters import Value, about
 from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
 from lathe_rc.control import angle_memory, memory_file
@@ -23,7 +24,7 @@ from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_fee
 from lathe_rc.errors import InputError
 from lathe_rc.messages import MAX_BLOCK, Signals
 from lathe_rc.plants.linear import discretise, second_order
-from lathe_rc.stages.common.obedience import OBEY, OUT_OF_REACH, listens
+from lathe_rc.stages.common.obedience import OBEY, listens
 from lathe_rc.stages.common.tables import made_of
 from lathe_rc.stages.learning.learner import Learner
 from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters

@@ -2,19 +2,21 @@
 """Spindle slowed by the cutting torque, with its encoder."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
+from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import STOPS, Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
 from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
-from lathe_rc.stages.common.command_limits import FREE, LIMITED, Clipping
+from lathe_rc.stages.common.command_limits import Clipping
 from lathe_rc.stages.common.tables import made_of
 from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
 
@@ -24,6 +26,8 @@ _MOST_LAG = 0.9 * 2.0 * np.pi  # largest extension of a run beyond its speed law
 
 class LoadedSpindleParameters(SpindleEncoderParameters):
     """Speed law and its change by the cutting torque; a run is longer than the law by the resulting delay."""
+
+    causes = MappingProxyType({"load": {"part_radius": 0.0}})
 
     inertia: Positive = parameter(0.03, "of spindle, chuck and part", "kg*m^2")
     motor_inertia: Positive = parameter(0.01, "of the motor, referred to the spindle", "kg*m^2")

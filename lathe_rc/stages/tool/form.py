@@ -121,6 +121,10 @@ class FormParameters(NodeParameters):
         with code_of_others(f"{node}.profile = {self.profile!r}"):
             return doubt(form)
 
+    def form_doubt(self, node: str) -> float:
+        """Return how far the form of the node may be off; 0 if another node has the form."""
+        return self.doubt(node, self.form(node)).whole if self.known() else 0.0
+
     def programmed_form(self, node: str) -> Measured | None:
         """Return the programmed form of the controllers of a node; None: the form itself.
 
@@ -131,15 +135,6 @@ class FormParameters(NodeParameters):
             return None
         with about(node, "programmed_file"):
             return read_csv(resources.find(Path(self.programmed_file)))
-
-
-def form_doubt(nodes: Mapping[str, NodeParameters]) -> float:
-    """Return how far the form of a scenario may be off between the points of its table [m]; 0 without a form."""
-    owner = next(((n, t) for n, t in nodes.items() if isinstance(t, FormParameters) and t.known()), None)
-    if not owner:
-        return 0.0
-    node, table = owner
-    return table.doubt(node, table.form(node)).whole
 
 
 FORM = frozenset(FormParameters.model_fields) - frozenset(NodeParameters.model_fields)  #: names of form parameters

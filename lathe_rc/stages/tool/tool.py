@@ -2,13 +2,14 @@
 """Tool and part: desired form, displacement, form error."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
+from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
 from lathe_rc.errors import InputError
@@ -54,6 +55,20 @@ class ToolParameters(FormParameters):
     def known(self) -> Mapping[str, Value]:
         """Form of the part for control laws, unless a profile node provides it."""
         return super().known() if self.reference == "own" else {}
+
+    def judged(self) -> Judged:
+        """Form error of the tool."""
+        return Judged(remapped(self, "tool"), "form", self.step, self.tolerance, self.nose_radius)
+
+    def shown(self) -> Mapping[str, Any]:
+        """Part, tolerance and feed of the tool."""
+        return {
+            "part": True,
+            "tolerance": self.tolerance * 1e6,
+            "fed": bool(self.feed or self.height_from == "slide"),
+            "feed": self.feed if self.height_from == "feed" else 0.0,
+            "radius": self.part_radius * 1e3,
+        }
 
 
 class Memory(NamedTuple):

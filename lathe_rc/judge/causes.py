@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Causes of a form error by name, with the parameter values that switch each off."""
+
+from collections.abc import Mapping
+
+from lathe_rc.cell.parameters import Values
+
+PREFIXES = ("", "coarse_", "fine_", "cut_")  #: parameter prefixes of stages composed of several devices
+
+#: causes that the same values switch off in every node that has these parameters; `NodeParameters.causes` has others
+EVERYWHERE: Mapping[str, Values] = {
+    "force": {"deflects": False, "cross_slide": False, "radial_ratio": 0.0},
+    "noise": {"noise_rms": 0.0},
+    "quantisation": {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
+    "hysteresis": {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0},
+    "backlash": {"backlash": 0.0},
+    "limits": {f"command_{name}": 0.0 for name in ("stroke", "velocity", "acceleration", "jerk")}
+    | {f"{name}_limit": 0.0 for name in ("current", "voltage", "torque")}
+    | {"slew_rate": 0.0},
+    "faults": {"faults": []},
+}
+ORDER = ("force", "load", "vibration", "noise", "quantisation", "hysteresis", "backlash", "limits", "faults")
+#: causes that make one revolution differ from the next
+_CHANGING: Mapping[str, Values] = {
+    "noise": EVERYWHERE["noise"],
+    "quantisation": EVERYWHERE["quantisation"],
+    "vibration": {"random_rms": 0.0, "line_amplitude": []},
+}
+_CONSTANT = ("harmonics", "polygon")  # profiles that are constant along the part
+
+
+def changing(nodes: Mapping[str, Values]) -> list[str]:
+    """Return the names of the causes that make revolutions differ from each other, except for speed and cut.
+
+    Args:
+        nodes: all values by node and parameter, unchecked; empty lists may be omitted.
+    """
+    found = [
+        name
+        for name, off in _CHANGING.items()
+        if any(
+            values.get(f"{prefix}{each}", none) != none
+            for values in nodes.values()
+            for prefix in PREFIXES
+            for each, none in off.items()
+        )
+    ]
+    fed = any(
+        values.get("profile", _CONSTANT[0]) not in _CONSTANT
+        and (values.get("feed", 0.0) != 0.0 or values.get("height_from") == "slide")
+        for values in nodes.values()
+    )
+    return [*found, *(["feed"] if fed else [])]
