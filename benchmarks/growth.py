@@ -39,10 +39,10 @@ from lathe_rc import resources
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.judge import part
 from lathe_rc.messages import Signals

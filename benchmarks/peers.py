@@ -25,9 +25,9 @@ from scipy import signal
 from benchmarks import sides
 from benchmarks.others.peer import Peer, missing
 from lathe_rc import messages, resources
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 from lathe_rc.plants.electrodynamic import ElectrodynamicDrive

@@ -38,10 +38,10 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import BagWriter, Compression, offered_qos
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder, Encoder
 from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 

@@ -42,10 +42,11 @@ LAYERS = (
     Layer("judgement", {"judge": "part, loops, budget, against tolerances"}),
     Layer("the catalogue", {"stages": "spindle, learning, drives, cut, tool, feed, supervisor"}),
     Layer("the framework", {"cell": "wiring, scenario, stage, checks, offline run"}),
+    Layer("between nodes", {"blocks": "ports, messages as arrays and bytes, delays"}),
     Layer(
         "around it",
         {
-            "drawing": "pictures of arrays",
+            "drawing": "pages, charts, pictures",
             "analysis": "formulas, metrology, fits",
             "safety": "faults, monitors, safe state",
         },

@@ -24,10 +24,10 @@ from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Values
 from lathe_rc.cell.scenario import TABLES, Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import Array
-from lathe_rc.view.pages import own_file
+from lathe_rc.drawing.pages import own_file
 
 
 @cache

@@ -16,9 +16,9 @@ from typing import Literal, Protocol
 from lathe_live.rerun_pieces import Pieces
 from lathe_live.rerun_signals import drawn_fields
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.protocol.messages import Phase

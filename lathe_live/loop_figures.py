@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lathe_live.varied_loop import Along, DriveCurve
+from lathe_rc.drawing.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.messages import Samples
-from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.view.report_figures import BOX, colours, figure
 
 _MOST = 5  # responses of a controller

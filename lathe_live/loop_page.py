@@ -13,13 +13,13 @@ from lathe_live.varied_loop import Along, LoopState, Setting, VariedLoop, drive_
 from lathe_rc import __version__, files
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.cell.parameters import judged
+from lathe_rc.drawing.charts import Charts, Spec, page_template
+from lathe_rc.drawing.pages import own_file
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.judge import part
 from lathe_rc.names import instead
 from lathe_rc.signals.form_errors import FormErrors
 from lathe_rc.view import report_loop
-from lathe_rc.view.charts import Charts, Spec, page_template
-from lathe_rc.view.pages import own_file
 
 Row = tuple[str, str, str]  # name, value, value with all digits
 _HERE = Path(__file__).parent

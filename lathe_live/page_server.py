@@ -29,8 +29,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
+from lathe_rc.drawing.pages import own_file
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.view.pages import own_file
 
 HOST = "127.0.0.1"  #: the only interface
 TOKEN = "X-Lathe-Token"  # noqa: S105 - the header with the token, which the scripts of a page send

@@ -14,10 +14,10 @@ from lathe_rc import messages
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.drawing.pages import own_file
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 from lathe_rc.safety import faults
-from lathe_rc.view.pages import own_file
 
 _HERE = Path(__file__).parent
 

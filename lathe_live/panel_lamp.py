@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lathe_rc import event_log, messages
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import Signals
 from lathe_rc.safety.state_machine import State
 

@@ -8,9 +8,9 @@ from typing import Any
 from lathe_live.live_runs import LiveRuns, RunOrder, RunView, ShownRun
 from lathe_live.panel_view import View
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.event_log import LOGGED
 from lathe_rc.messages import Signals
 from lathe_rc.protocol.messages import Phase

@@ -15,7 +15,7 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reader import read_bag
 from lathe_rc.bag.reading.source import Source, name_of
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import MAX_BLOCK
 

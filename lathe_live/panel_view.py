@@ -22,10 +22,10 @@ from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.arrays import Array
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.messages import Samples, Signals, full

@@ -13,8 +13,8 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.source import Source, name_of
+from lathe_rc.blocks.block import Block
 from lathe_rc.cell.beside import RERUN_RATE
-from lathe_rc.cell.block import Block
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops
 from lathe_rc.messages import START_NS

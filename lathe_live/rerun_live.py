@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from lathe_live.live_runs import LiveRuns, RunView, ShownRun
 from lathe_live.rerun_part import Outlook
 from lathe_live.rerun_scene import Scene
-from lathe_rc.cell.block import Block
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.judge.loops import loops
 from lathe_rc.messages import Signals
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from lathe_live.rerun_signals import drawn_fields
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Samples, Signals, full
 
 _AHEAD = 4  # number of chunks that wait for late topics

@@ -22,9 +22,9 @@ from lathe_live.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
 from lathe_live.rerun_revolutions import HIGHEST, Revolution, Revolutions
 from lathe_live.rerun_signals import CYCLES, STATE_COLOURS, STATES, curve_path, curves, extreme_samples, supervisor
 from lathe_rc import event_log, messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.judge.loops import Loop, watches
 from lathe_rc.messages import Samples, Signals, full

@@ -9,7 +9,7 @@ import numpy as np
 
 from lathe_rc.analysis.tolerance import LAST, judge
 from lathe_rc.arrays import Array
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 

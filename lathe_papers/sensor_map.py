@@ -21,9 +21,9 @@ from rich.table import Table as RichTable
 from lathe_papers import cells
 from lathe_rc import messages
 from lathe_rc.arrays import Array
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import Value, Values, parameter
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 from lathe_rc.stages.learning.learner import Learner

@@ -9,6 +9,8 @@ from lathe_export.tables.export import export_bag as export_bag
 from lathe_rc import messages as messages
 from lathe_rc import study as study
 from lathe_rc.bag.reader import read_bag as read_bag
+from lathe_rc.blocks.ports import Input as Input
+from lathe_rc.blocks.ports import Output as Output
 from lathe_rc.cell.batch import run_many as run_many
 from lathe_rc.cell.parameters import NodeParameters as NodeParameters
 from lathe_rc.cell.parameters import parameter as parameter
@@ -16,8 +18,6 @@ from lathe_rc.cell.recording import Recording as Recording
 from lathe_rc.cell.scenario import Scenario as Scenario
 from lathe_rc.cell.scenario import load as load
 from lathe_rc.cell.stage import DONE as DONE
-from lathe_rc.cell.stage import Input as Input
-from lathe_rc.cell.stage import Output as Output
 from lathe_rc.cell.stage import Stage as Stage
 from lathe_rc.errors import InputError as InputError
 from lathe_rc.errors import LatheError as LatheError

@@ -4,9 +4,9 @@
 from dataclasses import dataclass, field
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FAULT, FREE, LIMITED, REPAIR
 from lathe_rc.cell.recording import Recording
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.safety.state_machine import Reaction, State
 
 _STATES, _REACTIONS = {int(s): s.name.lower() for s in State}, {int(r): r.name.lower() for r in Reaction}

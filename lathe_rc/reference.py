@@ -8,12 +8,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Input, signal_depth
 from lathe_rc.cell.beside import BESIDE
-from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS, signal_depth
+from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS
 from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.stage import Input, Stage
+from lathe_rc.cell.stage import Stage
 
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 _WHEN = {
@@ -45,8 +46,8 @@ Topic names are relative to the node's namespace and can be remapped. A unit of 
 read-only while a node is configured, but those that its section names; what changes samples is an event.
 
 Signal topics (inputs and outputs below) are offered and requested as reliable, keep last, transient local, with a
-depth of {signal_depth(SharedParameters())} at the default `window`; a topic named in `volatile_inputs` is requested
-as volatile. Every node is a lifecycle node with the standard parameter and lifecycle services."""
+depth of {signal_depth(SharedParameters().window)} at the default `window`; a topic named in `volatile_inputs` is
+requested as volatile. Every node is a lifecycle node with the standard parameter and lifecycle services."""
 
 
 def _allowed(row: Row) -> str:

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 
 from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness, messages
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import TABLES, Scenario, load
-from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell, Unknown
 
 Values = Mapping[str, Any]

@@ -36,12 +36,12 @@ from lathe_rc.bag.reading import seal
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.writing.writer import BagWriter
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.cell import scenario
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario, new_stage
-from lathe_rc.cell.wire import Encoder
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.stage import Input
-from lathe_rc.cell.wire import Encoder
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import Input
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import (
     Announcement,

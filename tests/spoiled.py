@@ -122,7 +122,7 @@ def no_block(message):
 
 def spoil_encoder(source: str, kind: str, sample: int) -> None:
     """Spoil the first block that holds a sample, of those that a node of this process publishes."""
-    from lathe_rc.cell.wire import Encoder
+    from lathe_rc.blocks.wire import Encoder
 
     encode = Encoder.encode
     waits = True

@@ -18,7 +18,7 @@ from test_lifecycle import Manager
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
-from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
@@ -72,7 +72,7 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
     watched = {"error_limit": 1e-12, "error_after": 0.0, "error_reaction": "warn"}
     cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0}, supervisor=watched)
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
-    full = 2 * signal_depth(cell.shared) * cell.shared.block_size  # more samples than a queue holds
+    full = 2 * signal_depth(cell.shared.window) * cell.shared.block_size  # more samples than a queue holds
     manager, heard = Manager(ghost), {}
     deaf, blocks = [sys.executable, "-c", DEAF], []
     ear = ghost.create_subscription(ToolBlock, "/tool", blocks.append, 10)

@@ -15,11 +15,12 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from lathe_rc import harness
+from lathe_rc.blocks.ports import Output
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import new_stage
-from lathe_rc.cell.stage import Output, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.stage_cache import Start, UnknownPartError
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError

@@ -14,8 +14,8 @@ from shown_page import ShownPage
 
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import judge
+from lathe_rc.drawing.charts import Charts
 from lathe_rc.view import compare_figures as figures
-from lathe_rc.view.charts import Charts
 from lathe_rc.view.report_gather import gather
 
 

@@ -16,8 +16,8 @@ from lathe_export.tables import export as exporting
 from lathe_export.tables.formats import FORMATS
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.cell.columns import columns, dense_rows, units
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.columns import columns, dense_rows, units
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.errors import InputError, LatheError
 
 EVENT = {"learning_controller": {"events": ["revolution 2: freeze"]}}

@@ -11,7 +11,7 @@ from cells import form_error, scenario
 
 from lathe_rc import harness
 from lathe_rc.bag import reader
-from lathe_rc.cell.columns import columns
+from lathe_rc.blocks.columns import columns
 from lathe_rc.errors import InputError
 
 AT = 9000  # sample of the event, in the third revolution

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import harness
-from lathe_rc.cell.latency_histogram import Lateness, Percentiles
+from lathe_rc.blocks.latency_histogram import Lateness, Percentiles
 from lathe_rc.commands import outcome
 from lathe_rc.errors import InputError, PaceError
 

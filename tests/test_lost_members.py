@@ -17,8 +17,8 @@ from lathe_rc.bag.loss import HELD, SOUND, loss_of
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import SNAPSHOT
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder, Encoder
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.judge.loops import Loop, watches

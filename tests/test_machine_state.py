@@ -18,8 +18,8 @@ from sensor_msgs.msg import JointState
 
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
+from lathe_rc.blocks.block import Block
 from lathe_rc.cell.beside import MachineStateParameters
-from lathe_rc.cell.block import Block
 from lathe_rc.nodes.machine_state import MachineState
 from lathe_rc.view.machine_state import BED, EDGE, JOINTS, Force, Joints, Machine, source
 

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader
 from lathe_rc import messages
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
-from lathe_rc.cell.wire import Decoder, Encoder
+from lathe_rc.blocks.wire import Decoder, Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS
 

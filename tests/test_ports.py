@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import messages
-from lathe_rc.cell.delay_buffer import DelayBuffer
-from lathe_rc.cell.wire import Encoder
+from lathe_rc.blocks.delay_buffer import DelayBuffer
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.protocol import BadBlock, ForeignMessage

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.program import Program, Tapes, wired
-from lathe_rc.cell.stage import NEVER, Input, Output, Sparse, Stage
+from lathe_rc.cell.stage import NEVER, Stage
 from lathe_rc.compiled.step import CompiledStep
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel

@@ -37,7 +37,7 @@ from lathe_rc.bag.check import check, recorded, write_digests
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.repairing.recover import recover
-from lathe_rc.cell.wire import Encoder
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 
 PLUGINS = pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

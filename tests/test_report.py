@@ -21,14 +21,14 @@ from lathe_rc import __version__, harness, messages, resources
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
-from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
+from lathe_rc.blocks.latency_histogram import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.report import report
+from lathe_rc.drawing import charts
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.judge.budget import changing
-from lathe_rc.view import charts
 from lathe_rc.view import report as reporting
 from lathe_rc.view.report_figures import against_time, colour_range, spectrum_range, timing
 from lathe_rc.view.report_form import Form, Revolution

@@ -16,8 +16,8 @@ from lathe_rc_msgs.srv import Schedule
 from lathe_rc import data_file, harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check as check_bag
+from lathe_rc.blocks.delay_buffer import DelayBuffer, longest_delays
 from lathe_rc.cell.changes import Restoring, changes
-from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays
 from lathe_rc.cell.scenario import load, new_stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_rc import event_log, harness, messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.kinds import STAGES
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError

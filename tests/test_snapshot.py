@@ -27,11 +27,11 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.snapshot import SNAPSHOT, first_sample
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
-from lathe_rc.cell.block import Framer
+from lathe_rc.blocks.block import Framer
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Encoder
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Encoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import START_NS
 from lathe_rc.nodes.recorder_role import RecorderRole

@@ -23,8 +23,8 @@ from lathe_explore.sweep.page_data import PageData
 from lathe_explore.sweep.space import Space
 from lathe_rc import cli, resources
 from lathe_rc.cell import scenario
+from lathe_rc.drawing import charts
 from lathe_rc.errors import LatheError
-from lathe_rc.view import charts
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"
 DAMPING, LAW = "electrodynamic_actuator.damping", "learning_controller.lead_law"

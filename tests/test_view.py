@@ -26,8 +26,8 @@ from lathe_live.rerun_signals import extreme_samples  # noqa: E402
 from lathe_rc import harness, messages, resources  # noqa: E402
 from lathe_rc.analysis import metrology  # noqa: E402
 from lathe_rc.bag import reader  # noqa: E402
+from lathe_rc.blocks.ports import Sparse  # noqa: E402
 from lathe_rc.cell.scenario import load  # noqa: E402
-from lathe_rc.cell.stage import Sparse  # noqa: E402
 from lathe_rc.errors import LatheError  # noqa: E402
 from lathe_rc.event_log import Conditions  # noqa: E402
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lathe_rc import messages
-from lathe_rc.cell.wire import Decoder, Encoder, NoBlockError
+from lathe_rc.blocks.wire import Decoder, Encoder, NoBlockError
 
 types = st.sampled_from(sorted(messages.block_types()))
 lengths = st.one_of(st.integers(1, 70), st.just(messages.MAX_BLOCK))

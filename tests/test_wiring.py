@@ -7,9 +7,10 @@ import pytest
 from cells import NODES, announced, run, scenario
 
 from lathe_rc import allowed_code, harness, messages
+from lathe_rc.blocks.ports import Input, Output
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import load
-from lathe_rc.cell.stage import Input, Output, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell, Unknown
 from lathe_rc.errors import InputError
 

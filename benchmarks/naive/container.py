@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-from lathe_rc.cell.latency_histogram import Durations
+from lathe_rc.blocks.latency_histogram import Durations
 from lathe_rc.nodes import container, process
 from lathe_rc.protocol import pace, time_master
 

@@ -16,10 +16,10 @@ from rclpy.subscription import Subscription
 from lathe_bagtools.publication_order import Continuity, PublicationOrder, Recorded
 from lathe_rc import messages
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, BagWriter
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.beside import TOPIC_RECORDER as KIND
 from lathe_rc.cell.beside import TopicRecorderParameters
 from lathe_rc.cell.recorder import RecorderParameters
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LossyRunError, shown
 from lathe_rc.nodes import publisher_info, standalone_node
 from lathe_rc.nodes.graph import unfit

@@ -13,9 +13,10 @@ from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import SampleReader, first_of
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import DONE, Fields, Reached, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError

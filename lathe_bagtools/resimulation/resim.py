@@ -28,6 +28,7 @@ from lathe_rc.bag.reading.stream import From, feed, first_of
 from lathe_rc.bag.snapshot import GONE_ON, span_of
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.checkpoint import START_FROM
@@ -36,7 +37,6 @@ from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.judge.part import ErrorsByRevolution

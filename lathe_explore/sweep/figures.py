@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lathe_explore.sweep.effects import Axis, Bins, Effect, Index, Samples, Yield, is_wide
-from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
+from lathe_rc.drawing.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 
 GOOD_TO_BAD = ("#2f7fd0", "#9460b4", "#cf5a3c", "#d99a1b")  #: visible on white and on black
 _LINE = "#2f8fae"

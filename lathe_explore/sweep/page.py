@@ -24,8 +24,8 @@ from lathe_explore.sweep.outcomes import outcomes
 from lathe_explore.sweep.page_data import PageData, text_of
 from lathe_explore.sweep.parallel import parallel
 from lathe_rc import __version__, files
+from lathe_rc.drawing.charts import Charts, page_template
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.view.charts import Charts, page_template
 
 PAGE, FIGURES = "page.html", "figures"
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lathe_explore.sweep.effects import Axis, Samples
 from lathe_explore.sweep.figures import GOOD_TO_BAD, Goal, said
-from lathe_rc.view.charts import Column, Rows, Spec, number, rows
+from lathe_rc.drawing.charts import Column, Rows, Spec, number, rows
 
 _GAP = 74  # [px] from axis to axis
 _SIDE = 26  # [px] beside the axes, for the labels at their ends

@@ -41,12 +41,12 @@ from numpy.typing import NDArray
 from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
 from lathe_rc.analysis.tolerance import judge
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
 from lathe_rc.cell.events import LIMITED, OUT_OF_REACH
 from lathe_rc.cell.parameters import Value, form_doubt, judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.extensions import attribute

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from lathe_export.c_library.memory_image import MemoryImage
 from lathe_export.c_library.object_code import temporary_arrays
 from lathe_rc import messages
-from lathe_rc.cell.columns import units
+from lathe_rc.blocks.columns import units
 from lathe_rc.cell.events import SET
 from lathe_rc.cell.parameters import Row, explain_overflow, remapped
 from lathe_rc.cell.stage import Stage

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_export.c_library.library import LEARN, Library, Signal
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.engine import Engine
-from lathe_rc.cell.stage import Sparse, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 

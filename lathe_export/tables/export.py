@@ -16,8 +16,8 @@ from lathe_export.tables.message_rows import is_known
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import BagHeader, feed, first_of
-from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.columns import Column, columns, dense_rows, sparse_rows
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.names import instead

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.blocks.columns import TEXT, Column
 from lathe_rc.cell.frames import arrow_schema
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples

@@ -10,7 +10,7 @@ from rosbags.interfaces import Nodetype
 from lathe_export.tables.formats import Format
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.blocks.columns import TEXT, Column
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
 

@@ -37,7 +37,7 @@ def loop(
     from lathe_live.varied_loop import VariedLoop
     from lathe_rc import files
     from lathe_rc.commands import scenario as scenarios
-    from lathe_rc.view.pages import check_page, write_page
+    from lathe_rc.drawing.pages import check_page, write_page
 
     loaded = scenarios.load(scenario, overrides)
     place = output or Path(f"{loaded.name}-loop.yaml")

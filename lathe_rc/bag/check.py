@@ -16,9 +16,9 @@ from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
 from lathe_rc.bag.reading.source import Source, files_of
 from lathe_rc.bag.snapshot import first_sample, span_of
-from lathe_rc.cell.block import Block
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.recording import Digester, SparseTopic
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness

@@ -10,8 +10,8 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.recording import Recording, SparseTopic
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Samples, Signals
 

@@ -20,12 +20,12 @@ from functools import partial
 from typing import Any, Generic, Protocol, TypeVar, overload
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import Soundness
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError

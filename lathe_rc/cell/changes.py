@@ -23,7 +23,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lathe_rc.cell.parameters import Table
-from lathe_rc.control.q_filter import QFilter
 from lathe_rc.errors import LatheError
 from lathe_rc.extensions import is_ours
 
@@ -58,8 +57,7 @@ def _is_frozen(part: Any) -> bool:
     """Return whether an object never changes, although parts of it may."""
     params = getattr(type(part), "__dataclass_params__", None)
     is_read_only = isinstance(part, np.ndarray) and not part.flags.writeable
-    # A Q filter has no state; stages with equal parameters share it.
-    return bool(params and params.frozen) or is_read_only or isinstance(part, QFilter)
+    return bool(params and params.frozen) or is_read_only or getattr(type(part), "stateless", False)
 
 
 def _attributes(part: Any) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Framer
+from lathe_rc.blocks.block import Framer
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.recording import Recording, SparseTopic
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals

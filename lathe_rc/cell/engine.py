@@ -9,11 +9,12 @@ from typing import NoReturn, Protocol, TypeVar
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import NotFiniteError, check_finite
-from lathe_rc.cell.delay_buffer import longest_delays
+from lathe_rc.blocks.block import NotFiniteError, check_finite
+from lathe_rc.blocks.delay_buffer import longest_delays
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.program import Program, Tapes, chunk_of, wired
-from lathe_rc.cell.stage import Sparse, compile_kernels
+from lathe_rc.cell.stage import compile_kernels
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError
 from lathe_rc.jit import check_compiler

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lathe_rc.cell.columns import TEXT, Column
+from lathe_rc.blocks.columns import TEXT, Column
 from lathe_rc.messages import Samples
 
 _SPINDLE = (Column("revolution", np.dtype(np.int64)), Column("spindle_angle", np.dtype(np.float64), "rad"))

@@ -1,22 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS topics of a cell other than signals, and the queue depth of signal topics."""
+"""ROS topics of a cell other than signals."""
 
 from typing import NamedTuple
 
 from lathe_rc.cell.kinds import MASTERS, STAGES
-from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.messages import PACKAGE
-
-_SPARE, _FREE_RUNNING = 32, 2080  # messages
-
-
-def signal_depth(shared: SharedParameters) -> int:
-    """Return the queue length of signal topics: all blocks in flight plus a reserve; large without flow control.
-
-    A publisher may be one window ahead, and a reader that replaces a dead one starts two windows back.
-    """
-    return 3 * shared.window + _SPARE if shared.window else _FREE_RUNNING
 
 
 class HostTopic(NamedTuple):

@@ -12,9 +12,10 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.arrays import Integers
-from lathe_rc.cell.delay_buffer import past_of
+from lathe_rc.blocks.delay_buffer import past_of
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import remapped
-from lathe_rc.cell.stage import DONE, PYTHON, Sparse, Stage
+from lathe_rc.cell.stage import DONE, PYTHON, Stage
 from lathe_rc.compiled.step import BROKEN, AddressTable, broken
 from lathe_rc.compiled.struct_view import address, call, floats
 from lathe_rc.jit import kernel

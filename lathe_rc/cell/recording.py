@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.columns import Column, columns, dense_rows, sparse_rows
+from lathe_rc.blocks.columns import Column, columns, dense_rows, sparse_rows
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import Soundness
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
 from lathe_rc.messages import START_NS, Samples, Signals, full, signals_of

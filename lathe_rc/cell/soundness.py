@@ -8,8 +8,8 @@ is cut as the true signals say. A result ends for good at its first fault: contr
 from collections.abc import Collection, Mapping, Sequence
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FAULT
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 from lathe_rc.safety.faults import KINDS

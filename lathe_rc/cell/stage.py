@@ -17,12 +17,12 @@ one if there are none, and outputs are the arrays of all fields of all output po
 from abc import ABC
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import CLOCK, Input, Joint, Output, Sparse
 from lathe_rc.cell import events, ros_yaml
 from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import NodeParameters, about, remapped
@@ -36,56 +36,6 @@ from lathe_rc.safety import faults
 from lathe_rc.safety.faults import Fault
 from lathe_rc.safety.injection import Injection, Port
 from lathe_rc.signals.noise import NormalStream, Sensor
-
-
-@dataclass(frozen=True)
-class Input:
-    """Input port of a stage: the samples that the stage reads from a topic.
-
-    Attributes:
-        topic: relative name, before remapping.
-        type: message type.
-        fields: fields that the stage reads.
-        delay: 0 for a forward edge: block k is complete before the stage computes block k. Otherwise a feedback
-            edge: at sample n the stage sees sample n - delay, and zeros before sample ``delay``.
-    """
-
-    topic: str
-    type: str
-    fields: tuple[str, ...]
-    delay: int = 0
-
-
-#: input of a stage that does not use the angle itself: the spindle's blocks determine which samples are due
-CLOCK = Input("encoder", messages.ENCODER, ("angle",))
-
-
-class Joint(NamedTuple):
-    """Selection of the fields of an output that form a decimated sensor_msgs/JointState."""
-
-    position: str
-    velocity: str | None = None
-    effort: str | None = None
-
-
-@dataclass(frozen=True)
-class Output:
-    """Output port of a stage: a topic with one block per input block."""
-
-    topic: str
-    type: str
-    joint: Joint | None = None
-
-
-@dataclass(slots=True)
-class Sparse:
-    """Message at a chosen sample, instead of one per block."""
-
-    topic: str
-    type: str
-    index: int
-    values: dict[str, Any] = field(compare=False)
-
 
 Fields = tuple[Samples, ...]  #: arrays of a step, each of shape (n,)
 Reached = tuple[int, int]  #: sample of the block that a step has reached, and why it has stopped

@@ -11,11 +11,12 @@ from functools import cached_property, lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING, NamedTuple
 
+from lathe_rc.blocks.ports import Input, Output
 from lathe_rc.cell.checkpoint import Checkpoint, begun_of
 from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
 from lathe_rc.cell.scenario import kind_of, new_stage
-from lathe_rc.cell.stage import Input, Output, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
 

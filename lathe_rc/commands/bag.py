@@ -17,11 +17,11 @@ from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.limits import SIMULATED
 from lathe_rc.bag.reading.source import Source, files_of, name_of
-from lathe_rc.bag.reading.tachogram import make as make_tachogram
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
 from lathe_rc.commands import lossy, options, tables
+from lathe_rc.commands.tachogram import make as make_tachogram
 from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
 from lathe_rc.judge import part
 from lathe_rc.names import instead

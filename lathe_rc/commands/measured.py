@@ -47,7 +47,7 @@ def opened(path: Path, given: Sequence[str]) -> Measurement:
     mapping = measurement_file.parse_mapping(given)
     if is_bag(path):
         lossy.tell([path])
-        from lathe_rc.bag.reading import bag_columns
+        from lathe_rc.commands import bag_columns
 
         return bag_columns.measurement(path, mapping)
     return measurement_file.read(path, mapping)

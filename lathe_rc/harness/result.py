@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
-from lathe_rc.cell.latency_histogram import Lateness
+from lathe_rc.blocks.latency_histogram import Lateness
 from lathe_rc.cell.parameters import judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario

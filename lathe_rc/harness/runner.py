@@ -15,13 +15,13 @@ from pathlib import Path
 from types import MappingProxyType
 
 from lathe_rc import messages, process_launcher
+from lathe_rc.blocks.latency_histogram import Lateness
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import checkpoint
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.latency_histogram import Lateness
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder

@@ -10,10 +10,10 @@ from lathe_rc import messages
 from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch, models
 from lathe_rc.cell.parameters import NodeParameters, Value, Values
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.causes import EVERYWHERE, ORDER, PREFIXES

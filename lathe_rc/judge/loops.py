@@ -9,10 +9,10 @@ from typing import Any
 from lathe_rc import messages
 from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, Step
 from lathe_rc.analysis.tolerance import FORCE, LAST, POSITION, Growth, Quantity, Verdict, judge, swing_growth
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.soundness import Soundness, fields_of
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.messages import Signals, full
 from lathe_rc.signals.form_errors import turns_before
 

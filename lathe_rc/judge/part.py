@@ -11,12 +11,12 @@ from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import Soundness
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
 from lathe_rc.signals.form_errors import RunningErrors, that_count, turns_before

@@ -29,8 +29,8 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.cell.checkpoint import START_FROM, Checkpoint, begun_of
-from lathe_rc.cell.host_topics import signal_depth
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value, remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -619,7 +619,7 @@ class CellNode(LifecycleNode):
             if (sender := self._senders.get(publisher)) is not None:
                 named(data, sender)
                 return
-            most = _MOST_DEFERRED * signal_depth(self.table)
+            most = _MOST_DEFERRED * signal_depth(self.table.window)
             waiting = self._nameless.setdefault((full, publisher), deque(maxlen=most))
             waiting.append((named, data, time.monotonic()))
             self._name(full, publisher)
@@ -653,7 +653,7 @@ class CellNode(LifecycleNode):
                 callback(*message)
             elif self.protocol.active or self.table.window:
                 self._deferred.append((callback, message))
-                if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table) * (len(self.inlets) + 1):
+                if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table.window) * (len(self.inlets) + 1):
                     if self.protocol.ready:
                         raise LatheError(f"{self.full_name}: {len(self._deferred)} messages wait until it is active")
                     self._deferred.popleft()  # a flood of foreign messages

@@ -14,9 +14,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from lathe_rc import messages
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.beside import MACHINE_STATE as KIND
 from lathe_rc.cell.beside import MachineStateParameters
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import standalone_node
 from lathe_rc.nodes.ports import overhear, taken

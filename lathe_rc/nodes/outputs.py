@@ -5,9 +5,10 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Framer, Pool
-from lathe_rc.cell.stage import Sparse, Stage
-from lathe_rc.cell.wire import Encoder
+from lathe_rc.blocks.block import Framer, Pool
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Encoder
+from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.cell_node import CellNode

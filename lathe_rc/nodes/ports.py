@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 
 from lathe_rc import messages
-from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.cell.parameters import NodeParameters
 
 
@@ -50,7 +50,7 @@ def signal_qos(parameters: NodeParameters, topic: str = "") -> QoSProfile:
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_ALL if topic and parameters.window else HistoryPolicy.KEEP_LAST,
-        depth=signal_depth(parameters),
+        depth=signal_depth(parameters.window),
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE
         if topic in parameters.volatile_inputs

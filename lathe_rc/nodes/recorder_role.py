@@ -19,13 +19,14 @@ from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Durability, Output, offered_qos
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.host_topics import HOST_TOPICS, signal_depth
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import signal_depth
+from lathe_rc.blocks.wire import Decoder, Encoder
+from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.wire import Decoder, Encoder
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.nodes import publisher_info
 from lathe_rc.nodes.cell_node import CellNode, Role
@@ -61,7 +62,7 @@ class RecorderRole(Role):
                 place, self.table, name=node.get_name(), namespace=namespace, told=self._tell_snapshot
             )
         self._writer: Output | None = bag_of(self._path, self.table, self._snapshots)
-        self._depth = signal_depth(self.table)
+        self._depth = signal_depth(self.table.window)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
         self._processes: dict[str, int] = {}  # process number of the members that can be restarted

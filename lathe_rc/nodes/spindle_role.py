@@ -13,8 +13,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lathe_rc import messages
+from lathe_rc.blocks.latency_histogram import LATENCY, LATENESS, PERCENT
 from lathe_rc.cell.kinds import MASTERS
-from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, PERCENT
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell

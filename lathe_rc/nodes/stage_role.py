@@ -8,12 +8,13 @@ import numpy as np
 from lathe_rc_msgs.srv import Schedule
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import events
 from lathe_rc.cell.ahead import uncompiled
 from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import Value, explain_overflow
-from lathe_rc.cell.stage import Sparse, Stage, compile_kernels
+from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError, LossyRunError
 from lathe_rc.messages import Signals

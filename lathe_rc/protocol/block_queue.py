@@ -4,20 +4,22 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import astuple, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.host_topics import signal_depth
-from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.wire import Decoder, NoBlockError
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import signal_depth
+from lathe_rc.blocks.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.protocol.block_order import BlockOrder
 from lathe_rc.protocol.exchange import Run
 from lathe_rc.protocol.messages import ForeignMessage
+
+if TYPE_CHECKING:
+    from lathe_rc.cell.parameters import NodeParameters
 
 _QUIET = 1.0  # [s] after which the last blocks of a device that loses blocks count as lost
 
@@ -37,8 +39,8 @@ class BlockQueue(BlockOrder):
         run_end: returns the end of the run [sample]; None while it is not known.
     """
 
-    def __init__(self, topic: str, msgtype: str, parameters: NodeParameters, fields: list[str]) -> None:
-        self._limit, self._size = 8 * signal_depth(parameters), parameters.block_size
+    def __init__(self, topic: str, msgtype: str, parameters: "NodeParameters", fields: list[str]) -> None:
+        self._limit, self._size = 8 * signal_depth(parameters.window), parameters.block_size
         super().__init__(topic, parameters.run_id, None if parameters.window else self._limit * self._size)
         self.type, self.lossy = msgtype, not parameters.window and topic in parameters.volatile_inputs
         self._quiet = (0, 0.0)  # end of the newest block, and the monotonic time at which it was first seen

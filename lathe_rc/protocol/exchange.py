@@ -9,10 +9,12 @@ are passed on as one `Run`.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.wiring import Cell
+from lathe_rc.blocks.block import Block
+
+if TYPE_CHECKING:
+    from lathe_rc.cell.wiring import Cell
 
 
 class Run(NamedTuple):
@@ -51,7 +53,7 @@ class Exchange:
         waited: time for which nodes of this process have waited in vain for acknowledgements [s].
     """
 
-    def __init__(self, form: Callable[[Any, Cell | None], None] = lambda _role, _cell: None) -> None:
+    def __init__(self, form: Callable[[Any, "Cell | None"], None] = lambda _role, _cell: None) -> None:
         self.form = form
         self.master: Callable[[Any], None] | None = None
         self.stages: list[Any] = []

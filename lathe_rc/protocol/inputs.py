@@ -3,14 +3,17 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from lathe_rc import messages
-from lathe_rc.cell.delay_buffer import DelayBuffer, longest_delays, past_of
-from lathe_rc.cell.parameters import NodeParameters
-from lathe_rc.cell.stage import Input
+from lathe_rc.blocks.delay_buffer import DelayBuffer, longest_delays, past_of
+from lathe_rc.blocks.ports import Input
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.protocol.block_queue import BlockQueue
+
+if TYPE_CHECKING:
+    from lathe_rc.cell.parameters import NodeParameters
 
 
 class Inputs:
@@ -28,7 +31,7 @@ class Inputs:
         pace: blocks of the time master that limit the stage if no input does; None: they do not.
     """
 
-    def __init__(self, ports: Sequence[tuple[str, Input]], parameters: NodeParameters, together: int) -> None:
+    def __init__(self, ports: Sequence[tuple[str, Input]], parameters: "NodeParameters", together: int) -> None:
         self.ports = ports
         self._parameters, self._size, self._window = parameters, parameters.block_size, parameters.window
         self.queues: dict[str, BlockQueue] = {}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pace of a run against wall time: the due time of each block, and its lateness."""
 
-from lathe_rc.cell.latency_histogram import PERCENT, Durations, Lateness, Percentiles
+from lathe_rc.blocks.latency_histogram import PERCENT, Durations, Lateness, Percentiles
 
 
 class Pace:

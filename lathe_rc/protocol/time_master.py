@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from lathe_rc.cell.latency_histogram import Durations
+from lathe_rc.blocks.latency_histogram import Durations
 from lathe_rc.errors import LatheError
 from lathe_rc.protocol import actions as do
 from lathe_rc.protocol.member import (

@@ -13,9 +13,10 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.arrays import Array, Integers
-from lathe_rc.cell.columns import units
+from lathe_rc.blocks.columns import units
+from lathe_rc.blocks.ports import CLOCK, Input, Joint, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, about, parameter
-from lathe_rc.cell.stage import CLOCK, DONE, Fields, Input, Joint, Output, Reached, Sparse, Stage, WiredCell
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell
 from lathe_rc.compiled.c_function import c_status
 from lathe_rc.compiled.step import CompiledStep
 from lathe_rc.errors import InputError, LatheError, shown

@@ -11,8 +11,9 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import Integers
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter, remapped
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell, cut
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell, cut
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import __version__
+from lathe_rc.drawing.charts import Charts, page_template
+from lathe_rc.drawing.pages import Grid, check_page, grid, printable, write_page
 from lathe_rc.errors import InputError
 from lathe_rc.judge.loops import FIGURES
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view import report_figures
-from lathe_rc.view.charts import Charts, page_template
-from lathe_rc.view.pages import Grid, check_page, grid, printable, write_page
 from lathe_rc.view.report import SIGNALS, losses
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_gather import Gathered, gather

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_rc.drawing.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.judge.loops import LoopResult
 from lathe_rc.messages import Samples
-from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.view.report_figures import LEGEND, colour_range, diverging, rectangles, um
 from lathe_rc.view.report_form import Form
 from lathe_rc.view.report_series import Envelope

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Block
+from lathe_rc.blocks.block import Block
 
 JOINTS = ("spindle", "z", "x", "tool")  #: names in the order of `Joints`
 BED, EDGE = "bed", "edge"  #: frames of the joints' root and of the force

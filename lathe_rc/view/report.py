@@ -18,14 +18,14 @@ from lathe_rc.analysis.metrology import Lay
 from lathe_rc.bag.provenance import FILE, ORIGINS, SCENARIO, VERSIONS, origin, origins, scenario_of
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.drawing.charts import Charts, page_template
+from lathe_rc.drawing.pages import MOST_ROWS, Grid, check_page, grid, printable, shown, write_page
 from lathe_rc.errors import LatheError
 from lathe_rc.judge.budget import budget
 from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
 from lathe_rc.judge.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view import report_loop
-from lathe_rc.view.charts import Charts, page_template
-from lathe_rc.view.pages import MOST_ROWS, Grid, check_page, grid, printable, shown, write_page
 from lathe_rc.view.report_form import CUTOFF, Form
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope

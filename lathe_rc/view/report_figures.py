@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import Lay
+from lathe_rc.drawing.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.judge.loops import LoopResult
 from lathe_rc.messages import Samples
-from lathe_rc.view.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host

@@ -12,8 +12,8 @@ import numpy as np
 
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
 from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import Soundness
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.messages import Samples, Signals

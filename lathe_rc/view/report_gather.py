@@ -15,10 +15,10 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import Feeder, first_of
 from lathe_rc.bag.snapshot import span_of
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.event_log import LOGGED, LogEntry
 from lathe_rc.judge import part

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lathe_rc import messages
-from lathe_rc.cell.latency_histogram import LATENCY, LATENESS, Durations
+from lathe_rc.blocks.latency_histogram import LATENCY, LATENESS, Durations
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TYPES = frozenset({DIAGNOSTICS, messages.CELL_STATE})

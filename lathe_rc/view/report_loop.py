@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from lathe_rc.drawing.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.judge.loop_curves import LEAST, LoopCurve
-from lathe_rc.view.charts import Rows, Spec, axis_scale, quantity, rows, tip
 from lathe_rc.view.report_figures import BOX, FIRST, LAST, colours, figure
 
 _SQUARE = 460  # [px] size of the locus

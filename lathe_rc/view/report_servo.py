@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.errors import InputError
 from lathe_rc.judge.loops import LoopResult, LoopWatch
 from lathe_rc.messages import Signals

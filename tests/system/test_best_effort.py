@@ -15,7 +15,7 @@ TOPIC = "/coarse/state"
 DEVICE = f"""
 from rclpy.qos import qos_profile_sensor_data
 from lathe_rc import messages
-from lathe_rc.cell.wire import Decoder
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.nodes import outputs
 
 

@@ -11,8 +11,8 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import check_next
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import refuse_faults
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples, Signals
 

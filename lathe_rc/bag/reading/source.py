@@ -32,8 +32,8 @@ from lathe_rc.bag.reading.sealed_metadata import compare
 from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.wire import Decoder
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import START_NS, block_types
 

@@ -15,10 +15,10 @@ from lathe_rc.bag.loss import Loss
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.snapshot import span_of
-from lathe_rc.cell.block import Block
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.ports import Sparse
+from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.engine import Sink
-from lathe_rc.cell.stage import Sparse
-from lathe_rc.cell.wire import Decoder
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Signals
 

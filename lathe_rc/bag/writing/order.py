@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lathe_rc.bag.writing.rows import Dense, Plan, RowBuffer
 from lathe_rc.bag.writing.writer import Output
-from lathe_rc.cell.block import Block
+from lathe_rc.blocks.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 

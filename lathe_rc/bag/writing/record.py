@@ -12,11 +12,10 @@ from lathe_rc.bag.snapshot import GONE_ON
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
-from lathe_rc.cell.block import Framer
-from lathe_rc.cell.host_topics import signal_depth
+from lathe_rc.blocks.block import Framer
+from lathe_rc.blocks.ports import Sparse, signal_depth
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 
@@ -95,7 +94,7 @@ class OfflineRecorder:
         self._cell, self._samples, self._writer = cell, samples, writer
         self._block, self._step_ns = shared.block_size, shared.step_ns
         self._framers = {name: Framer(shared.run_id, f"/{name}", shared.step_ns) for name in cell.stages}
-        qos = offered_qos(signal_depth(shared), "transient_local")
+        qos = offered_qos(signal_depth(shared.window), "transient_local")
         for topic, source in sorted({**cell.dense, **cell.sparse}.items()):
             writer.add_topic(f"/{topic}", source.type, qos)
 

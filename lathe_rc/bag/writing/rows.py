@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lathe_rc.bag.writing.mcap_file import TIMES, message_head
-from lathe_rc.cell.block import Block
-from lathe_rc.cell.wire import NUMBERS, Layout
+from lathe_rc.blocks.block import Block
+from lathe_rc.blocks.wire import NUMBERS, Layout
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000

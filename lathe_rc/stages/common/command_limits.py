@@ -5,9 +5,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, parameter
-from lathe_rc.cell.stage import Sparse
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limit, limiter
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

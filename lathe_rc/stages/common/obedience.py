@@ -9,9 +9,10 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.arrays import Array, Integers
+from lathe_rc.blocks.ports import Input, Sparse
 from lathe_rc.cell.events import OUT_OF_REACH
 from lathe_rc.cell.parameters import ObedientParameters, Positive, parameter
-from lathe_rc.cell.stage import Input, Sparse, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, take_over
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel

@@ -10,8 +10,9 @@ from annotated_types import Ge, Le, Lt
 from lathe_rc import messages
 from lathe_rc.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_rc.arrays import put, put_scaled, subtract
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals

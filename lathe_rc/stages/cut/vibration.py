@@ -9,8 +9,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import CLOCK, Joint, Output
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import CLOCK, DONE, Fields, Joint, Output, Reached, Stage
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from lathe_rc.analysis.learning import Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, Positive, parameter
-from lathe_rc.cell.stage import Sparse, Stage
+from lathe_rc.cell.stage import Stage
 from lathe_rc.control.bounded import Bounds, Mode, Takeover, TakeoverTable, follows, take_over
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

@@ -10,8 +10,9 @@ from pydantic import create_model
 
 from lathe_rc import messages
 from lathe_rc.arrays import put, put_scaled
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import CommandLimits, LimiterTable, limiter
 from lathe_rc.errors import InputError

@@ -11,8 +11,9 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel

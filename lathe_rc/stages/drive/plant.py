@@ -11,8 +11,9 @@ from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
 from lathe_rc.analysis.resonance_grid import NO_POLES
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.control.bounded import TakeoverTable
 from lathe_rc.control.limits import LimiterTable
 from lathe_rc.extensions import code_of_others

@@ -7,8 +7,9 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
+from lathe_rc.blocks.ports import Input, Output
 from lathe_rc.cell.parameters import NodeParameters, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Stage
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage
 from lathe_rc.control.decoupler import (
     LAG,
     LEAK,

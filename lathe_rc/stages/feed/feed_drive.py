@@ -10,9 +10,10 @@ from annotated_types import Ge, Le
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
+from lathe_rc.blocks.ports import Input, Joint, Output, Sparse
 from lathe_rc.cell.events import FREE, LIMITED, OUT_OF_REACH
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

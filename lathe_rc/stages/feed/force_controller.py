@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import CLOCK, Input, Output
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
-from lathe_rc.cell.stage import CLOCK, Fields, Input, Output, Reached
+from lathe_rc.cell.stage import Fields, Reached
 from lathe_rc.control.pid import FORCE, PidTable
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

@@ -9,8 +9,9 @@ from annotated_types import Gt, Le
 
 from lathe_rc import messages, resources
 from lathe_rc.arrays import Integers
+from lathe_rc.blocks.ports import CLOCK, Input, Output, Sparse
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import CLOCK, DONE, Fields, Input, Output, Reached, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.compiled.step import Step
 from lathe_rc.control import periodic
 from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicLaw, PeriodicState

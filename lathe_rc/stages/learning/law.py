@@ -10,8 +10,9 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
 from lathe_rc.arrays import Array, Complex, Integers
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.events import OUT_OF_REACH
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.extensions import code_of_others
 from lathe_rc.jit import inlined
 from lathe_rc.messages import Samples, Signals

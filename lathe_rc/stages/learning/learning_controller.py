@@ -14,9 +14,10 @@ from lathe_rc import messages
 from lathe_rc.analysis.learning import LearningLoop, Response, highest_waves
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.events import OUT_OF_REACH
 from lathe_rc.cell.parameters import Value, about
-from lathe_rc.cell.stage import Input, Output, Sparse, WiredCell
+from lathe_rc.cell.stage import WiredCell
 from lathe_rc.control import angle_memory, memory_file
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.identification import DriveIdentifier, Identified

@@ -9,8 +9,8 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages, resources
+from lathe_rc.blocks.ports import Joint, Output, Sparse
 from lathe_rc.cell.parameters import NonNegative, Positive, parameter
-from lathe_rc.cell.stage import Joint, Output, Sparse
 from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError, at_most
 from lathe_rc.messages import Samples, Signals

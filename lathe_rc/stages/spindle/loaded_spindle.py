@@ -9,9 +9,10 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Input, Sparse
 from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Reached, Sparse
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import STOPS, Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn

@@ -8,8 +8,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached
+from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.compiled.step import Step
 from lathe_rc.errors import InputError

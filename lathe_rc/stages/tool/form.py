@@ -11,8 +11,9 @@ from annotated_types import Ge, Le, Lt
 from lathe_rc import messages, resources
 from lathe_rc.analysis.tolerance import DOUBTED
 from lathe_rc.arrays import put
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Value, about, parameter
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel

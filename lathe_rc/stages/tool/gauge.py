@@ -26,8 +26,9 @@ from annotated_types import Ge, Gt, Le, Lt
 from lathe_rc import messages
 from lathe_rc.analysis.metrology import gaussian_share
 from lathe_rc.arrays import Integers, put
+from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, parameter, remapped
-from lathe_rc.cell.stage import DONE, Fields, Input, Output, Reached, Sparse, Stage, WiredCell
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell
 from lathe_rc.control.interpolation import read
 from lathe_rc.errors import InputError, LatheError, at_least, at_most
 from lathe_rc.jit import inlined, kernel

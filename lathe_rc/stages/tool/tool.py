@@ -9,9 +9,10 @@ from annotated_types import Ge, Le, MinLen
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
+from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import NonNegative, Value, parameter, remapped
-from lathe_rc.cell.stage import DONE, Fields, Input, Joint, Output, Reached, Stage, WiredCell
+from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples

@@ -7,7 +7,7 @@ from pathlib import Path
 from lathe_rc import messages
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.cell import columns
+from lathe_rc.blocks import columns
 from lathe_rc.messages import Samples
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Clock, Mapped, Measurement

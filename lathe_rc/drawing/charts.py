@@ -20,8 +20,8 @@ import numpy as np
 import vl_convert
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
+from lathe_rc.drawing.pages import own_file
 from lathe_rc.messages import Samples
-from lathe_rc.view.pages import own_file
 
 Spec = dict[str, Any]
 Rows = list[dict[str, Any]]

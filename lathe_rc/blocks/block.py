@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import MAX_BLOCK, START_NS, Samples, Signals
 
 _MOST_FIELDS = 16

@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from lathe_rc import messages
-from lathe_rc.cell.stage import Sparse
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
 
 TEXT = np.dtype(object)  #: element type of strings

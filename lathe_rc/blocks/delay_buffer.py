@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.stage import Input
+from lathe_rc.blocks.ports import Input
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples, Signals
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.cell.block import Block, is_finite
+from lathe_rc.blocks.block import Block, is_finite
 from lathe_rc.messages import START_NS, Samples, Signals
 
 _BILLION = 1_000_000_000
