@@ -53,11 +53,16 @@ def changes(now: Any, start: Any) -> Change | None:
     return _Comparison().change(now, start, "")
 
 
+def _is_stateless(part: Any) -> bool:
+    """Return whether stages with equal parameters share an object of this class."""
+    return getattr(type(part), "stateless", False) is True
+
+
 def _is_frozen(part: Any) -> bool:
     """Return whether an object never changes, although parts of it may."""
     params = getattr(type(part), "__dataclass_params__", None)
     is_read_only = isinstance(part, np.ndarray) and not part.flags.writeable
-    return bool(params and params.frozen) or is_read_only or getattr(type(part), "stateless", False)
+    return bool(params and params.frozen) or is_read_only or _is_stateless(part)
 
 
 def _attributes(part: Any) -> dict[str, Any]:
@@ -287,7 +292,7 @@ class Restoring:
         return fresh
 
     def _with_attributes(self, told: Mapping[str, Change], fresh: Any, start: Any, path: str) -> Any:
-        fresh = copy.deepcopy(fresh) if isinstance(fresh, QFilter) else fresh
+        fresh = copy.deepcopy(fresh) if _is_stateless(fresh) else fresh
         target = copy.copy(fresh) if _is_frozen(fresh) else fresh
         there, before = vars(fresh), vars(start)
         for name, change in told.items():

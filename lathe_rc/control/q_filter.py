@@ -47,8 +47,7 @@ class QFilter(ABC):
         InputError: the filter is wider than the cycle allows.
     """
 
-    stateless = True  # stages with equal parameters share it, and checkpoints need not compare it
-
+    stateless = True  #: stages with equal parameters share it, and no run changes it
     ratio = -1.0
 
     def __init__(self, reach: int, cycle: int) -> None:
