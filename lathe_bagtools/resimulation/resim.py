@@ -31,12 +31,12 @@ from lathe_rc.bag.writing.writer import refuse_existing
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.checkpoint import START_FROM
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
+from lathe_rc.cell.time_master import START_FROM
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, UnpublishedError
 from lathe_rc.judge.part import ErrorsByRevolution

@@ -17,13 +17,13 @@ from pathlib import Path
 from lathe_rc import __version__, allowed_code, resources
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.checkpoint import START_FROM
 from lathe_rc.cell.judged import Judged, from_text, to_text
 from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, Value, form_doubt
 from lathe_rc.cell.parameters import judged as judged_of
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario, kind_of
+from lathe_rc.cell.time_master import START_FROM
 from lathe_rc.errors import InputError, shown
 from lathe_rc.files import contents
 

@@ -25,7 +25,7 @@ from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, remapped_by
 from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of, new_stage
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.time_master import TimeMaster
+from lathe_rc.cell.time_master import START_FROM, TimeMaster
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.files import written
@@ -35,7 +35,6 @@ from lathe_rc.messages import Signals
 _KIND = "checkpoint"
 _WHEN = re.compile(r"(revolution|second|sample):([0-9.eE+-]+)")
 _FREE = frozenset({"revolutions", "events", "faults", "block_size", "joint_state_period", "allow_faults"})
-START_FROM = "start_from"  #: parameter of the time master that names a checkpoint
 
 
 @dataclass(frozen=True)

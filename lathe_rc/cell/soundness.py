@@ -12,7 +12,6 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FAULT
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
-from lathe_rc.safety.faults import KINDS
 
 #: message types and fields that the form error is made of
 FORM = frozenset(
@@ -71,7 +70,11 @@ class Soundness:
     def _take(self, message: Sparse) -> None:
         verb, _, fault = str(message.values["action"]).partition(" ")
         target, kind = [*fault.split(" "), ""][:2]
-        if verb != FAULT or kind not in KINDS or KINDS[kind].what == "cut":  # of the material, not of a signal
+        if verb != FAULT:
+            return
+        from lathe_rc.safety.faults import KINDS  # few runs have faults
+
+        if kind not in KINDS or KINDS[kind].what == "cut":  # of the material, not of a signal
             return
         # The target is a field, or the whole encoder.
         if any(place.endswith(f"/{target}") for name in self._fields for place in (name, name.rpartition(".")[0])):

@@ -17,7 +17,7 @@ one if there are none, and outputs are the arrays of all fields of all output po
 from abc import ABC
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -32,10 +32,11 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.extensions import is_ours
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
-from lathe_rc.safety import faults
-from lathe_rc.safety.faults import Fault
-from lathe_rc.safety.injection import Injection, Port
 from lathe_rc.signals.noise import NormalStream, Sensor
+
+if TYPE_CHECKING:
+    from lathe_rc.safety.faults import Fault
+    from lathe_rc.safety.injection import Injection
 
 Fields = tuple[Samples, ...]  #: arrays of a step, each of shape (n,)
 Reached = tuple[int, int]  #: sample of the block that a step has reached, and why it has stopped
@@ -123,6 +124,7 @@ class Stage(ABC):
     actions: ClassVar[tuple[str, ...]] = ()  #: events that it knows
     tunable: tuple[str, ...] = ()  #: parameters that the event ``set PARAM VALUE`` may change, all float
     announces: ClassVar[tuple[str, ...]] = ()  #: events that come about by themselves; up to a colon
+    relayed: str = ""  #: topic, before remapping, of the motion that it passes on as its own; empty: none
     devices: ClassVar[tuple[str, ...]] = ()  #: what can break beside its ports; see `lathe_rc.safety.faults.Kind`
 
     inputs: tuple[Input, ...] = ()
@@ -201,6 +203,8 @@ class Stage(ABC):
         if self.takes_events or tells:
             self.sparse_topics[f"{self.name}/events"] = messages.EVENT
         if self.shared.allow_faults:
+            from lathe_rc.safety.injection import Injection, Port
+
             self._injection = Injection(
                 self.name,
                 [Port(remapped(self.shared, p.topic), p.type, p.fields, p.delay, out=False) for p in inputs],
@@ -231,8 +235,7 @@ class Stage(ABC):
         """Return what may be faulty, by kind of fault; empty unless faults are allowed."""
         if self._injection is None:
             return {}
-        found = {name: sorted(self._injection.targets(kind)) for name, kind in faults.KINDS.items()}
-        return {name: targets for name, targets in found.items() if targets}
+        return self._injection.targets_by_kind()
 
     def check_action(self, action: str) -> None:
         """Check that an event can be carried out.
@@ -246,10 +249,7 @@ class Stage(ABC):
                 raise InputError(
                     f"{self.name}: {action!r} is refused; set allow_faults = true under /** to let things break"
                 )
-            if verb == events.FAULT or " " in rest:
-                self._injection.check(faults.parse(rest, self.name, what=verb))
-            else:
-                self._injection.check_target(rest)
+            self._injection.check_event(verb, rest)
             return
         if verb == events.SET:
             if (parameter := rest.partition(" ")[0]) not in self.tunable:
@@ -459,18 +459,18 @@ class Stage(ABC):
         if verb == events.SAFE:
             self.go_safe()
         elif verb == events.FAULT:
-            fault = faults.parse(rest, self.name)
-            if faults.KINDS[fault.kind].what in self.devices:
+            assert self._injection is not None, "the fault has been checked"
+            fault = self._injection.parse(rest)
+            if self._injection.is_of_device(fault):
                 self.damage(fault)
             else:
-                assert self._injection is not None, "the fault has been checked"
                 self._injection.begin(fault, index)
         elif verb == events.SET:
             self.parameters = self._table_after([action])
             self.tune(self.parameters)
         elif verb == events.REPAIR:
             assert self._injection is not None, "the event has been checked"
-            target, one = rest.partition(" ")[0], faults.parse(rest, self.name) if " " in rest else None
+            target, one = rest.partition(" ")[0], self._injection.parse(rest) if " " in rest else None
             mended = self.mend(one) if target in self.devices else self._injection.end(target, index, one)
             if not mended:
                 self._remarks.append(f"{events.NOTHING_TO_REPAIR}: {target}")
@@ -488,14 +488,14 @@ class Stage(ABC):
     def go_safe(self) -> None:  # noqa: B027 - most stages move nothing, and go on as they are
         """Go to the safe state after a loss of cell members."""
 
-    def damage(self, fault: Fault) -> None:
+    def damage(self, fault: "Fault") -> None:
         """Apply a fault to one of the ``devices`` of the stage.
 
         Stages with ``devices`` override this; other faults are rejected earlier by `check_action`.
         """
         raise NotImplementedError(fault.text)
 
-    def mend(self, fault: Fault | None) -> bool:
+    def mend(self, fault: "Fault | None") -> bool:
         """End a fault, or all faults; return whether there was one. Stages with ``devices`` override this."""
         raise NotImplementedError(fault)
 
@@ -676,7 +676,9 @@ def cut(signals: Sequence[Signals], start: int, stop: int) -> list[Signals]:
 def compile_kernels(stage: Stage) -> None:
     """Compile the kernels of a stage in advance, so that the first block takes no longer than the next."""
     if stage.shared.allow_faults:
-        faults.prepare()
+        from lathe_rc.safety.faults import prepare
+
+        prepare()
     if stage.is_compiled:
         assert stage.native().address, "that compiles it"
         return

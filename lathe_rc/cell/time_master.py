@@ -15,6 +15,7 @@ from lathe_rc.cell.stage import Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.signals.speed import SpeedLaw
 
+START_FROM = "start_from"  #: parameter of the time master that names a checkpoint
 _LEAST_SAMPLES = 4  # per revolution
 _LEAST_CLOCK = 1e-12  # [s]
 

@@ -12,17 +12,26 @@ from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING, NamedTuple
 
 from lathe_rc.blocks.ports import Input, Output
-from lathe_rc.cell.checkpoint import Checkpoint, begun_of
 from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, explain_overflow, remapped
 from lathe_rc.cell.scenario import kind_of, new_stage
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.time_master import TimeMaster
+from lathe_rc.cell.time_master import START_FROM, TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
 
 if TYPE_CHECKING:
     from lathe_rc.analysis.learning import DriveMargin
+    from lathe_rc.cell.checkpoint import Checkpoint
     from lathe_rc.stages.learning.learner import Loop
+
+
+def _begun(nodes: Mapping[str, NodeParameters]) -> "Checkpoint | None":
+    """Return the checkpoint that the time master of some nodes names; None without one."""
+    if not any(getattr(table, START_FROM, "") for table in nodes.values()):
+        return None
+    from lathe_rc.cell.checkpoint import begun_of
+
+    return begun_of(nodes)
 
 
 @dataclass(frozen=True)
@@ -189,7 +198,7 @@ class Cell:
         self.factors: dict[str, float] = {}
         self.loops: dict[str, list[Loop]] = {}
         self._tables = nodes
-        self.begun: Checkpoint | None = begun_of(nodes)
+        self.begun: Checkpoint | None = _begun(nodes)
         new = self.begun.stage if self.begun else new_stage
         with explain_overflow(nodes):
             named = {name: table for name, table in nodes.items() if kind_of(name, table.stage) in STAGES}

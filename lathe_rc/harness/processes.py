@@ -16,17 +16,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any
 
 from lathe_rc import allowed_code, process_launcher
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, LossyRunError, PaceError
 from lathe_rc.extensions import search_path
+from lathe_rc.harness.result import Event
 from lathe_rc.names import absolute
 from lathe_rc.nodes.report import THROUGHPUT
 from lathe_rc.process_launcher import Child, Start
-
-Event = Mapping[str, Any]  #: event of a cell, as reported by a node or the harness
 
 _SILENCE_LIMIT = 120.0  # [s] without any event: the first start on a machine compiles kernels
 _FAREWELL = 10.0  # [s] without any event once the run is complete and its bag closed
@@ -49,10 +47,6 @@ def how_it_ended(event: Event) -> str:
     return f"{event['node']} " + (
         f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     )
-
-
-def ignore(event: Event) -> None:
-    """Ignore an event (default of ``watch``)."""
 
 
 @contextlib.contextmanager
@@ -308,7 +302,7 @@ class Processes:
             self._raise_failure(event)
         raise AssertionError
 
-    def wait_for_end(self, watch: Callable[[Event], None] = ignore) -> dict[str, Event]:
+    def wait_for_end(self, watch: Callable[[Event], None] = lambda _event: None) -> dict[str, Event]:
         """Wait until every process has ended.
 
         Returns:

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.analysis.tolerance import Growth, Verdict
 from lathe_rc.blocks.latency_histogram import Lateness
@@ -17,15 +16,19 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
-from lathe_rc.event_log import LogEntry, entries
-from lathe_rc.judge import loops, part
+from lathe_rc.judge import part
 from lathe_rc.signals.form_errors import FormErrors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from lathe_rc.analysis.learning import DriveMargin
+    from lathe_rc.event_log import LogEntry
+    from lathe_rc.judge.loops import LoopResult
+
 
 Mode = Literal["offline", "composed", "processes"]
+Event = Mapping[str, Any]  #: event of a cell, as reported by a node or the harness
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,7 +81,7 @@ class Result:
     unchecked: Sequence[str] = ()
     warnings: Sequence[str] = ()
     margins: Mapping[str, float | None] = field(default_factory=dict)
-    drive_margins: Mapping[str, DriveMargin] = field(default_factory=dict)
+    drive_margins: "Mapping[str, DriveMargin]" = field(default_factory=dict)
     lateness: Lateness | None = None
 
     def __repr__(self) -> str:
@@ -154,9 +157,14 @@ class Result:
         return part.error_growth(self.recording)
 
     @cached_property
-    def loops(self) -> dict[str, loops.LoopResult]:
+    def loops(self) -> "dict[str, LoopResult]":
         """Results of the force and position loops, by controller (`lathe_rc.judge.loops`)."""
-        return loops.evaluated(loops.loops(judged(self.scenario.nodes)), self.recording)
+        declared = judged(self.scenario.nodes)
+        if all(each.quantity == "form" for each in declared.values()):
+            return {}
+        from lathe_rc.judge import loops
+
+        return loops.evaluated(loops.loops(declared), self.recording)
 
     @cached_property
     def surface(self) -> Lay | str | None:
@@ -175,8 +183,10 @@ class Result:
         return self.recording.digests()
 
     @cached_property
-    def event_log(self) -> list[LogEntry]:
+    def event_log(self) -> "list[LogEntry]":
         """Log of the run's events, alarms and reactions, in order."""
+        from lathe_rc.event_log import entries
+
         return entries(self.recording)
 
     def summary(self) -> dict[str, object]:

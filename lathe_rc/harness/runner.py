@@ -4,31 +4,30 @@
 The modules that write and read bags are imported only when a bag is requested, so that other runs start faster.
 """
 
-import contextlib
 import os
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-from lathe_rc import messages, process_launcher
-from lathe_rc.blocks.latency_histogram import Lateness
+from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
-from lathe_rc.cell import checkpoint
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.harness.processes import Event, Processes, ignore, with_recorder
-from lathe_rc.harness.result import Mode, Result
+from lathe_rc.harness import bags
+from lathe_rc.harness.result import Event, Mode, Result
 from lathe_rc.messages import Signals
 from lathe_rc.names import checked_namespace
-from lathe_rc.process_launcher import Start
+
+if TYPE_CHECKING:
+    from lathe_rc.process_launcher import Start
 
 
 def run(
@@ -37,10 +36,10 @@ def run(
     mode: Mode = "offline",
     groups: Sequence[Sequence[str]] | None = None,
     bag: str | os.PathLike[str] | None = None,
-    watch: Callable[[Event], None] = ignore,
+    watch: Callable[[Event], None] = lambda _event: None,
     domain: int | None = None,
     namespace: str = "/",
-    start: Start = "fork",
+    start: "Start" = "fork",
     start_from: str | os.PathLike[str] | None = None,
     checkpoints: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
 ) -> Result:
@@ -80,6 +79,8 @@ def run(
         lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
     if mode != "offline" and start == "fork":
+        from lathe_rc import process_launcher
+
         process_launcher.server()  # the server imports while the cell is checked
     if start_from:
         scenario = scenario.varied({f"{name}.start_from": os.fspath(start_from) for name in scenario.masters})
@@ -93,7 +94,7 @@ def run(
         raise InputError(SNAPSHOTS_GONE_ON)
     cell.check()
     check_room(cell)
-    places = {checkpoint.sample_of(when, cell.master): Path(path) for when, path in checkpoints.items()}
+    places = _places(checkpoints, cell)
     for event, told in (("unchecked", cell.unchecked), ("warning", cell.warnings)):
         for what in told:
             watch({"event": event, "node": cell.master.name, "message": what})
@@ -109,7 +110,9 @@ def run(
     if mode == "offline":
         result = _offline(scenario, cell, place, watch, places)
     else:
-        result = _run(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
+        from lathe_rc.harness.hosted import run_hosted
+
+        result = run_hosted(scenario, cell, mode, groups, place, watch, domain, checked_namespace(namespace), start)
     result = replace(
         result,
         unchecked=cell.unchecked,
@@ -124,73 +127,13 @@ def run(
     return result
 
 
-def _run(
-    scenario: Scenario,
-    cell: Cell,
-    mode: Mode,
-    groups: Sequence[Sequence[str]] | None,
-    bag: Path | None,
-    watch: Callable[[Event], None],
-    domain: int | None,
-    namespace: str,
-    start: Start,
-) -> Result:
-    from lathe_rc.bag import reader
-    from lathe_rc.bag.repairing import recover
+def _places(checkpoints: Mapping[str, str | os.PathLike[str]], cell: Cell) -> dict[int, Path]:
+    """Return the files of checkpoints by sample."""
+    if not checkpoints:
+        return {}
+    from lathe_rc.cell.checkpoint import sample_of
 
-    if start == "fork":
-        nodes = {name: (scenario.kind(name), table.model_dump()) for name, table in scenario.nodes.items()}
-        process_launcher.server().preload(nodes)
-    with contextlib.ExitStack() as stack:
-        table = scenario.recorder[1]
-        folder = table.snapshots_of(bag) if bag is not None and table.mode != "continuous" else None
-        place = kept = _whole(scenario, bag)
-        if place is None:
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lathe-"))) / "bag"
-        complete = with_recorder(scenario, place, keep=bag is not None, snapshots=folder)
-        split = [list(complete.nodes)] if mode == "composed" else complete.processes(groups)
-        processes = stack.enter_context(Processes(complete, split, domain=domain, namespace=namespace, start=start))
-        try:
-            events = processes.wait_for_end(watch)
-        except BaseException:
-            processes.stop()
-            for path in ([kept] if kept else []) + _bags_in(folder):
-                recover.mend(path)
-            raise
-        recording = reader.read_bag(place)
-        return Result(
-            scenario=scenario,
-            mode="grouped" if mode == "processes" and len(split) < len(complete.nodes) else mode,
-            samples=cell.master.samples - cell.first
-            if cell.master.samples
-            else recording.of_type(messages.ENCODER)["angle"].size,
-            wall_s=(events["complete"]["monotonic_ns"] - events["block0"]["monotonic_ns"]) * 1e-9,
-            bag=kept,
-            snapshots=tuple(_bags_in(folder)),
-            recording=recording,
-            refused=processes.refused,
-            not_reached=processes.not_reached,
-            lateness=_lateness(events),
-        )
-
-
-def _lateness(events: Mapping[str, Event]) -> Lateness | None:
-    """Return the lateness of the blocks as reported by the time master."""
-    if "pace" not in events:
-        return None
-    told = events["pace"]
-    within = {int(percent): seconds for percent, seconds in told["within"].items()}  # JSON keys are strings
-    return Lateness(told["blocks"], told["late"], told["worst"], within, told["slipped"])
-
-
-def _whole(scenario: Scenario, bag: Path | None) -> Path | None:
-    """Return the bag of the whole run; None if only snapshots or nothing was recorded."""
-    return None if scenario.recorder[1].mode == "snapshot" else bag
-
-
-def _bags_in(folder: Path | None) -> list[Path]:
-    """Return the snapshots in a folder, in the order of their triggers."""
-    return sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
+    return {sample_of(when, cell.master): Path(path) for when, path in checkpoints.items()}
 
 
 class _Watcher:
@@ -238,8 +181,8 @@ def _offline(
         if recorder:
             recorder.close()
     wall = time.monotonic() - start
-    kept = _whole(scenario, bag)
-    found = tuple(_bags_in(snapshots.folder)) if snapshots else ()
+    kept = bags.of_whole(scenario, bag)
+    found = tuple(bags.snapshots_in(snapshots.folder)) if snapshots else ()
     waiting = {name: stage.waiting for name, stage in cell.stages.items() if stage.waiting}
     for name, events in waiting.items():
         watch({"event": "not_reached", "node": name, "events": events})
@@ -248,4 +191,6 @@ def _offline(
 
 
 def _keep(scenario: Scenario, engine: Engine, path: Path) -> None:
+    from lathe_rc.cell import checkpoint
+
     checkpoint.save(path, checkpoint.take(scenario, engine.stages, engine.reached, engine.past))

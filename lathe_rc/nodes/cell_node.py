@@ -30,11 +30,12 @@ from std_msgs.msg import Empty
 
 from lathe_rc import messages
 from lathe_rc.blocks.ports import signal_depth
-from lathe_rc.cell.checkpoint import START_FROM, Checkpoint, begun_of
+from lathe_rc.cell.checkpoint import Checkpoint, begun_of
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value, remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
+from lathe_rc.cell.time_master import START_FROM
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare, graph
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from lathe_rc import messages
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals
-from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind
+from lathe_rc.safety.faults import DISTURBANCES, KINDS, Disturbance, Fault, Kind, parse
 
 _TRUE = "_true"  # suffix of fields with true values, which cannot be faulty
 
@@ -103,6 +103,30 @@ class Injection:
         if kind.what in self._devices:
             return {kind.what}
         return {target for port in self._ports for target in port.targets(kind)}
+
+    def targets_by_kind(self) -> dict[str, list[str]]:
+        """Return the possible targets of each kind of fault that has any."""
+        found = {name: sorted(self.targets(kind)) for name, kind in KINDS.items()}
+        return {name: targets for name, targets in found.items() if targets}
+
+    def parse(self, text: str, verb: str = "fault") -> Fault:
+        """Return the fault in the text of an event (see `lathe_rc.safety.faults.parse`)."""
+        return parse(text, self._node, what=verb)
+
+    def is_of_device(self, fault: Fault) -> bool:
+        """Return whether a fault is of a device of the stage, not of a port."""
+        return KINDS[fault.kind].what in self._devices
+
+    def check_event(self, verb: str, rest: str) -> None:
+        """Check the event of a fault or a repair.
+
+        Raises:
+            InputError: there is no such fault or target.
+        """
+        if verb == "fault" or " " in rest:
+            self.check(self.parse(rest, verb))
+        else:
+            self.check_target(rest)
 
     def check(self, fault: Fault) -> None:
         """Check that a fault is possible for its target.

@@ -29,7 +29,6 @@ from lathe_rc.bag.reading.mcap_storage import open_mcap
 from lathe_rc.bag.reading.metadata import Metadata, Topic
 from lathe_rc.bag.reading.seal import Seal
 from lathe_rc.bag.reading.sealed_metadata import compare
-from lathe_rc.bag.reading.sqlite_storage import open_sqlite
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
 from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
 from lathe_rc.blocks.block import Block
@@ -228,6 +227,8 @@ class Source:
         if head.startswith(MCAP0_MAGIC):
             return open_mcap(path)
         if head == _SQLITE:
+            from lathe_rc.bag.reading.sqlite_storage import open_sqlite
+
             return open_sqlite(path, self._folder())
         if not is_packed(head):
             raise ValueError("a bag of ROS 1" if head.startswith(b"#ROSBAG") else "not an MCAP or SQLite file")

@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import GONE_ON
 from lathe_rc.bag.writing.order import Merger
-from lathe_rc.bag.writing.snapshots import Snapshots
 from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
 from lathe_rc.blocks.block import Framer
 from lathe_rc.blocks.ports import Sparse, signal_depth
@@ -19,8 +19,11 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
 
+if TYPE_CHECKING:
+    from lathe_rc.bag.writing.snapshots import Snapshots
 
-def bag_of(path: Path, table: RecorderParameters, snapshots: Snapshots | None) -> Output:
+
+def bag_of(path: Path, table: RecorderParameters, snapshots: "Snapshots | None") -> Output:
     """Create the output of a recorder: the bag of the whole run (unless disabled), the snapshots, or both.
 
     Raises:
@@ -40,7 +43,7 @@ def split(output: Output, duration: float) -> None:
         bag.split_ns = round(duration * 1e9)
 
 
-def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) -> Output:
+def begin(path: Path, scenario: Scenario, snapshots: "Snapshots | None" = None) -> Output:
     """Create the bag of an offline run of a scenario, with the settings of its recorder.
 
     Args:
@@ -56,7 +59,7 @@ def begin(path: Path, scenario: Scenario, snapshots: Snapshots | None = None) ->
     return output
 
 
-def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | None:
+def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> "Snapshots | None":
     """Create the snapshot output of a scenario's recorder, whose bag is at ``path``; None without snapshots.
 
     Raises:
@@ -65,6 +68,8 @@ def begin_snapshots(path: Path, scenario: Scenario, cell: Cell) -> Snapshots | N
     name, table = scenario.recorder
     if table.mode == "continuous":
         return None
+    from lathe_rc.bag.writing.snapshots import Snapshots
+
     snapshots = Snapshots(table.snapshots_of(path), table, name=name)
     snapshots.prepare(_dense(cell), list(cell.stages))
     return snapshots
@@ -87,7 +92,7 @@ class OfflineRecorder:
     """
 
     def __init__(
-        self, cell: Cell, samples: int, writer: Output, snapshots: Snapshots | None = None, first: int = 0
+        self, cell: Cell, samples: int, writer: Output, snapshots: "Snapshots | None" = None, first: int = 0
     ) -> None:
         shared = cell.master.shared
         self._snapshots = snapshots

@@ -13,7 +13,7 @@ from lathe_rc import resources
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
-from lathe_rc.signals import speed, tachogram
+from lathe_rc.signals import speed
 from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
 from lathe_rc.stages.common.tables import made_of
 
@@ -90,6 +90,8 @@ class SpeedLawParameters(NodeParameters):
                 )
         time, deviation = np.array(self.tachogram_time), np.array(self.tachogram_deviation)
         if self.tachogram_file:
+            from lathe_rc.signals import tachogram
+
             with about(node, "tachogram_file"):
                 time, rpm = tachogram.read(path := resources.find(Path(self.tachogram_file)))
                 tachogram.check_unit(path, rpm, self.nominal_rpm)

@@ -310,13 +310,13 @@ class Gauge(Stage):
                 Input("encoder", messages.ENCODER, ("angle", "angle_true")),
                 Input("encoder", messages.ENCODER, ("angle_true",), parameters.tool_delay),
                 Input("tool", messages.TOOL, ("error",), parameters.tool_delay),
-                Input(self.drive_topic, messages.STATE, ("position", "velocity", "effort", "measured_position")),
+                Input(self.relayed, messages.STATE, ("position", "velocity", "effort", "measured_position")),
             ],
             outputs=[Output(_CORRECTED, messages.STATE), Output("gauge/reading", messages.STATE)],
         )
 
     @property
-    def drive_topic(self) -> str:
+    def relayed(self) -> str:  # type: ignore[override]
         """Topic of the drive's state, before remapping."""
         return f"{self.parameters.drive}/state"
 

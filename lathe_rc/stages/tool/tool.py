@@ -20,7 +20,6 @@ from lathe_rc.signals.profile_table import Demand
 from lathe_rc.signals.tip_path import steepest_fall
 from lathe_rc.stages.drive.drive import Drive, Limits
 from lathe_rc.stages.tool.form import Form, FormParameters, FormTable, ProfileStage, evaluate
-from lathe_rc.stages.tool.gauge import Gauge
 
 
 class ToolParameters(FormParameters):
@@ -189,8 +188,8 @@ class Tool(Stage):
         owner = self._form_owner(cell)
         topic = remapped(self.shared, f"{self.parameters.drives[0]}/state")
         source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
-        if isinstance(source, Gauge):
-            topic = remapped(source.shared, source.drive_topic)
+        if source and source.relayed:
+            topic = remapped(source.shared, source.relayed)
             source = cell.publisher(topic, f"whether {cell.node_of(topic)} can follow the profile of {self.name}")
         if owner is None or owner.form is None:
             return
