@@ -33,6 +33,7 @@ def digests_by_host(scenario: Scenario, folder: str | os.PathLike[str]) -> dict[
         LatheError: a run failed.
 
     Example:
+        >>> import lathe_bagtools
         >>> import lathe_rc
         >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=2"])
         >>> found = lathe_bagtools.digests_by_host(piston, ".")

@@ -23,7 +23,7 @@ from lathe_live.panel_view import View
 from lathe_rc import messages
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import refuse_existing
-from lathe_rc.cell import checkpoint, events
+from lathe_rc.cell import checkpoint, events, time_master
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.parameters import Value
@@ -254,7 +254,7 @@ class LiveCell:
         self._folder = tempfile.TemporaryDirectory(prefix="lathe-panel-")
         self._recorder: OfflineRecorder | None = None
         self._bag, self._version = "", 0
-        masters = [f"{name}.{checkpoint.START_FROM}" for name in scenario.masters]
+        masters = [f"{name}.{time_master.START_FROM}" for name in scenario.masters]
         self._given = {name: scenario.value(name) for name in masters}  # checkpoint of a restart, if any
         self._changed: dict[str, Value] = {}  # parameters changed since the panel was opened
         self._begin(scenario)

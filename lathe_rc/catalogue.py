@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this distribution contains, by name: packages with their commands and executables, and stages.
+"""Contents of this distribution by name: packages with their commands and executables, and stages.
 
 Nothing is imported here, and nothing else in the core names what lies beside or above it.
 

@@ -49,6 +49,7 @@ _KERNELS = (
     "cell/program.py",
     "stages/**/*.py",
     "../lathe_bagtools/resimulation/bag_spindle.py",
+    "../lathe_papers/adrc.py",
     "../lathe_papers/formulas/*.py",
 )
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from lathe_explore.sweep.space import given
+from lathe_rc.cell import cells_file
 from lathe_rc.signals import measured_profile, measurement_file, tachogram
 from lathe_rc.signals.counts import CsvReader
 
@@ -35,7 +35,7 @@ READERS = {
     "profile": lambda path: [(form := measured_profile.read_csv(path)).angle, form.radius],
     "measurement": columns,
     "whole numbers first": columns,
-    "cells": lambda path: [[*cell.values()] for cell in given(path)],
+    "cells": lambda path: [[*cell.values()] for cell in cells_file.read(path)],
 }
 DIALECTS = {
     "decimal comma": lambda text: text.replace(",", ";").replace(".", ",").encode(),

@@ -16,7 +16,7 @@ from lathe_rc.analysis.metrology import undulations
 from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
-from lathe_rc.signals.encoder import Encoder
+from lathe_rc.signals.encoder import Encoder, EncoderSamples
 from lathe_rc.signals.encoder_errors import EncoderErrors, seen_along
 
 TURN = 2 * np.pi
@@ -25,6 +25,10 @@ NOMINAL = 1000 * TURN / 60
 swinging = speed.harmonic(NOMINAL, np.array([0.1]), np.array([10.7]), np.array([0.5]))
 laws = st.sampled_from([speed.constant(NOMINAL), swinging])
 counts = st.one_of(st.integers(1, 100), st.integers(101, 2**31 - 1))
+
+
+def test_samples_are_named_in_the_order_of_the_message():
+    assert EncoderSamples._fields == tuple(messages.sample_fields(messages.ENCODER))
 
 
 def measure(law, counts=0, window=64, lengths=(12000,), errors=EncoderErrors(), **kwargs):  # noqa: B008 - it never changes

@@ -28,7 +28,7 @@ from lathe_rc.commands.report import report
 from lathe_rc.drawing import charts
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
-from lathe_rc.judge.budget import changing
+from lathe_rc.judge.causes import changing
 from lathe_rc.view import report as reporting
 from lathe_rc.view.report_figures import against_time, colour_range, spectrum_range, timing
 from lathe_rc.view.report_form import Form, Revolution

@@ -50,8 +50,13 @@ def imports():
 
     for path in sorted(ROOT.glob("lathe_*/**/*.py")):
         package = box(path.relative_to(ROOT).with_suffix("").parts)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.Import | ast.ImportFrom):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        typing = [
+            each for each in ast.walk(tree) if isinstance(each, ast.If) and ast.unparse(each.test) == "TYPE_CHECKING"
+        ]
+        only_for_types = {id(node) for each in typing for node in ast.walk(each)}
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Import | ast.ImportFrom) or id(node) in only_for_types:
                 continue
             module = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
             for alias in node.names:

@@ -15,6 +15,7 @@ from lathe_rc import harness
 from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.bag import provenance
 from lathe_rc.errors import InputError
+from lathe_rc.judge import part
 
 errors = st.lists(st.sampled_from([0.5, 1.0, 1.5, 3.0]), max_size=30)
 SHORT = ("run", "piston", "--revolutions", "5")
@@ -197,13 +198,22 @@ def test_a_report_begins_with_it_and_shows_the_budget_if_it_is_asked_for(tmp_pat
     assert sum(float(share) for _, share in rows[:-1]) == pytest.approx(100.0, abs=0.2)
 
 
-def test_a_bag_whose_scenario_is_none_has_no_tolerance_but_a_reason():
-    def told(text):
-        return provenance.tolerances(provenance.values_of({provenance.SCENARIO: text}))
-
+def test_a_bag_that_states_no_judgement_has_no_tolerance_but_a_reason():
     with pytest.raises(InputError, match=r"^lathe_rc\.scenario of the bag: no nodes; allowed: "):
-        told("[1, 2]")
-    assert provenance.values_of({}) == {}
-    assert told("tool: {ros__parameters: {tolerance: .inf}}") == {}
-    text = "edge: {ros__parameters: {stage: tool, tolerance: 1e-6, remap: ['tool:=part']}}"
-    assert told(text) == {"part": 1e-6}
+        provenance.values_of({provenance.SCENARIO: "[1, 2]"})
+    assert provenance.judged({}) == {}
+    with pytest.raises(InputError, match=r"^the bag has no lathe_rc\.judged, .*; lathe resim makes one that has$"):
+        provenance.judged({provenance.SCENARIO: "tool: {}"})
+    for text, said in (
+        ('{"tool": {"topic": "tool", "quantity": "form", "step": 1e-5, "tolerance": 1e999}}', "tool.tolerance: "),
+        ('{"tool": {"topic": "tool", "quantity": "colour", "step": 1e-5}}', "tool.quantity: "),
+        ("[]", "text: "),
+    ):
+        with pytest.raises(InputError, match=rf"^lathe_rc\.judged of the bag: {said}"):
+            provenance.judged({provenance.JUDGED: text})
+
+
+def test_a_node_declares_its_tolerance_by_the_topic_after_remapping(tmp_path):
+    scenario = config("piston", "tool.tolerance=1e-6", "tool.remap=['tool:=part']")
+    declared = provenance.judged(provenance.tell(scenario, []))
+    assert part.tolerances(declared) == {"part": 1e-6}

@@ -13,6 +13,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 import lathe_explore
+from lathe_explore.commands import progress
 from lathe_explore.sweep import formulas, history, row, sweep, tune
 from lathe_explore.sweep.objectives import objectives
 from lathe_explore.sweep.search_space import Dimension, search_space
@@ -23,7 +24,6 @@ from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.commands import progress
 from lathe_rc.control.decoupler import PAPER
 from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError

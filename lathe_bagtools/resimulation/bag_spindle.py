@@ -23,37 +23,34 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.judge.part import ErrorsByRevolution
 from lathe_rc.messages import Samples, Signals
+from lathe_rc.signals.encoder import EncoderSamples
 from lathe_rc.stages.tool.tool import Tool
 
 _TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
 
 
 class Memory(NamedTuple):
-    """State of the time master's step function: recorded samples, read ahead.
+    """State of the step function.
 
     Attributes:
-        span: index of the first sample, and the index after the last.
-        angle, speed, angle_true, speed_true, index_pulse: recorded samples, starting at element 0.
+        span: first recorded sample, and the sample after the last one.
+        recorded: recorded samples, starting at element 0.
     """
 
     span: npt.NDArray[np.int64]
-    angle: Samples
-    speed: Samples
-    angle_true: Samples
-    speed_true: Samples
-    index_pulse: Samples
+    recorded: EncoderSamples
 
 
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """Copy the recorded samples of a block to the outputs."""
-    angle, speed, angle_true, speed_true, index_pulse = outputs
-    at, n = first - memory.span[0], angle.size
-    put(angle, memory.angle[at : at + n])
-    put(speed, memory.speed[at : at + n])
-    put(angle_true, memory.angle_true[at : at + n])
-    put(speed_true, memory.speed_true[at : at + n])
-    put(index_pulse, memory.index_pulse[at : at + n])
+    block, recorded = EncoderSamples(*outputs), memory.recorded
+    at, n = first - memory.span[0], block.angle.size
+    put(block.angle, recorded.angle[at : at + n])
+    put(block.speed, recorded.speed[at : at + n])
+    put(block.index_pulse, recorded.index_pulse[at : at + n])
+    put(block.angle_true, recorded.angle_true[at : at + n])
+    put(block.speed_true, recorded.speed_true[at : at + n])
     return n, DONE
 
 
@@ -96,7 +93,7 @@ class _RecordedSpindle(TimeMaster):
     @property
     def memory(self) -> Memory:
         """Current state of the step function."""
-        return Memory(self._span, *self._ready.values())
+        return Memory(self._span, EncoderSamples(**self._ready))
 
     def prepare(self, first: int, samples: int) -> None:
         """Read the samples of the next block before it is computed.

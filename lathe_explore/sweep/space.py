@@ -66,6 +66,7 @@ class Space:
         sample_seed: random seed of the sample.
 
     Example:
+        >>> import lathe_explore
         >>> import lathe_rc
         >>> lead = "learning_controller.lead_time"
         >>> space = lathe_explore.Space(grid={lead: "1e-3:2e-3:5"}, sampled={"tool.feed": "80%:120%"}, sample="sobol:8")

@@ -161,6 +161,7 @@ def run_sweep(
         LatheError: workers died, or the disk is full; the computed rows are saved.
 
     Example:
+        >>> import lathe_explore
         >>> import lathe_rc
         >>> piston = lathe_rc.load("piston", ["spindle_encoder.revolutions=10"])
         >>> space = lathe_explore.Space(grid={"learning_controller.lead_time": [1.3e-3, 1.425e-3, 3e-3]})

@@ -84,6 +84,7 @@ def tune(
         LatheError: workers died, or the disk is full; the computed rows are saved.
 
     Example:
+        >>> import lathe_explore
         >>> import lathe_rc
         >>> start = ["spindle_encoder.revolutions=10", "learning_controller.lead_time=1.0e-3"]
         >>> piston = lathe_rc.load("piston", start)

@@ -183,6 +183,7 @@ def export_bag(
         LatheError: the bag is incomplete, or writing to the disk fails.
 
     Example:
+        >>> import lathe_export
         >>> import lathe_rc
         >>> result = lathe_rc.run(lathe_rc.load("piston", ["spindle_encoder.revolutions=2"]), bag="piston_bag")
         >>> exported = lathe_export.export_bag("piston_bag", "piston.npz", "npz", ["/tool"])

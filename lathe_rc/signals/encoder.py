@@ -44,11 +44,29 @@ class EncoderTable(NamedTuple):
     before: Array
 
 
+class EncoderSamples(NamedTuple):
+    """Samples of an encoder's block, in the order of `EncoderBlock.msg`; arrays of shape (n,).
+
+    Attributes:
+        angle: measured angle, unwrapped [rad].
+        speed: measured speed [rad/s].
+        index_pulse: 1 in the first sample of each measured revolution, else 0.
+        angle_true, speed_true: true angle [rad] and speed [rad/s].
+    """
+
+    angle: Array
+    speed: Array
+    index_pulse: Array  # of uint8
+    angle_true: Array
+    speed_true: Array
+
+
 @kernel
 def encode(encoder: EncoderTable, first: int, samples: Fields) -> None:
     """Fill the encoder signals of a block, starting at sample ``first`` (implements `Encoder.block`)."""
-    follow_law(encoder, first, samples[3], samples[4])
-    read_off(encoder, first, samples)
+    block = EncoderSamples(*samples)
+    follow_law(encoder, first, block.angle_true, block.speed_true)
+    read_off(encoder, first, block)
 
 
 @kernel
@@ -58,9 +76,10 @@ def follow_law(encoder: EncoderTable, first: int, angle_true: Array, speed_true:
 
 
 @kernel
-def read_off(encoder: EncoderTable, first: int, samples: Fields) -> None:
+def read_off(encoder: EncoderTable, first: int, block: EncoderSamples) -> None:
     """Fill measured angle, speed and index pulse from the true angle and speed (see `Encoder.block`)."""
-    angle, speed, index_pulse, angle_true, speed_true = samples
+    angle, speed, index_pulse = block.angle, block.speed, block.index_pulse
+    angle_true, speed_true = block.angle_true, block.speed_true
     step, counts, history, revolution = encoder.step, encoder.counts, encoder.history, encoder.revolution
     before = revolution[0]
     if encoder.errors.real:

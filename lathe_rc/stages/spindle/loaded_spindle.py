@@ -16,7 +16,7 @@ from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.plants.spindle import STOPS, Belt, LoadedSpindle, SpeedLoop, SpindleTable, failure, turn
-from lathe_rc.signals.encoder import EncoderTable, follow_law, read_off
+from lathe_rc.signals.encoder import EncoderSamples, EncoderTable, follow_law, read_off
 from lathe_rc.stages.common.command_limits import Clipping
 from lathe_rc.stages.common.tables import made_of
 from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder, SpindleEncoderParameters
@@ -82,12 +82,12 @@ class Memory(NamedTuple):
 @kernel
 def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """Turn the spindle through one block under the cutting torque, and read its encoder."""
-    angle_true, speed_true = outputs[3], outputs[4]
-    follow_law(memory.encoder, first, angle_true, speed_true)
-    reached, reason = turn(memory.spindle, first, inputs[0], angle_true, speed_true, memory.room[0])
+    block = EncoderSamples(*outputs)
+    follow_law(memory.encoder, first, block.angle_true, block.speed_true)
+    reached, reason = turn(memory.spindle, first, inputs[0], block.angle_true, block.speed_true, memory.room[0])
     if reason != DONE:
         return reached, reason
-    read_off(memory.encoder, first, outputs)
+    read_off(memory.encoder, first, block)
     return reached, DONE
 
 
