@@ -56,7 +56,7 @@ LAYERS = (
     Layer("compiled code", {"compiled": "memories and addresses of steps", "fmi": "models of other tools"}),
 )
 #: Arrows within a layer.
-BESIDE = (("drawing", "analysis"), ("plants", "control"))
+BESIDE = (("plants", "control"),)
 
 LEFT, WIDTH, RIGHT = 112, 640, 4
 HEIGHT, GAP, SPACE = 50, 22, 36  # of a box, between layers, between boxes

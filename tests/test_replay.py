@@ -322,7 +322,7 @@ def test_keys_of_a_terminal_are_told_and_its_settings_come_back():
 
 KEYS = """
 import fcntl, termios, time
-from lathe_rc.nodes import keys
+from lathe_bagtools.nodes import keys
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 before = termios.tcgetattr(0)
 with keys.listening() as pressed:

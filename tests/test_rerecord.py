@@ -148,7 +148,7 @@ def last_word(ghost, talker, word, recording):
 
 
 #: how often a recorder looks for those who were there before it
-LOOKS = "from lathe_rc.nodes import topic_recorder; topic_recorder._LOOKS = {}"
+LOOKS = "from lathe_bagtools.nodes import topic_recorder; topic_recorder._LOOKS = {}"
 
 
 def test_what_was_missed_is_told(ghost, tmp_path):

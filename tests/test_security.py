@@ -147,7 +147,7 @@ def test_an_attached_panel_asks_for_what_its_page_commands():
     held = scenario(spindle_encoder={"simulation_services": "playing"}, supervisor=watched)
     policy = security.policy(held, beside=[security.PANEL, RERUN_BRIDGE])
     listener, commands = policy["/panel"]
-    assert listener.subscribe - policy["/rerun_bridge"][0].subscribe == {"safety"}
+    assert {"safety", "cell_state"} <= listener.subscribe == policy["/rerun_bridge"][0].subscribe
     asked = {f"{name}/schedule" for name in held.nodes} | {"spindle_encoder/set_parameters", "set_simulation_state"}
     assert commands.request == asked
     offered = frozenset().union(*(profile.reply for enclave in policy.values() for profile in enclave))

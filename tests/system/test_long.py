@@ -66,7 +66,7 @@ AHEAD = """
 import json
 from lathe_rc.cell import ahead
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.stages import STAGES
+from lathe_rc.cell.kinds import STAGES
 
 def made(name, kind):
     return STAGES[kind](name, TABLES[kind].read(name, {"stage": kind}))
