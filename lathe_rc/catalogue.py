@@ -61,6 +61,8 @@ STANDALONE = {
     "topic_recorder": "lathe_bagtools.nodes.topic_recorder",
 }
 
+DRAWN = "lathe_live.rerun_signals:is_drawn"  #: function that tells which message types a scene shows
+
 #: built-in stages by kind; their modules are imported on demand, which for all takes as long as a hundred revolutions
 STAGES = {
     "spindle_encoder": "lathe_rc.stages.spindle.spindle_encoder:SpindleEncoder",

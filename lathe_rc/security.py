@@ -5,12 +5,14 @@ DDS security applies to processes, not to nodes: an enclave holds the permission
 its nodes' profiles. No name is denied explicitly, since everything outside the profiles of an enclave is denied.
 """
 
+import pkgutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lathe_rc import harness
+from lathe_rc.catalogue import DRAWN
 from lathe_rc.cell.beside import MACHINE_STATE, PANEL, PANEL_COMMANDS, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.cell.host_topics import HOST_TOPICS
 from lathe_rc.cell.kinds import MASTERS
@@ -18,7 +20,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.messages import ALIVE
+from lathe_rc.messages import ALIVE, SAFETY
 from lathe_rc.names import absolute, checked_namespace
 from lathe_rc.view.machine_state import source as machine_source
 
@@ -136,12 +138,17 @@ class _Maker:
         )
 
     def rerun_bridge(self) -> Profile:
-        """Return the profile of the Rerun bridge, which reads signals and the cell's state."""
-        return self._node(RERUN_BRIDGE, subscribe=[*self._signals, "cell_state"])
+        """Return the profile of the Rerun bridge, which reads the signals shown in a scene and the cell's state."""
+        is_drawn = pkgutil.resolve_name(DRAWN)
+        drawn = [topic for topic, source in self._signals.items() if is_drawn(source.type)]
+        return self._node(RERUN_BRIDGE, subscribe=[*drawn, "cell_state"])
 
     def panel(self) -> Profile:
-        """Return the profile of an attached panel, which reads signals and the cell's state."""
-        return self._node(PANEL, subscribe=[*self._signals, "cell_state"])
+        """Return the profile of an attached panel, which reads the signals of the Rerun bridge and the cell's state."""
+        bridge = self.rerun_bridge()
+        states = {topic for topic, source in self._signals.items() if source.type == SAFETY} | {"cell_state"}
+        reply = frozenset(f"{PANEL}/{each}" for each in _PARAMETERS)
+        return replace(bridge, node=PANEL, subscribe=bridge.subscribe | states, reply=reply)
 
     def panel_commands(self) -> Profile:
         """Return the profile of its second node, which asks for events, pace and pause."""

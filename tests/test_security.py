@@ -21,6 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 
 from lathe_rc import cli, harness, process_launcher, security
+from lathe_rc.catalogue import STANDALONE
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.beside import MACHINE_STATE, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
 from lathe_rc.nodes.ports import latched_qos
@@ -147,7 +148,7 @@ def test_an_attached_panel_asks_for_what_its_page_commands():
     held = scenario(spindle_encoder={"simulation_services": "playing"}, supervisor=watched)
     policy = security.policy(held, beside=[security.PANEL, RERUN_BRIDGE])
     listener, commands = policy["/panel"]
-    assert {"safety", "cell_state"} <= listener.subscribe == policy["/rerun_bridge"][0].subscribe
+    assert listener.subscribe - policy["/rerun_bridge"][0].subscribe == {"safety"}
     asked = {f"{name}/schedule" for name in held.nodes} | {"spindle_encoder/set_parameters", "set_simulation_state"}
     assert commands.request == asked
     offered = frozenset().union(*(profile.reply for enclave in policy.values() for profile in enclave))
@@ -269,7 +270,7 @@ def running(folder, commands):
                     environment=environment,
                     report=theirs,
                     log=log.fileno(),
-                    command=[sys.executable, "-m", *command] if command[0].startswith("lathe_rc.") else [],
+                    command=[sys.executable, "-m", *command] if command[0].startswith("lathe_") else [],
                 )
             started.append((child, folder / f"{number}.log", ours))
         try:
@@ -325,7 +326,7 @@ def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_p
     commands = list(members(scenarios.load(CONFIG / "piston.yaml", ENDLESS), root, tmp_path))
     for enclave in list(root.iter("enclave"))[len(commands) :]:
         kind = next(enclave.iter("profile")).get("node")
-        commands.append([f"lathe_rc.nodes.{kind}", *ros(enclave, *options[kind])])
+        commands.append([STANDALONE[kind], *ros(enclave, *options[kind])])
     with running(tmp_path, commands):
         wait_for_block_0(observer, "/shop/left")
         compare(observer, root)
@@ -342,7 +343,7 @@ def test_the_replayer(observer, tmp_path):
         if enclave.get("path") != f"/{REPLAYER}":
             enclaves.remove(enclave)
     # With readers that never come, it stands at the first message.
-    waiting = [f"lathe_rc.nodes.{REPLAYER}", *ros(enclaves[0], "-p", f"bag:={tmp_path / 'bag'}", "-p", "wait:=9")]
+    waiting = [STANDALONE[REPLAYER], *ros(enclaves[0], "-p", f"bag:={tmp_path / 'bag'}", "-p", "wait:=9")]
     with running(tmp_path, [waiting]):
         compare(observer, root)
 
