@@ -83,11 +83,26 @@ def test_resonance_is_identified_during_the_cut():
     assert not none
 
 
-@pytest.mark.parametrize(
-    "changes", [STEADY, ['controller.events=["second 0.001: freeze"]'], ["controller.identify=false"]]
-)
-def test_nothing_is_adopted_without_what_tells_a_model(changes):
-    """Neither at constant speed, where the force explains everything, nor while learning is frozen."""
+def test_a_model_is_identified_at_constant_speed_while_the_memory_still_learns():
+    """The command changes from one revolution to the next until the memory has converged."""
+    error, law, _ = found(*STEADY)
+    assert rational_inverse.is_rational(law)
+    before, _, _ = found(*STEADY, "controller.inverse=second_order")
+    assert error < 0.8 * before
+
+
+def test_a_drive_without_resonance_is_inverted_by_the_second_order_to_the_bit():
+    second, fourth = (
+        lathe_rc.run(config("robust_cutting", "spindle_encoder.revolutions=12", f"controller.inverse={order}"))
+        for order in ("second_order", "fourth_order")
+    )
+    assert fourth.digest["/coarse/command"] == second.digest["/coarse/command"]
+    events = fourth.recording.sparse["/controller/events"].values["action"]
+    assert events[-1] == "model refused: it has no resonance (damping of the zeros above 0.5)"
+
+
+@pytest.mark.parametrize("changes", [['controller.events=["second 0.001: freeze"]'], ["controller.identify=false"]])
+def test_nothing_is_adopted_without_learning(changes):
     _, law, events = found(*changes)
     assert not rational_inverse.is_rational(law)
     assert not [each for each in events if each.startswith("model")]
@@ -129,6 +144,7 @@ def test_a_model_with_which_learning_would_diverge_is_unsafe():
     small = MODEL * np.array([1.0, 30.0, 1.0, 1.0, 1.0, 1.0])  # ten times the response
     assert rational_fit.safe(fit, small) == rational_fit.UNSAFE
     assert rational_fit.safe(fit, MODEL * np.array([1, 1, 1, 1, 0.1, 1])) == rational_fit.UNSTABLE
+    assert rational_fit.safe(fit, MODEL * np.array([1, 1, 1, 1, 100, 1])) == rational_fit.SMOOTH
 
 
 def test_law_starts_with_the_resonances_of_the_drive_unless_others_are_given():

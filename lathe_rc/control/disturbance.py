@@ -46,17 +46,21 @@ from lathe_rc.control.rational_inverse import (
     RationalTable,
     at_sample,
     begin_at,
+    changed,
     forget_candidate,
     inverted,
     is_rational,
-    record,
-    revolve,
+    proved,
+    refit,
+    use_candidate,
 )
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
 
 _TURN = 2.0 * np.pi
 _SWINGS_IN = 10.0  # settling time of the drive, in units of a1
+
+_SETTLING = 3  # revolutions in which the filters settle while a memory is converted, and its own one
 
 # Indices in the integer state: current grid point, first grid point, whether there is a current grid point, number of
 # learned revolutions, whether a position has been received.
@@ -197,9 +201,7 @@ def fed_forward(m: DisturbanceTable, form: FormAhead, angle: float, speed: float
     value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
     second = speed * speed * bow + acceleration * slope
     plain = value + m.model[0] * speed * slope + m.model[1] * second
-    command = inverted(m.rational, FORM, plain, value, speed * slope, second)
-    record(m.rational, angle)
-    return command
+    return inverted(m.rational, FORM, plain, value, speed * slope, second)
 
 
 @kernel
@@ -308,8 +310,10 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
     state[_POINT] += 1
     if (state[_POINT] - state[_FIRST]) % points == 0:
         state[_REVOLUTIONS] += 1
-        if m.rational.fits and revolve(m.rational, m.model):
-            _take_over(m)
+        if m.rational.fits:
+            if proved(m.rational, m.model):
+                _take_over(m, form)
+            refit(m.rational)
         if m.identifies and not is_rational(m.rational):
             _adopt(m, form, speed)
         fade(m.fit)
@@ -340,11 +344,23 @@ def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
 
 
 @inlined
-def _take_over(m: DisturbanceTable) -> None:
-    """Put into memory and filters what a rational model adds to the feed-forward."""
-    for stage in range(m.learned.size):
-        m.learned[stage] += m.rational.more[OBSERVER]
-        m.learner.command[stage] += m.rational.more[LEARNER]
-    if m.memory.learns:
-        for point in range(m.memory.value.size):
-            m.memory.value[point] += m.rational.changes[point]
+def _take_over(m: DisturbanceTable, form: FormAhead) -> None:
+    """Use the candidate from now on; convert the memory to it at the nominal speed, and the filters."""
+    memory, points, end = m.memory, m.memory.value.size, m.state[_POINT]
+    if memory.learns:
+        speed, before = memory.nominal, memory.value[end & (points - 1)]
+        step = _TURN / (points * speed)
+        for i in range(end - _SETTLING * points, end):
+            value, slope, bow = derivatives_at(
+                form.heights, form.table, form.feed, form.start, form.part, i * (_TURN / points)
+            )
+            first, second = speed * slope, speed * speed * bow
+            plain = value + m.model[0] * first + m.model[1] * second
+            more = changed(m.rational, step, plain, value, first, second)
+            if i >= end - points:
+                memory.value[i & (points - 1)] += more
+        more = memory.value[end & (points - 1)] - before
+        for stage in range(m.learned.size):
+            m.learned[stage] += more
+            m.learner.command[stage] += more
+    use_candidate(m.rational)

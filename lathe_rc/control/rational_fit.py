@@ -35,15 +35,15 @@ _STAGES = 6  # of F; its fourth derivative needs four, two more suppress the noi
 _RIDGE = 1e-7  # weight of the present model, relative to the energy of a regressor
 _FORGETTING = 0.9  # of a revolution, at each later one
 _EXCITED = 1e-5  # energy of the difference of dx/dt that is needed, relative to that of dx/dt
-LEAST_DAMPING = 0.03  #: of the zeros
+LEAST_DAMPING, MOST_DAMPING = 0.03, 0.5  #: of the zeros that are identified; with more there is no resonance
 _PINNED = 1e6  # weight of b1 where the damping is too small, relative to its sum of squares
-_BETTER, _FAR_BETTER = 0.5, 0.25  # squared error of a new model over that of the one in use, of fourth or second order
+_BETTER = 0.7  # largest squared error of a candidate, relative to that of the model in use
 LEAST_MARGIN = 0.1  #: drive margin that a model must leave if the drive is the given one
 _WAVES = 64  # frequencies at which the margin is computed
 _REACH = 4.0  # the highest one, in units of the cut-off of S
 
-#: verdicts on a model: it is adopted, errs no less than the one in use, is not stable, leaves too small a margin
-ADOPTED, NO_BETTER, UNSTABLE, UNSAFE = range(4)
+#: verdicts on a model: it is adopted, its zeros are not damped, it has no resonance, it leaves too small a margin
+ADOPTED, UNSTABLE, SMOOTH, UNSAFE = range(1, 5)
 
 
 class JudgeTable(NamedTuple):
@@ -282,14 +282,15 @@ def safe(m: RationalFitTable, model: Array) -> int:
     """Return why a ``model`` cannot be used, or `ADOPTED`."""
     if not damped(model):
         return UNSTABLE
+    if model[B1] > 2.0 * MOST_DAMPING * np.sqrt(model[B2]):
+        return SMOOTH
     return ADOPTED if drive_margin(m.judge, model) >= LEAST_MARGIN else UNSAFE
 
 
 @kernel
 def better(m: RationalFitTable, model: Array, present: Array) -> bool:
     """Return whether a ``model`` errs less than the ``present`` one in the revolution that has ended."""
-    limit = _BETTER if present[A4] != 0.0 else _FAR_BETTER
-    return bool(_error(m.fresh, _scale(m, 1, model)) < limit * _error(m.fresh, _scale(m, 0, present)))
+    return bool(_error(m.fresh, _scale(m, 1, model)) < _BETTER * _error(m.fresh, _scale(m, 0, present)))
 
 
 @kernel

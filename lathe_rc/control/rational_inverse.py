@@ -8,10 +8,9 @@ The polynomial acts on a signal and its first two derivatives. The rest is a fil
 and the fourth derivative are not needed. The filter is integrated by the trapezoidal rule; its states are y and dy/dt
 of b2·d²y/dt² + b1·dy/dt + y = s0·x + s1·dx/dt.
 
-A new model is a candidate first. Its filters run beside those in use for a revolution, in which they settle, and for a
-second one, in which the difference of both feed-forwards is recorded over the angle. At its end the model is judged by
-measurements that it was not fitted to. If it is adopted, the difference goes into the memory: the command then does not
-change at that sample.
+A new model is a candidate for a revolution: its filters settle beside those in use. Then the model is judged
+by measurements that it was not fitted to. If it is adopted, the memory over the angle receives the difference of both
+responses to the form, at the nominal speed.
 
 Source: spec/resonance.md; rational feed-forward: Bolder, Oomen, van Zundert.
 """
@@ -31,7 +30,6 @@ from lathe_rc.control.rational_fit import (
     B1,
     B2,
     COEFFICIENTS,
-    NO_BETTER,
     JudgeTable,
     RationalFitTable,
     add_revolution,
@@ -44,16 +42,11 @@ from lathe_rc.jit import inlined, kernel
 
 _TURN = 2.0 * np.pi
 _Q0, _Q1, _Q2, _S0, _S1 = range(5)  # indices in a quotient
-FORM, OBSERVER, LEARNER = range(3)  #: signals with a filter of their own
-# Indices in the integer state: whether the rational model is in use, age of the candidate in revolutions (0: there is
-# none), number of logged verdicts, present sample, last recorded grid point.
-_USED, _AGE, _LOGGED, _SAMPLE, _PLACE = range(5)
+FORM, OBSERVER, LEARNER, STEADY = range(4)  #: signals with a filter of their own; the last: the form at nominal speed
+# Indices in the integer state: whether the rational model is in use, whether there is a candidate, number of logged
+# verdicts, present sample.
+_USED, _CANDIDATE, _LOGGED, _SAMPLE = range(4)
 _LOG = 64  # verdicts that the log keeps
-_BEFORE, _AT = (
-    3,
-    4,
-)  # indices behind the signals: change of the form's response at the sample before, and its grid point
-_SETTLED = 2  # age of a candidate from which its feed-forward is recorded
 
 
 class RationalTable(NamedTuple):
@@ -64,10 +57,7 @@ class RationalTable(NamedTuple):
         half: half a sampling step [s].
         model: coefficients of A and B in use, and of the candidate, shape (2, 6) [s, s², s³, s⁴, s, s²].
         quotient: q0, q1, q2, s0 and s1 of both, shape (2, 5).
-        rests: states y, dy/dt and input of the filters, by model and signal, shape (2, 3, 3).
-        more: response of the candidate minus the one in use by signal, that of the form one sample before, and the grid
-            point of the latter, shape (5,) [m].
-        changes: that of the form over the angle, shape (n,) [m].
+        rests: states y, dy/dt and input of the filters, and their signal, by model and signal, shape (2, 4, 4).
         fit: accumulated measurements.
         log: sample and verdict of each adoption and refusal, shape (n, 2); the newest at their number modulo n.
         state: integer state, indexed by the module's constants.
@@ -78,8 +68,6 @@ class RationalTable(NamedTuple):
     model: Array
     quotient: Array
     rests: Array
-    more: Array
-    changes: Array
     fit: RationalFitTable
     log: Integers
     state: Integers
@@ -97,25 +85,13 @@ def rational_inverse(
         bandwidth: that of the fit [rad/s].
         judge: memory loop for the margin of models; None: no model is fitted.
     """
-    model, quotient, state = np.zeros((2, COEFFICIENTS)), np.zeros((2, 5)), np.zeros(5, np.int64)
+    model, quotient, state = np.zeros((2, COEFFICIENTS)), np.zeros((2, 5)), np.zeros(4, np.int64)
     if given is not None:
         model[0], state[_USED] = given, 1
         divide(given, quotient[0])
-    size = points if judge else 1
-    fit = no_rational_measurements(bandwidth, step, size, judge)
-    rests, changes = np.zeros((2, 3, 3)), np.zeros(size)
-    return RationalTable(
-        judge is not None,
-        0.5 * step,
-        model,
-        quotient,
-        rests,
-        np.zeros(5),
-        changes,
-        fit,
-        np.zeros((_LOG, 2), np.int64),
-        state,
-    )
+    fit = no_rational_measurements(bandwidth, step, points if judge else 1, judge)
+    rests, log = np.zeros((2, 4, 4)), np.zeros((_LOG, 2), np.int64)
+    return RationalTable(judge is not None, 0.5 * step, model, quotient, rests, fit, log, state)
 
 
 @inlined
@@ -129,16 +105,28 @@ def divide(model: Array, quotient: Array) -> None:
 
 
 @inlined
-def _inverted(m: RationalTable, row: int, signal: int, value: float, first: float, second: float) -> float:
-    """Advance the filter of a model and a signal by a sample; return the response of A/B to the signal."""
-    quotient, rest, half = m.quotient[row], m.rests[row, signal], m.half
-    b1, b2 = m.model[row, B1], m.model[row, B2]
+def _inverted(
+    model: Array, quotient: Array, rest: Array, half: float, value: float, first: float, second: float
+) -> float:
+    """Advance the filter of a ``model`` by two ``half`` steps [s]; return the response of A/B to a signal."""
+    b1, b2 = model[B1], model[B2]
     v = quotient[_S0] * value + quotient[_S1] * first
     rate = rest[1] * (b2 - half * (b1 + half)) + half * (v + rest[2] - 2.0 * rest[0])
     rate /= b2 + half * (b1 + half)
     rest[0] += half * (rest[1] + rate)
-    rest[1], rest[2] = rate, v
+    rest[1], rest[2], rest[3] = rate, v, value
     return float(quotient[_Q0] * value + quotient[_Q1] * first + quotient[_Q2] * second + rest[0])
+
+
+@inlined
+def _in_use(
+    m: RationalTable, signal: int, half: float, second_order: float, value: float, first: float, second: float
+) -> float:
+    """Return the response of the model in use; that of ``second_order`` until one is adopted."""
+    if not m.state[_USED]:
+        m.rests[0, signal, 3] = value
+        return second_order
+    return _inverted(m.model[0], m.quotient[0], m.rests[0, signal], half, value, first, second)
 
 
 @inlined
@@ -153,10 +141,20 @@ def inverted(m: RationalTable, signal: int, second_order: float, value: float, f
         first: its first derivative [m/s].
         second: its second derivative [m/s²].
     """
-    found = _inverted(m, 0, signal, value, first, second) if m.state[_USED] else second_order
-    if m.state[_AGE]:
-        m.more[signal] = _inverted(m, 1, signal, value, first, second) - found
-    return found
+    if m.state[_CANDIDATE]:
+        _inverted(m.model[1], m.quotient[1], m.rests[1, signal], m.half, value, first, second)
+    return _in_use(m, signal, m.half, second_order, value, first, second)
+
+
+@inlined
+def changed(m: RationalTable, step: float, second_order: float, value: float, first: float, second: float) -> float:
+    """Return the response of the candidate minus that of the model in use to the form at the nominal speed [m].
+
+    Arguments as of `inverted`; the filters are advanced by a ``step`` [s].
+    """
+    half = 0.5 * step
+    more = _inverted(m.model[1], m.quotient[1], m.rests[1, STEADY], half, value, first, second)
+    return more - _in_use(m, STEADY, half, second_order, value, first, second)
 
 
 @inlined
@@ -180,48 +178,44 @@ def begin_at(m: RationalTable, position: float) -> None:
     """Set the filters to rest at the first measured position [m]."""
     m.fit.low.position[:] = m.fit.low.command[:] = position
     for signal in (OBSERVER, LEARNER):
-        m.rests[0, signal, 0] = m.rests[0, signal, 2] = m.quotient[0, _S0] * position
+        _rest(m, 0, signal, position)
 
 
 @inlined
-def record(m: RationalTable, angle: float) -> None:
-    """Record the change of the feed-forward at the grid points up to an angle [rad]."""
-    if m.state[_AGE] == 0:
-        return
-    here, before, now = angle * (m.changes.size / _TURN), m.more[_BEFORE], m.more[FORM]
-    place = int(np.floor(here))
-    for point in range(max(m.state[_PLACE] + 1, place - m.changes.size + 1), place + 1):
-        m.changes[point & (m.changes.size - 1)] = now + (before - now) * (here - point) / (here - m.more[_AT])
-    m.state[_PLACE] = max(place, m.state[_PLACE])
-    m.more[_BEFORE], m.more[_AT] = now, here
+def _rest(m: RationalTable, row: int, signal: int, value: float) -> None:
+    """Set the filter of a model and a signal to rest at a ``value`` of the signal [m]."""
+    rest = m.rests[row, signal]
+    rest[0] = rest[2] = m.quotient[row, _S0] * value
+    rest[1], rest[3] = 0.0, value
 
 
 @kernel
-def revolve(m: RationalTable, second_order: Array) -> bool:
-    """End a revolution: judge the candidate, or fit a new one; return whether it has taken over."""
-    fit, state, present, taken = m.fit, m.state, m.model[0], False
-    if not state[_USED]:  # A and B = 1 of the second order
-        present[A1], present[A2] = second_order[0], second_order[1]
-    if state[_AGE] == _SETTLED:
-        taken = better(fit, m.model[1], present)
-        _judged(m, ADOPTED if taken else NO_BETTER)
-        if taken:
-            _use(m)
-    elif state[_AGE]:
-        state[_AGE] += 1
-    add_revolution(fit, present)
-    if not state[_AGE] and fitted_model(fit, present, m.model[1]):
-        verdict = safe(fit, m.model[1])
-        if verdict == ADOPTED:
-            state[_AGE] = 1
-            divide(m.model[1], m.quotient[1])
-        else:
-            _judged(m, verdict)
-    return taken
+def proved(m: RationalTable, second_order: Array) -> bool:
+    """Return whether a candidate errs less in the revolution that has ended than the model in use."""
+    if not m.state[_USED]:  # A and B = 1 of the second order
+        m.model[0, A1], m.model[0, A2] = second_order[0], second_order[1]
+    return bool(m.state[_CANDIDATE] and better(m.fit, m.model[1], m.model[0]))
+
+
+@kernel
+def refit(m: RationalTable) -> None:
+    """Add the revolution that has ended to the measurements, and fit the next candidate."""
+    add_revolution(m.fit, m.model[0])
+    m.state[_CANDIDATE] = 0
+    if not fitted_model(m.fit, m.model[0], m.model[1]):
+        return
+    verdict = safe(m.fit, m.model[1])
+    if verdict != ADOPTED:
+        _log(m, verdict)
+        return
+    m.state[_CANDIDATE] = 1
+    divide(m.model[1], m.quotient[1])
+    for signal in (FORM, OBSERVER, LEARNER):
+        _rest(m, 1, signal, m.rests[0, signal, 3])
 
 
 @inlined
-def _use(m: RationalTable) -> None:
+def use_candidate(m: RationalTable) -> None:
     """Put the candidate in the place of the model in use."""
     m.state[_USED] = 1
     for k in range(COEFFICIENTS):
@@ -231,16 +225,17 @@ def _use(m: RationalTable) -> None:
     for signal in range(m.rests.shape[1]):
         for k in range(m.rests.shape[2]):
             m.rests[0, signal, k] = m.rests[1, signal, k]
+    _log(m, ADOPTED)
 
 
 @inlined
-def _judged(m: RationalTable, verdict: int) -> None:
-    """Log the verdict on the candidate, which is none any more."""
-    m.state[_AGE] = 0
-    if verdict != NO_BETTER:
-        row = m.state[_LOGGED] % _LOG
-        m.log[row, 0], m.log[row, 1] = m.state[_SAMPLE], verdict
-        m.state[_LOGGED] += 1
+def _log(m: RationalTable, verdict: int) -> None:
+    """Log the verdict on a model, a refusal unless it has the ground of the one before."""
+    if verdict != ADOPTED and verdict == m.log[(m.state[_LOGGED] - 1) % _LOG, 1]:
+        return
+    row = m.state[_LOGGED] % _LOG
+    m.log[row, 0], m.log[row, 1] = m.state[_SAMPLE], verdict
+    m.state[_LOGGED] += 1
 
 
 def verdicts(m: RationalTable, told: int) -> list[tuple[int, int]]:
@@ -252,4 +247,4 @@ def verdicts(m: RationalTable, told: int) -> list[tuple[int, int]]:
 @inlined
 def forget_candidate(m: RationalTable) -> None:
     """Discard the candidate, whose measurements have a gap."""
-    m.state[_AGE] = 0
+    m.state[_CANDIDATE] = 0

@@ -37,8 +37,11 @@ from lathe_rc.control.rational_fit import (
     ADOPTED,
     LEAST_DAMPING,
     LEAST_MARGIN,
+    MOST_DAMPING,
     RATIONAL_BAND,
+    SMOOTH,
     UNSAFE,
+    UNSTABLE,
     damped,
     inverse_response,
     judge_of,
@@ -48,6 +51,11 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 
 MODEL_ADOPTED, MODEL_REFUSED = "model adopted", "model refused"  #: events of the identification of fourth order
+_WHY = {
+    UNSTABLE: "it is not stable",
+    SMOOTH: f"it has no resonance (damping of the zeros above {MOST_DAMPING:g})",
+    UNSAFE: f"drive margin below {LEAST_MARGIN:g}",
+}
 
 
 class DisturbanceControllerParameters(FormLawParameters):
@@ -222,8 +230,7 @@ class DisturbanceController(FormLaw):
         """Return the events that a model has been adopted, or refused as unsafe."""
         told = super().tell(first, end)
         for index, verdict in verdicts(self.law.known.rational, self._verdicts):
-            why = f"drive margin below {LEAST_MARGIN:g}" if verdict == UNSAFE else "it is not stable"
-            action = MODEL_ADOPTED if verdict == ADOPTED else f"{MODEL_REFUSED}: {why}"
+            action = MODEL_ADOPTED if verdict == ADOPTED else f"{MODEL_REFUSED}: {_WHY[verdict]}"
             told.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
             self._verdicts += 1
         return told
