@@ -12,8 +12,9 @@ The error is that of the equation, weighted by |F|² alone. A division by the B 
 Koerner; Steiglitz and McBride) weights the antiresonance more, where a form has no waves, and gives larger errors of
 the form.
 
-Where the measurements do not determine a coefficient, a ridge holds it at its present value. At constant speed nothing
-is fitted. Early revolutions, in which the error is large, have a small weight.
+Where the measurements do not determine a coefficient, a ridge holds it at its present value. At constant speed a model
+is fitted only while the memory, and thus the command, still changes. Early revolutions, in which the error is large,
+have a small weight.
 
 Source: spec/resonance.md.
 """
@@ -34,9 +35,8 @@ RATIONAL_BAND = 5655.0  #: default bandwidth of F [rad/s], 900 Hz
 _STAGES = 6  # of F; its fourth derivative needs four, two more suppress the noise
 _RIDGE = 1e-7  # weight of the present model, relative to the energy of a regressor
 _FORGETTING = 0.9  # of a revolution, at each later one
-_EXCITED = 1e-5  # energy of the difference of dx/dt that is needed, relative to that of dx/dt
+_EXCITED = 1e-4  # energy of the difference of dx/dt that is needed, relative to that of dx/dt
 LEAST_DAMPING, MOST_DAMPING = 0.03, 0.5  #: of the zeros that are identified; with more there is no resonance
-_PINNED = 1e6  # weight of b1 where the damping is too small, relative to its sum of squares
 _BETTER = 0.7  # largest squared error of a candidate, relative to that of the model in use
 LEAST_MARGIN = 0.1  #: drive margin that a model must leave if the drive is the given one
 _WAVES = 64  # frequencies at which the margin is computed
@@ -181,15 +181,12 @@ def sum_up_rational(m: RationalFitTable, here: int, again: bool) -> None:  # noq
 
 
 @kernel
-def _solved(m: RationalFitTable, present: Array, pin: float, found: Array) -> bool:
-    """Solve the normal equations with the ridge by Cholesky's method; ``pin`` above 0 is the wanted b1 [1]."""
+def _solved(m: RationalFitTable, present: Array, found: Array) -> bool:
+    """Solve the normal equations with the ridge by Cholesky's method."""
     size, low = found.size, m.factor
     for i in range(size):
-        found[i] = m.sums[i, size] + _RIDGE * m.sums[size + 1, i] * present[i]
         more = _RIDGE * m.sums[size + 1, i]
-        if i == B1 and pin > 0.0:
-            more += _PINNED * m.sums[i, i]
-            found[i] += _PINNED * m.sums[i, i] * pin
+        found[i] = m.sums[i, size] + more * present[i]
         for j in range(i + 1):
             value = m.sums[j, i]
             if i == j:
@@ -228,8 +225,7 @@ def _squares(sums: Array, model: Array) -> float:
 @inlined
 def damped(a: Array) -> bool:
     """Return whether the zeros of a model are damped, and the drive is a lag at low frequencies."""
-    # A little less than the damping to which a fit is held, for it holds it by a large weight.
-    zeros = a[B2] > 0.0 and a[B1] > 1.9 * LEAST_DAMPING * np.sqrt(a[B2])
+    zeros = a[B2] > 0.0 and a[B1] > 2.0 * LEAST_DAMPING * np.sqrt(a[B2])
     return bool(zeros and a[A1] > 0.0 and a[A2] > 0.0 and a[A4] != 0.0)
 
 
@@ -307,11 +303,8 @@ def add_revolution(m: RationalFitTable, present: Array) -> None:
 @kernel
 def fitted_model(m: RationalFitTable, present: Array, model: Array) -> bool:
     """Fit a ``model``, shape (6,); return False if the measurements do not determine it."""
-    scaled, found = _scale(m, 0, present), m.found
-    if not m.sums[0, 0] > _EXCITED * m.sums[COEFFICIENTS + 1, 0] or not _solved(m, scaled, 0.0, found):
-        return False
-    least = 2.0 * LEAST_DAMPING * np.sqrt(max(found[B2], 0.0))
-    if found[B1] < least and not _solved(m, scaled, least, found):
+    found = m.found
+    if not m.sums[0, 0] > _EXCITED * m.sums[COEFFICIENTS + 1, 0] or not _solved(m, _scale(m, 0, present), found):
         return False
     for k in range(COEFFICIENTS):
         model[k] = found[k] / m.powers[k]
