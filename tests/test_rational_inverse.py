@@ -91,7 +91,7 @@ def test_a_model_is_identified_at_constant_speed_while_the_memory_still_learns()
     assert error < 0.8 * before
 
 
-def test_a_drive_without_resonance_is_inverted_by_the_second_order_to_the_bit():
+def test_a_drive_of_second_order_is_inverted_as_before_to_the_bit():
     second, fourth = (
         lathe_rc.run(config("robust_cutting", "spindle_encoder.revolutions=12", f"controller.inverse={order}"))
         for order in ("second_order", "fourth_order")
