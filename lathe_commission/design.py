@@ -147,6 +147,10 @@ _FLAT_OF_CYCLES = _FLAT[:: len(_SHAPES)]  # those that several cycles are weight
 _SMOOTH: list[Values] = [{"q_time": float(width)} for width in _WIDTHS]
 _CYCLES: Sequence[list[float]] = [[1.0] * count for count in (2, 4, 8)]
 _PROCESSES: Sequence[list[float]] = [of_gaussian_process(8, *each) for each in ((10.0, 0.3), (30.0, 1.0), (100.0, 3.0))]
+_DISTURBANCE: list[Values] = [
+    {"learned_waves": waves, "learning_bandwidth": bandwidth, "observer_bandwidth": observer}
+    for waves, bandwidth, observer in product(_WAVES, _LEARNING, _OBSERVERS)
+]
 _INVERSE: Values = {"correction": "second_order_inverse"}
 #: laws by name
 LAWS: Mapping[str, Law] = {
@@ -176,14 +180,9 @@ LAWS: Mapping[str, Law] = {
         [{"highest_order": orders, "change_weight": weight} for orders in _ORDERS for weight in _WEIGHTS],
         "",
     ),
-    "disturbance": Law(
-        "disturbance_controller",
-        {"identify": False},
-        [
-            {"learned_waves": waves, "learning_bandwidth": bandwidth, "observer_bandwidth": observer}
-            for waves, bandwidth, observer in product(_WAVES, _LEARNING, _OBSERVERS)
-        ],
-        "",
+    "disturbance": Law("disturbance_controller", {"identify": False}, _DISTURBANCE, ""),
+    "disturbance, resonance": Law(
+        "disturbance_controller", {"identify": False, "inverse": "fourth_order"}, _DISTURBANCE, ""
     ),
 }  # fmt: skip
 
@@ -392,10 +391,16 @@ class Design:
         """
         found = []
         for name, law in LAWS.items():
-            if {"measured": self._measured, "notch": self._resonances}.get(law.lead, True):
+            if self._applies(law):
                 watch(name)
                 found.append(self._candidate(name, law))
         return sorted(found, key=_rank)
+
+    def _applies(self, law: Law) -> bool:
+        """Return whether the drive is known as a law needs it: with measured points, or with resonances."""
+        if "inverse" in law.fixed:
+            return any("inverse.denominator" in each for each in self._base.nodes[self._node].drive_models().values())
+        return bool({"measured": self._measured, "notch": self._resonances}.get(law.lead, True))
 
     def _with(self, base: Scenario, law: Law, values: Values) -> Scenario:
         """Return a scenario with a law in place of its learning controller."""

@@ -73,6 +73,7 @@ LAWS: dict[str, cells.Values] = {
     "ours": {
         **_ANY, "stage": "disturbance_controller", "identification_bandwidth": 3000.0,
         "learned_waves": 7.5, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0,
+        "inverse": "fourth_order", "model_denominator": [], "model_numerator": [], "expected_deviation": 0.015,
     },
 }  # fmt: skip
 
@@ -193,7 +194,7 @@ class Oval3000Result:
             axes.set(xlabel="largest form error [µm]", title=condition)
             axes.grid(visible=True, alpha=0.3)
         panels[0].set_ylabel("drives below [%]")
-        panels[0].legend(fontsize=7)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize=7)
 
 
 def _range_of(values: Array) -> str:

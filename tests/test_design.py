@@ -85,6 +85,18 @@ def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
     assert run.errors.largest[-10:].max() * 1e6 == pytest.approx(found["laws"][0]["largest_um"]["nominal"], rel=1e-12)
 
 
+def test_the_inverse_with_a_resonance_errs_less_with_a_drive_that_has_one(monkeypatch):
+    """It starts with the model of the fitted drive; for a drive without modes it is not a law of its own."""
+    settings = [{"learned_waves": 8.0, "learning_bandwidth": 8000.0, "observer_bandwidth": 0.0}]
+    names = ("disturbance", "disturbance, resonance")
+    monkeypatch.setattr(design, "LAWS", {name: replace(design.LAWS[name], filters=settings) for name in names})
+    varied = config("piston", *FAST, "spindle_encoder.random_rms=0.03", "spindle_encoder.counts_per_revolution=100000")
+    found = {each.law: each for each in Design(varied, [DRIVE], 0.1).candidates()}
+    assert not any(each.reason for each in found.values())
+    assert found[names[1]].nominal.largest < 0.7 * found[names[0]].nominal.largest
+    assert [each.law for each in Design(varied, [{}], 0.1).candidates()] == [names[0]]
+
+
 def test_a_margin_that_no_law_keeps_is_said_and_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(design, "LAWS", {"lead, Gaussian Q": design.LAWS["lead, Gaussian Q"]})
     monkeypatch.chdir(tmp_path)

@@ -84,6 +84,7 @@ TABLE = {
     "piezo.png": _script("piezo", 30, "drives"),
     "predistortion.png": _script("predistortion", 5, "force_position"),
     "compare.png": _photograph("report_screenshot", "view.md", " chromium turned"),
+    "resonance_map.png": _script("resonance_map", 120, "robust"),
     "report.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_dark.png": _photograph("report_screenshot", "view.md", " chromium turned"),
     "report_force.png": _photograph("report_screenshot", "force_position.md", " chromium turned"),

@@ -38,11 +38,29 @@ from lathe_rc.control.identification import (
     pass_through,
     sum_up,
 )
+from lathe_rc.control.rational_fit import forget_rational, put_latest, sum_up_rational
+from lathe_rc.control.rational_inverse import (
+    FORM,
+    LEARNER,
+    OBSERVER,
+    RationalTable,
+    at_sample,
+    begin_at,
+    changed,
+    forget_candidate,
+    inverted,
+    is_rational,
+    proved,
+    refit,
+    use_candidate,
+)
 from lathe_rc.jit import inlined, kernel
 from lathe_rc.signals.profile_table import derivatives_at
 
 _TURN = 2.0 * np.pi
 _SWINGS_IN = 10.0  # settling time of the drive, in units of a1
+
+_SETTLING = 3  # revolutions in which the filters settle while a memory is converted, and its own one
 
 # Indices in the integer state: current grid point, first grid point, whether there is a current grid point, number of
 # learned revolutions, whether a position has been received.
@@ -79,6 +97,7 @@ class DisturbanceTable(NamedTuple):
         fit: accumulated measurements for fitting the model.
         point: sums of the current grid point.
         state: integer state, indexed by the module's constants.
+        rational: rational inverse in place of the model of second order.
     """
 
     step: float
@@ -98,6 +117,7 @@ class DisturbanceTable(NamedTuple):
     fit: FitTable
     point: Array
     state: Integers
+    rational: RationalTable
 
 
 def disturbance(
@@ -115,6 +135,7 @@ def disturbance(
     identification_bandwidth: float,
     identify: bool,
     identification_forgetting: float,
+    rational: RationalTable,
 ) -> DisturbanceTable:
     """Create a disturbance model in its initial state, with an empty memory.
 
@@ -132,6 +153,7 @@ def disturbance(
         identification_bandwidth: bandwidth of the identification [rad/s].
         identify: whether the model is identified.
         identification_forgetting: forgetting factor applied to the measurements once per revolution.
+        rational: rational inverse in its initial state.
 
     Raises:
         InputError: the filter S is wider than a revolution.
@@ -159,6 +181,7 @@ def disturbance(
         fit=no_measurements(given, points_per_revolution, identification_forgetting),
         point=np.zeros(6),
         state=np.zeros(5, np.int64),
+        rational=rational,
     )
 
 
@@ -168,6 +191,17 @@ def forget(m: DisturbanceTable) -> None:
     forget_measurements(m.fit)
     m.point[:] = 0.0
     m.state[:_SEEN] = 0
+    forget_rational(m.rational.fit)
+    forget_candidate(m.rational)
+
+
+@kernel
+def fed_forward(m: DisturbanceTable, form: FormAhead, angle: float, speed: float, acceleration: float) -> float:
+    """Return the command [m] for the form at an angle [rad], a speed [rad/s] and dΩ/dt [rad/s²]."""
+    value, slope, bow = derivatives_at(form.heights, form.table, form.feed, form.start, form.part, angle)
+    second = speed * speed * bow + acceleration * slope
+    plain = value + m.model[0] * speed * slope + m.model[1] * second
+    return inverted(m.rational, FORM, plain, value, speed * slope, second)
 
 
 @kernel
@@ -205,6 +239,7 @@ def observed(
         m.state[_SEEN] = 1
         m.observer.position[:] = m.learner.position[:] = m.identifier.position[:] = position
         m.observer.command[:] = m.learner.command[:] = m.identifier.command[:] = position
+        begin_at(m.rational, position)
     found = 0.0
     if m.observes:
         low = m.observer
@@ -213,27 +248,31 @@ def observed(
         pass_through(m.learned, known, low.keep, low.take)
         first, second = derivatives(low.position, low.bandwidth)
         found = low.position[STAGES] + m.model[0] * first + m.model[1] * second
+        found = inverted(m.rational, OBSERVER, found, low.position[STAGES], first, second)
         found -= low.command[STAGES] + m.learned[STAGES]
     if m.memory.learns or m.identifies:
         low = m.learner
         pass_through(low.position, position, low.keep, low.take)
         pass_through(low.command, command + known, low.keep, low.take)
+        first, second = derivatives(low.position, low.bandwidth)
+        beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second
+        beyond = inverted(m.rational, LEARNER, beyond, low.position[STAGES], first, second) - low.command[STAGES]
         low = m.identifier
         pass_through(low.position, position, low.keep, low.take)
         pass_through(low.command, command, low.keep, low.take)
+        at_sample(m.rational, sample, position, command)
         if learning and sample >= m.begins:
-            _measure(m, form, angle, speed)
+            _measure(m, form, angle, speed, beyond)
         else:
             m.state[_BEGUN] = 0
+            forget_candidate(m.rational)
     return found
 
 
 @inlined
-def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -> None:
+def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float, beyond: float) -> None:
     """Add a sample to its grid point, and complete the grid points already passed."""
     low, point, state = m.learner, m.point, m.state
-    first, second = derivatives(low.position, low.bandwidth)
-    beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second - low.command[STAGES]
     lag = STAGES / low.bandwidth  # of the low-pass for slow signals, which thus belong to an earlier angle
     place = int(np.floor((angle - speed * lag) * (m.memory.value.size / _TURN)))
     low = m.identifier
@@ -248,6 +287,8 @@ def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float) -
         point[_SPEED] = speed / m.memory.nominal - 1.0
         point[_VELOCITY], point[_ACCELERATION] = derivatives(low.position, low.bandwidth)
         point[_REST] = low.command[STAGES] - low.position[STAGES]
+        if m.rational.fits:
+            put_latest(m.rational.fit)
 
 
 @kernel
@@ -263,11 +304,17 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
     if m.identifies and point[_COUNT] > 0.0:
         again = state[_POINT] - state[_FIRST] >= points
         sum_up(m.fit, here, again, point[_VELOCITY], point[_ACCELERATION], point[_REST])
+        if m.rational.fits:
+            sum_up_rational(m.rational.fit, here, again)
     point[_SUM] = point[_COUNT] = 0.0
     state[_POINT] += 1
     if (state[_POINT] - state[_FIRST]) % points == 0:
         state[_REVOLUTIONS] += 1
-        if m.identifies:
+        if m.rational.fits:
+            if proved(m.rational, m.model):
+                _take_over(m, form)
+            refit(m.rational)
+        if m.identifies and not is_rational(m.rational):
             _adopt(m, form, speed)
         fade(m.fit)
         revolution_ended(m.memory, state[_REVOLUTIONS])
@@ -294,3 +341,26 @@ def _adopt(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
             form.heights, form.table, form.feed, form.start, form.part, (i + 0.5) * _TURN / points
         )
         m.memory.value[i & (points - 1)] += more1 * speed * slope + more2 * speed**2 * bow
+
+
+@inlined
+def _take_over(m: DisturbanceTable, form: FormAhead) -> None:
+    """Use the candidate from now on; convert the memory to it at the nominal speed, and the filters."""
+    memory, points, end = m.memory, m.memory.value.size, m.state[_POINT]
+    if memory.learns:
+        speed, before = memory.nominal, memory.value[end & (points - 1)]
+        step = _TURN / (points * speed)
+        for i in range(end - _SETTLING * points, end):
+            value, slope, bow = derivatives_at(
+                form.heights, form.table, form.feed, form.start, form.part, i * (_TURN / points)
+            )
+            first, second = speed * slope, speed * speed * bow
+            plain = value + m.model[0] * first + m.model[1] * second
+            more = changed(m.rational, step, plain, value, first, second)
+            if i >= end - points:
+                memory.value[i & (points - 1)] += more
+        more = memory.value[end & (points - 1)] - before
+        for stage in range(m.learned.size):
+            m.learned[stage] += more
+            m.learner.command[stage] += more
+    use_candidate(m.rational)

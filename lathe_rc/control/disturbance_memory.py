@@ -78,6 +78,13 @@ def smoothing(waves: float, points: int) -> Array:
     return np.asarray(twiced)
 
 
+def smoothing_response(waves: float, points: int, at: Array) -> Array:
+    """Compute the response of S, arguments as for `smoothing`, ``at`` waves per revolution, shape (n,)."""
+    taps = smoothing(waves, points)
+    places = np.arange(taps.size) - taps.size // 2
+    return np.asarray(np.cos(2 * np.pi / points * np.outer(at, places)) @ taps)
+
+
 def empty_memory(nominal: float, gain: float, waves: float, points: int, *, follows_speed: bool) -> MemoryTable:
     """Create an empty memory; arguments as for `lathe_rc.control.disturbance.disturbance`."""
     spread = np.zeros((3, points))

@@ -42,23 +42,23 @@ class LowPass(NamedTuple):
     command: Array
 
 
-def low_pass(bandwidth: float, step: float) -> LowPass:
+def low_pass(bandwidth: float, step: float, stages: int = STAGES) -> LowPass:
     """Create a low-pass with a given ``bandwidth`` [rad/s], at rest at 0; ``step`` is in s."""
     half = 0.5 * bandwidth * step
     return LowPass(
-        bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(STAGES + 1), np.zeros(STAGES + 1)
+        bandwidth, (1.0 - half) / (1.0 + half), half / (1.0 + half), np.zeros(stages + 1), np.zeros(stages + 1)
     )
 
 
 @inlined
 def pass_through(stages: Array, value: float, keep: float, take: float) -> None:
     """Advance the low-pass of one signal by one sample."""
-    new = value
-    for stage in range(STAGES):
+    new, last = value, stages.size - 1
+    for stage in range(last):
         old = stages[stage]
         stages[stage] = new
         new = keep * stages[stage + 1] + take * (new + old)
-    stages[STAGES] = new
+    stages[last] = new
 
 
 @inlined

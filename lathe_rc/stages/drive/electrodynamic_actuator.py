@@ -11,6 +11,8 @@ from annotated_types import Ge, Le
 from lathe_rc import resources
 from lathe_rc.analysis.learning import Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive, read_points
+from lathe_rc.analysis.modal_drive import OPTIONAL, ModalDrive
+from lathe_rc.analysis.rational_model import of_modal_drive
 from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.errors import InputError
@@ -96,11 +98,20 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         return Modes(*map(tuple, (*of_modes, self.lag_time, self.lag_participation)))
 
     def drive_models(self) -> Mapping[str, Mapping[str, float | list[float]]]:
-        """Quantities of the second-order drive that controllers may know, by command topic."""
+        """Quantities of the drive that controllers may know, by command topic: of second and of fourth order."""
         frequency, damping = self.natural_frequency, self.damping
         if self.mode_velocity or self.lag_time:
             frequency, damping = self._modes().model(frequency, damping)
-        return {"coarse/command": {"natural_frequency": frequency, "damping": damping, "delay": self.delay}}
+        known: dict[str, float | list[float]] = {
+            "natural_frequency": frequency, "damping": damping, "delay": self.delay
+        }  # fmt: skip
+        if (model := of_modal_drive(self._modal_drive())) is not None:
+            known |= {"inverse.denominator": model[:4].tolist(), "inverse.numerator": model[4:].tolist()}
+        return {"coarse/command": known}
+
+    def _modal_drive(self) -> ModalDrive:
+        lists = {name: tuple(getattr(self, name)) for name in OPTIONAL}
+        return ModalDrive(self.natural_frequency, self.damping, self.delay, gain=self.gain, **lists)
 
 
 @kernel

@@ -9,22 +9,53 @@ angle and reads it ahead, and compensates the rest with a disturbance observer. 
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from itertools import product
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
+from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
 from lathe_rc.arrays import Array, Complex
+from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import NonNegative, Positive, Value, about, parameter
 from lathe_rc.control.angle_filter import AngleFilterTable, at, follow
-from lathe_rc.control.disturbance import DisturbanceTable, FormAhead, commanded, disturbance, forget, observed
-from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing, with_gain
+from lathe_rc.control.disturbance import (
+    DisturbanceTable,
+    FormAhead,
+    commanded,
+    disturbance,
+    fed_forward,
+    forget,
+    observed,
+)
+from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing_response, with_gain
+from lathe_rc.control.rational_fit import (
+    ADOPTED,
+    LEAST_DAMPING,
+    LEAST_MARGIN,
+    MOST_DAMPING,
+    RATIONAL_BAND,
+    SMOOTH,
+    UNSAFE,
+    UNSTABLE,
+    damped,
+    inverse_response,
+    judge_of,
+)
+from lathe_rc.control.rational_inverse import RationalTable, rational_inverse, verdicts
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.stages.common.tables import made_of
-from lathe_rc.stages.learning.form_law import FormLaw, FormLawParameters, feed_forward
+from lathe_rc.stages.learning.form_law import FormLaw, FormLawParameters
 from lathe_rc.stages.learning.law import Now
+
+MODEL_ADOPTED, MODEL_REFUSED = "model adopted", "model refused"  #: events of the identification of fourth order
+_WHY = {
+    UNSTABLE: "it is not stable",
+    SMOOTH: f"it has no resonance (damping of the zeros above {MOST_DAMPING:g})",
+    UNSAFE: f"drive margin below {LEAST_MARGIN:g}",
+}
 
 
 class DisturbanceControllerParameters(FormLawParameters):
@@ -50,6 +81,20 @@ class DisturbanceControllerParameters(FormLawParameters):
         0.7, "weight that a revolution's measurements keep after the next"
     )
 
+    inverse: Literal["second_order", "fourth_order"] = parameter(
+        "second_order", "of the drive; fourth_order: with one resonance, which is identified unless identify is false"
+    )
+    inverse_bandwidth: Positive = parameter(
+        RATIONAL_BAND, "bandwidth of its identification: about twice the highest frequency of the form", "rad/s"
+    )
+    model_denominator: list[float] = parameter(
+        [],
+        "drive model of fourth order: a1 to a4 of 1 + a1·p + ... + a4·p⁴; empty: that of second order at first",
+        "s^k",
+        drive="inverse.denominator",
+    )
+    model_numerator: list[float] = parameter([], "its b1 and b2 of 1 + b1·p + b2·p²", "s^k", drive="inverse.numerator")
+
     def make(self, node: str) -> DisturbanceTable:
         """Return the state before the first sample.
 
@@ -61,7 +106,41 @@ class DisturbanceControllerParameters(FormLawParameters):
             raise InputError(f"{node}.points_per_revolution = {points}; allowed: a power of 2, 64 up to 65536")
         with about(node, "learned_waves"):
             model = (self.model_natural_frequency, self.model_damping, self.model_delay)
-            return made_of(disturbance, self, model=model)
+            return made_of(disturbance, self, model=model, rational=self._rational(node))
+
+    def coefficients(self, node: str) -> Array:
+        """Return a1 to a4, b1 and b2 of the model in use at first [s, s², s³, s⁴, s, s²], shape (6,).
+
+        Raises:
+            InputError: there are not as many, or B has roots that are not damped.
+        """
+        given = len(self.model_denominator), len(self.model_numerator)
+        if self.inverse == "second_order" or given == (0, 0):
+            return np.array([*self.second_order, 0.0, 0.0, 0.0, 0.0])
+        if given != (4, 2):
+            raise InputError(
+                f"{node}.model_denominator and model_numerator have {given[0]} and {given[1]} coefficients; allowed: "
+                "4 and 2, or none"
+            )
+        if not damped(found := np.array([*self.model_denominator, *self.model_numerator])):
+            raise InputError(
+                f"{node}.model_numerator = {self.model_numerator}: zeros that are not damped, or a4 = 0; allowed: "
+                f"a4 not 0, and zeros with a damping of {LEAST_DAMPING:g} or more"
+            )
+        return found
+
+    def _rational(self, node: str) -> RationalTable:
+        model, judge = self.coefficients(node), None
+        if self.inverse == "fourth_order" and self.identify:
+            late = self.model_delay + self.feedback_delay * self.step
+            judge = made_of(judge_of, self, model=model, late=late)
+        return rational_inverse(
+            model if model[-1] else None,
+            step=self.step,
+            points=self.points_per_revolution,
+            bandwidth=self.inverse_bandwidth,
+            judge=judge,
+        )
 
 
 class Memory(NamedTuple):
@@ -92,7 +171,7 @@ def sample(memory: Memory, now: Now) -> float:
         angle, speed, _ = at(spindle, -memory.late)
         found = observed(known, memory.form, now.sample, angle, speed, now.position, now.learning)
     angle, speed, acceleration = at(spindle, memory.ahead)
-    command = feed_forward(memory.form, known.model[0], known.model[1], angle, speed, acceleration)
+    command = fed_forward(known, memory.form, angle, speed, acceleration)
     command -= expected(known.memory, angle, speed) + found
     commanded(known, now.sample, command)
     return command
@@ -101,15 +180,14 @@ def sample(memory: Memory, now: Now) -> float:
 @lru_cache(maxsize=64)
 def _passed(learned_waves: float, points: int, waves: bytes) -> Array:
     """Return the response of the filter S at waves per revolution given as bytes, cached: each margin asks again."""
-    taps = smoothing(learned_waves, points)
-    places = np.arange(taps.size) - taps.size // 2
-    return np.asarray(np.cos(2 * np.pi / points * np.outer(np.frombuffer(waves), places)) @ taps)
+    return smoothing_response(learned_waves, points, np.frombuffer(waves))
 
 
 class DisturbanceController(FormLaw):
     """Law that feeds the form forward, learns the disturbance and observes the rest."""
 
     kind = "disturbance_controller"
+    announces: ClassVar[tuple[str, ...]] = (*FormLaw.announces, MODEL_ADOPTED, MODEL_REFUSED)
     Parameters = DisturbanceControllerParameters
     parameters: DisturbanceControllerParameters
     tunable = ("learning_gain",)
@@ -121,6 +199,7 @@ class DisturbanceController(FormLaw):
 
     def __init__(self, name: str, parameters: DisturbanceControllerParameters) -> None:
         parameters.make(name)  # rejects invalid parameters
+        self._verdicts = 0
         super().__init__(name, parameters)
 
     def start(self) -> Memory:
@@ -147,6 +226,15 @@ class DisturbanceController(FormLaw):
         model = f"{parameters.model_natural_frequency:.4g} rad/s, {parameters.model_damping:.3g}"
         return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
 
+    def tell(self, first: int, end: int) -> list[Sparse]:
+        """Return the events that a model has been adopted, or refused as unsafe."""
+        told = super().tell(first, end)
+        for index, verdict in verdicts(self.law.known.rational, self._verdicts):
+            action = MODEL_ADOPTED if verdict == ADOPTED else f"{MODEL_REFUSED}: {_WHY[verdict]}"
+            told.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
+            self._verdicts += 1
+        return told
+
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
         """Return candidate remedies: fewer learned waves, a slower observer, or both where neither suffices alone."""
         parameters = self.parameters
@@ -160,9 +248,9 @@ class DisturbanceController(FormLaw):
 
     def _model_error(self, drive: Response, frequency: Array) -> Complex:
         """Return the model error E = Wi/Ŵi - 1, the delays included."""
-        a1, a2 = self.parameters.inverse
         p = 1j * frequency
-        return np.asarray(drive(frequency) * (1.0 + a1 * p + a2 * p * p) * np.exp(p * self.parameters.model_delay) - 1)
+        inverse = inverse_response(self.parameters.coefficients(self.name), frequency)
+        return np.asarray(drive(frequency) * inverse * np.exp(p * self.parameters.model_delay) - 1)
 
     def factors(self, drive: Response, waves: Array, speed: float) -> Complex:
         """Return the factor E·L of the observer and that of the memory, with the given model, shape (2, n)."""

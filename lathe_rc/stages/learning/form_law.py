@@ -72,7 +72,7 @@ class FormLawParameters(LawParameters, FormParameters):
     commanded_topic: ClassVar[str] = "coarse/command"
 
     @property
-    def inverse(self) -> tuple[float, float]:
+    def second_order(self) -> tuple[float, float]:
         """Coefficients a1 [s] and a2 [s²] of the model."""
         return 2.0 * self.model_damping / self.model_natural_frequency, 1.0 / self.model_natural_frequency**2
 
@@ -176,7 +176,7 @@ class FormLaw(Law):
         """Return the feed-forward in its initial state, before sample 0."""
         parameters = self.parameters
         return ForwardTable(
-            self.make_filter(), self.form, *parameters.inverse, parameters.model_delay, parameters.feedback_delay
+            self.make_filter(), self.form, *parameters.second_order, parameters.model_delay, parameters.feedback_delay
         )
 
     def largest_delay(self, speed: float, acceleration: float, count: float, speed_window: float) -> int:

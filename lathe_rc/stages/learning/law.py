@@ -184,7 +184,7 @@ class Law(Sampled, Learner):
     parameters: LawParameters
     senses: ClassVar[bool] = False
     actions = ("freeze", "learn", "clear")
-    announces = (OUT_OF_REACH,)
+    announces: ClassVar[tuple[str, ...]] = (OUT_OF_REACH,)
     stops: ClassVar[Mapping[int, str]] = {**Learner.stops, _DIVERGED: "diverged: the error has grown beyond stop_ratio"}
     sample: ClassVar[Callable[[Any, Now], float]]
     loop = staticmethod(_loop)

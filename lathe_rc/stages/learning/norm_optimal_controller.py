@@ -126,7 +126,7 @@ class NormOptimalController(FormLaw):
         )
 
     def _model(self, frequency: Array) -> Complex:
-        a1, a2 = self.parameters.inverse
+        a1, a2 = self.parameters.second_order
         return np.asarray(1.0 / (1.0 + 1j * frequency * a1 - frequency**2 * a2))
 
     def contraction(self, drive: Response, waves: Array, speed: float) -> Complex:

@@ -98,7 +98,7 @@ class ResonantController(FormLaw):
         """Return D and F of the characteristic function at a constant ``speed`` [rad/s], shape (n,) each."""
         parameters, back = self.parameters, np.exp(-1j * frequency * self.parameters.step)
         late = parameters.feedback_delay * parameters.step
-        a1, a2 = parameters.inverse
+        a1, a2 = parameters.second_order
         turn = speed * parameters.step
         # With t = k·turn, the sum of Re C·e^{jtn}/zⁿ over n is (Re C - Re(C·e^{-jt})/z)/(1 - 2·cos(t)/z + 1/z²).
         own, orders = (1.0 - back) / (1.0 - np.exp(-turn) * back), 1.0 / (1.0 - back)
