@@ -7,6 +7,8 @@ The core, ``lathe_rc``, runs cells, reads and writes bags, and judges and shows 
 core and never each other; only this table knows all of them. A package that is taken away takes its commands along.
 """
 
+from importlib.util import find_spec
+
 COMMANDS_OF = {
     "lathe_rc": {
         "bag": "Show, check, copy and recover bags; extract a tachogram.",
@@ -48,8 +50,8 @@ COMMANDS_OF = {
 }  #: summaries of the commands, by package and name
 
 OURS = frozenset([*COMMANDS_OF, "lathe_papers"])  #: packages of this distribution
-
-COMMANDS = dict(sorted((name, text) for table in COMMANDS_OF.values() for name, text in table.items()))
+_HERE = {package: table for package, table in COMMANDS_OF.items() if find_spec(package)}
+COMMANDS = dict(sorted((name, text) for table in _HERE.values() for name, text in table.items()))
 _BESIDES = {"container": "node"}  # commands defined in another command's module
 
 #: modules of the executables that are no member of a cell

@@ -2,13 +2,17 @@
 """Data of the package for ROS and pip: its dependencies, executables and tests."""
 
 import ast
+import re
 import runpy
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 import setuptools
+
+from lathe_rc.catalogue import COMMANDS_OF, OURS
 
 ROOT = Path(__file__).parents[1]
 #: rosdep keys by requirement; None: rosdep has none, or one for another system alone
@@ -91,3 +95,22 @@ def test_pip_puts_the_command_lathe_alone_on_the_path(metadata):
 def test_colcon_finds_the_tests(metadata):
     """Without pytest among the requirements of the tests, ``colcon test`` runs none and is green."""
     assert "pytest" in metadata("install")["extras_require"]["test"]
+
+
+ALONE = """
+import sys
+sys.modules.update(dict.fromkeys({beside}))
+from lathe_rc.cli import main
+for words in ["--help"], ["run", "piston", "--revolutions=3", "--bag=B"], ["bag", "check", "B"], ["report", "B", "-o", "B.html"]:
+    main(words, standalone_mode=False)
+"""
+
+
+def test_the_core_runs_without_the_packages_around_it(tmp_path):
+    code = ALONE.format(beside=sorted(OURS - {"lathe_rc"}))
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    listed = re.findall(r"^  (\w+) ", ran.stdout.partition("Commands:")[2], re.MULTILINE)
+    assert set(COMMANDS_OF["lathe_rc"]) <= {*listed}
+    assert not {*listed} & {name for package in OURS - {"lathe_rc", "lathe_papers"} for name in COMMANDS_OF[package]}
+    assert (tmp_path / "B.html").exists()

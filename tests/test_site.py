@@ -84,6 +84,14 @@ def test_the_picture_of_the_architecture_is_true():
     assert drawn == architecture.picture(), "run: ./lathe python figures/architecture.py"
 
 
+def test_the_sentences_of_the_architecture_are_contracts_of_the_linters():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    sentences = re.findall("^- (.+)$", page.partition("## What each part")[2].partition("\n## ")[0], re.MULTILINE)
+    contracts = re.findall('^name = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(sentences) == 9
+    assert {*sentences} <= {*contracts}
+
+
 class TestPictures:
     def test_each_is_drawn_by_a_command_and_shown_by_its_page(self):
         assert {path.name for path in pictures.PICTURES.iterdir()} == set(pictures.TABLE)
