@@ -101,8 +101,8 @@ ALONE = """
 import sys
 sys.modules.update(dict.fromkeys({beside}))
 from lathe_rc.cli import main
-for words in ["--help"], ["run", "piston", "--revolutions=3", "--bag=B"], ["bag", "check", "B"], ["report", "B", "-o", "B.html"]:
-    main(words, standalone_mode=False)
+for line in ["--help", "run piston --revolutions=3 --bag=B", "bag check B", "report B -o B.html"]:
+    main(line.split(), standalone_mode=False)
 """
 
 
