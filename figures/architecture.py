@@ -28,7 +28,7 @@ LAYERS = (
             "lathe_live": "panel, Rerun",
         },
     ),
-    Layer("the command line", {"commands": "lathe run, bag, report, …"}),
+    Layer("command line", {"commands": "lathe run, bag, report, …"}),
     Layer("Python", {"harness": "runs a scenario, scores it"}),
     Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS"}),
     Layer("to look at", {"view": "report, figures, notebooks"}),
@@ -76,9 +76,10 @@ def places() -> dict[str, tuple[float, float, float]]:
     """Return left end, top and width of each box."""
     found = {}
     for row, layer in enumerate(LAYERS):
-        width = (WIDTH - SPACE * (len(layer.boxes) - 1)) / len(layer.boxes)
+        space = SPACE if len(layer.boxes) < 4 else SPACE / 2
+        width = (WIDTH - space * (len(layer.boxes) - 1)) / len(layer.boxes)
         for column, name in enumerate(layer.boxes):
-            found[name] = (LEFT + column * (width + SPACE), TOP + row * (HEIGHT + GAP), width)
+            found[name] = (LEFT + column * (width + space), TOP + row * (HEIGHT + GAP), width)
     return found
 
 
