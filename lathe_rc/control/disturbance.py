@@ -313,7 +313,7 @@ def _end_point(m: DisturbanceTable, form: FormAhead, speed: float) -> None:
         if m.rational.fits:
             if proved(m.rational, m.model):
                 _take_over(m, form)
-            refit(m.rational)
+            refit(m.rational, m.state[_REVOLUTIONS])
         if m.identifies and not is_rational(m.rational):
             _adopt(m, form, speed)
         fade(m.fit)

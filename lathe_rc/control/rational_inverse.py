@@ -40,13 +40,13 @@ from lathe_rc.control.rational_fit import (
 )
 from lathe_rc.jit import inlined, kernel
 
-_TURN = 2.0 * np.pi
 _Q0, _Q1, _Q2, _S0, _S1 = range(5)  # indices in a quotient
 FORM, OBSERVER, LEARNER, STEADY = range(4)  #: signals with a filter of their own; the last: the form at nominal speed
 # Indices in the integer state: whether the rational model is in use, whether there is a candidate, number of logged
 # verdicts, present sample.
 _USED, _CANDIDATE, _LOGGED, _SAMPLE = range(4)
 _LOG = 64  # verdicts that the log keeps
+_FIRST_FIT = 4  # revolutions to the first fit; in earlier ones the command differs by the form that is being learned
 
 
 class RationalTable(NamedTuple):
@@ -198,11 +198,11 @@ def proved(m: RationalTable, second_order: Array) -> bool:
 
 
 @kernel
-def refit(m: RationalTable) -> None:
-    """Add the revolution that has ended to the measurements, and fit the next candidate."""
+def refit(m: RationalTable, revolutions: int) -> None:
+    """Add the last of some ``revolutions`` to the measurements, and fit the next candidate."""
     add_revolution(m.fit, m.model[0])
     m.state[_CANDIDATE] = 0
-    if not fitted_model(m.fit, m.model[0], m.model[1]):
+    if revolutions < _FIRST_FIT or not fitted_model(m.fit, m.model[0], m.model[1]):
         return
     verdict = safe(m.fit, m.model[1])
     if verdict != ADOPTED:
