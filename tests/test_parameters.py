@@ -16,7 +16,7 @@ SI = {
     "1", "m", "rad", "s", "Hz", "rad/s", "m/s", "m/s^2", "kg", "N", "N/A", "N/m", "N/s", "Pa", "V", "1/m", "1/N", "1/s",
     "1/s^2", "1/(m*s)", "1/(N*s)", "s/m", "s/N", "m/rev", "1/min", "m/s^3", "rad/s^2", "A or V", "rev", "sample",
     "block", "B", "A", "A/s", "V/s", "ohm", "H", "K", "1/K", "K*s/m", "N/m^3", "N*s/m", "N*m", "N*m/rad", "N*m*s/rad",
-    "kg*m^2",
+    "kg*m^2", "s^k",
 }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ FOLDER = "api"
 PACKAGES: dict[str, tuple[str, ...]] = {
     "lathe_rc.harness": (),
     "lathe_rc.bag": (),
-    "lathe_rc.cell": ("scenario", "recording", "batch", "parameters", "stage", "stages.law", "stages.plant"),
+    "lathe_rc.cell": ("scenario", "recording", "batch", "parameters", "stage"),
+    "lathe_rc.stages": ("learning.law", "drive.plant"),
     "lathe_rc.signals": (),
     "lathe_rc.plants": (),
     "lathe_rc.control": (),

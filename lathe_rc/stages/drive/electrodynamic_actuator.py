@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarse electrodynamic tool drive."""
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -105,7 +106,11 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         known: dict[str, float | list[float]] = {
             "natural_frequency": frequency, "damping": damping, "delay": self.delay
         }  # fmt: skip
-        if (model := of_modal_drive(self._modal_drive())) is not None:
+        model = None
+        with contextlib.suppress(InputError):  # the stage itself refuses modes that cannot be, by their names
+            self._modes()
+            model = of_modal_drive(self._modal_drive())
+        if model is not None:
             known |= {"inverse.denominator": model[:4].tolist(), "inverse.numerator": model[4:].tolist()}
         return {"coarse/command": known}
 
