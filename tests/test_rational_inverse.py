@@ -175,10 +175,13 @@ def test_blocks_and_a_checkpoint_beside_a_candidate_change_no_bit(tmp_path):
     """Nor does a start from a checkpoint while a model settles that is adopted after it."""
     length = "spindle_encoder.revolutions=8.0"
     made = config("oval3000", length)
-    whole = lathe_rc.run(made, checkpoints={"revolution:4.5": tmp_path / "state"})
-    again = lathe_rc.run(made, start_from=tmp_path / "state")
+    whole = lathe_rc.run(made, checkpoints={"revolution:4.5": tmp_path / "state", "revolution:7.5": tmp_path / "late"})
+    again, end = (lathe_rc.run(made, start_from=tmp_path / name) for name in ("state", "late"))
     small = lathe_rc.run(config("oval3000", length, "block_size=8"))
     assert small.digest["/coarse/command"] == whole.digest["/coarse/command"]
     late, command = (each.recording.of_type(messages.COMMAND)["position"] for each in (again, whole))
     assert np.array_equal(command[-late.size :], late)
-    assert "model adopted" in whole.recording.sparse["/controller/events"].values["action"]
+    events = [each.recording.sparse["/controller/events"].values.get("action") for each in (whole, again, end)]
+    assert "model adopted" in events[1]
+    assert events[0] == events[1]
+    assert not events[2], "what was told before the start is not told again"

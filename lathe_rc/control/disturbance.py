@@ -16,6 +16,8 @@ x = r as long as |E| is below 1.
 **Identification** of a1 and a2: `lathe_rc.control.identification`. The effect of an error in the identified model
 repeats, and is therefore learned as part of f.
 
+**Resonance**: an inverse of fourth order in place of that of second order, `lathe_rc.control.rational_inverse`.
+
 Source: spec/robust.md.
 """
 
@@ -60,7 +62,7 @@ from lathe_rc.signals.profile_table import derivatives_at
 _TURN = 2.0 * np.pi
 _SWINGS_IN = 10.0  # settling time of the drive, in units of a1
 
-_SETTLING = 3  # revolutions in which the filters settle while a memory is converted, and its own one
+_SETTLING = 3  # simulated revolutions for the conversion of a memory: in all but the last the filters settle
 
 # Indices in the integer state: current grid point, first grid point, whether there is a current grid point, number of
 # learned revolutions, whether a position has been received.

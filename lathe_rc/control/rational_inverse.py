@@ -238,10 +238,11 @@ def _log(m: RationalTable, verdict: int) -> None:
     m.state[_LOGGED] += 1
 
 
-def verdicts(m: RationalTable, told: int) -> list[tuple[int, int]]:
-    """Return sample and verdict of the logged models but the first ``told``."""
+def verdicts(m: RationalTable, first: int, end: int) -> list[tuple[int, int]]:
+    """Return sample and verdict of the models that were adopted or refused from sample ``first`` on, before ``end``."""
     logged = int(m.state[_LOGGED])
-    return [(int(m.log[k % _LOG, 0]), int(m.log[k % _LOG, 1])) for k in range(max(told, logged - _LOG), logged)]
+    rows = (m.log[k % _LOG].tolist() for k in range(max(0, logged - _LOG), logged))
+    return [(sample, verdict) for sample, verdict in rows if first <= sample < end]
 
 
 @inlined

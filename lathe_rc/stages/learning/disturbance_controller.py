@@ -199,7 +199,6 @@ class DisturbanceController(FormLaw):
 
     def __init__(self, name: str, parameters: DisturbanceControllerParameters) -> None:
         parameters.make(name)  # rejects invalid parameters
-        self._verdicts = 0
         super().__init__(name, parameters)
 
     def start(self) -> Memory:
@@ -227,12 +226,11 @@ class DisturbanceController(FormLaw):
         return f"a model of {model}, {parameters.model_delay * 1e3:.3g} ms"
 
     def tell(self, first: int, end: int) -> list[Sparse]:
-        """Return the events that a model has been adopted, or refused as unsafe."""
+        """Return the events that a model has been adopted, or refused."""
         told = super().tell(first, end)
-        for index, verdict in verdicts(self.law.known.rational, self._verdicts):
+        for index, verdict in verdicts(self.law.known.rational, first, end):
             action = MODEL_ADOPTED if verdict == ADOPTED else f"{MODEL_REFUSED}: {_WHY[verdict]}"
             told.append(Sparse(f"{self.name}/events", messages.EVENT, index, {"action": action}))
-            self._verdicts += 1
         return told
 
     def cures(self, lag: float) -> Iterable[Iterable[Mapping[str, Value]]]:
