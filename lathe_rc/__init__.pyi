@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # The public face of lathe_rc, and the only list of it: `lathe_rc.public` imports from here. Other modules may change.
 
-from lathe_bagtools.hosts import digests_by_host as digests_by_host
-from lathe_explore.sweep.space import Space as Space
-from lathe_explore.sweep.sweep import run_sweep as run_sweep
-from lathe_explore.sweep.tune import tune as tune
-from lathe_export.tables.export import export_bag as export_bag
 from lathe_rc import messages as messages
 from lathe_rc import study as study
 from lathe_rc.bag.reader import read_bag as read_bag

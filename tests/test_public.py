@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+import lathe_bagtools
+import lathe_explore
+import lathe_export
 import lathe_rc
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -20,15 +23,19 @@ SHOWN_ELSEWHERE = {
     *("DONE", "Input", "InputError", "LatheError", "LawParameters", "NodeParameters", "Now", "Output"),
     *("PlantParameters", "Scenario", "messages", "study"),
 }
-EXAMPLES = {name: getattr(lathe_rc, name) for name in sorted({*lathe_rc.__all__} - SHOWN_ELSEWHERE)}
+PACKAGES = (lathe_rc, lathe_bagtools, lathe_explore, lathe_export)
+EXAMPLES = {
+    name: getattr(package, name) for package in PACKAGES for name in sorted({*package.__all__} - SHOWN_ELSEWHERE)
+}
 EXAMPLES |= {"Scenario.varied": Scenario.varied, "Recording.frame": Recording.frame}
 WITH_WORKERS = {"run_sweep", "tune"}  #: start processes of Dask, of which test_sweep.py and test_tune.py have none
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("lathe_rc/templates/*/*.j2"), ROOT / "README.md"])
 
 
 def test_the_public_names_are_few_and_can_be_imported():
-    assert len(lathe_rc.__all__) <= MOST
-    assert set(lathe_rc.__all__) <= {*dir(lathe_rc)}
+    assert sum(len(package.__all__) for package in PACKAGES) <= MOST
+    for package in PACKAGES:
+        assert set(package.__all__) <= {*dir(package)}
     with pytest.raises(AttributeError, match="no attribute 'lode'"):
         lathe_rc.lode  # noqa: B018 - it is not there
 
@@ -56,7 +63,7 @@ def is_public(module: str, name: str) -> bool:
 def test_pages_and_templates_import_public_names_only(page):
     text = page.read_text(encoding="utf-8")
     code = re.findall(r"```py(?:thon)?[^\n]*\n(.*?)```", text, re.DOTALL) if page.suffix == ".md" else [text]
-    lines = re.findall(r"^from lathe_rc\b[^\n]*", "\n".join(code), re.MULTILINE)
+    lines = re.findall(r"^from lathe_[^\n]*", "\n".join(code), re.MULTILINE)
     for line in ast.walk(ast.parse(re.sub(r"\{%.*?%\}", "", "\n".join(lines)))):
         if isinstance(line, ast.ImportFrom):
             assert [alias.name for alias in line.names if not is_public(str(line.module), alias.name)] == []
