@@ -113,3 +113,12 @@ def test_no_scenario_of_ours_is_another_by_that(path):
             assert table.channels(node) == whole.nodes[node].channels(node)
         asked = {name: getattr(whole.nodes[node], name) for names in table.asks for name in names}
         assert same.model_copy(update=asked) == whole.nodes[node]
+
+
+def test_an_empty_model_that_is_given_follows_no_drive(tmp_path):
+    oval = load("oval3000")
+    assert oval.nodes["controller"].model_denominator == []
+    assert oval.with_node("controller", oval.nodes["controller"].model_copy()).nodes == oval.nodes
+    (file := tmp_path / "oval.yaml").write_text(oval.to_yaml(given=True), encoding="utf-8")
+    assert load(file).nodes["controller"].model_denominator == []
+    assert oval.varied({"loaded_drive.coarse_gain": 0.9}).nodes["controller"].model_denominator == []

@@ -114,6 +114,8 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
     Raises:
         InputError: a value is invalid in the drive's table.
     """
+    if not found:
+        return scenario
     nodes = dict(scenario.nodes)
     for drive in found:
         table = nodes[drive.node]

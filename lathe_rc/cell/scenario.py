@@ -314,7 +314,7 @@ class Scenario:
         return _agreed(self.name, tables, fingerprints, _identity(fingerprints))
 
     def to_yaml(self, *, given: bool = False) -> str:
-        """Return the complete parameter file; empty lists are left out, since rcl cannot read them.
+        """Return the parameter file; empty lists are left out, since rcl cannot read them.
 
         Args:
             given: whether to write only the values that are set explicitly; when the file is read, the others take
@@ -325,7 +325,9 @@ class Scenario:
         left_out = {"run_id"} if given and self._has_own_run_id else None
         for name, table in self.nodes.items():
             kept = table.model_dump(exclude_unset=given, exclude=left_out)
-            values = {key: _quoted(value) for key, value in kept.items() if value != []}
+            rows = type(table).rows()
+            # An empty model of a drive is a choice: without it the model would follow the drive.
+            values = {key: _quoted(value) for key, value in kept.items() if value != [] or (given and rows[key].drive)}
             tree[f"/**/{name}"] = {_ROS: values}
         return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
 
@@ -572,6 +574,7 @@ def load(
                 given = f"{name}.{key} = {values[key]}"
                 raise InputError(f"{given}: {_EVERYONE} says {shared[key]}; keep one ({key}=... sets all nodes)")
         tables[name] = TABLES[kind_of(name, values.get("stage"))].read(name, {**shared, **values})
-    tables = tables if complete else models.resolved(tables)
+    # An empty model that a complete file omits is given as well: no model of a drive takes its place.
+    tables = {name: models.given(table) for name, table in tables.items()} if complete else models.resolved(tables)
     fingerprints = {name: _fingerprint(table) for name, table in tables.items()}
     return _agreed(path.stem, tables, fingerprints, next(iter(tables.values())).run_id or _identity(fingerprints))

@@ -105,7 +105,7 @@ def test_search_finds_a_word_in_pages_and_docstrings(site, tmp_path):
         finally:
             browser.kill()
     assert "/force_position/" in places
-    assert "/api/control/" in places
+    assert "/api/lathe_rc.control/" in places
 
 
 @pytest.mark.parametrize("width", [1280, 420])
