@@ -181,7 +181,8 @@ def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain, tmp_path):
 
 def test_nobody_speaks_in_the_name_of_a_member(ghost, domain, tmp_path):
     """A block, announcement, state, progress or joint state is from the node that DDS names, or it is refused."""
-    cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0})
+    # Long enough for all nodes to discover all publishers of the ghost while other tests keep the machine busy.
+    cell = scenario(spindle_encoder={"revolutions": 120.0, "speed_factor": 1.0})
     joints = [(sample, joint_state(sample)) for sample in range(0, 120_000, 640)]
     forged = {
         "/members": (Member, [Member(run_id="test", name="/tool", state=Member.FAILED, message="no")]),
@@ -191,7 +192,6 @@ def test_nobody_speaks_in_the_name_of_a_member(ghost, domain, tmp_path):
         ),
         "/progress": (Progress, [Progress(run_id="test", name="/tool", blocks=2**40)]),
         "/electrodynamic_actuator/joint_states": (JointState, [message for _, message in joints]),
-        # last, since one round of them takes longer than the run on a busy machine
         "/tool": (ToolBlock, [block(messages.TOOL, first, "/tool", "test") for first in range(0, 120_000, 64)]),
     }
     sends = []
