@@ -4,14 +4,6 @@
 The public names are listed in ``__init__.pyi``.
 """
 
-from typing import Any
-
 from lathe_rc import public
 
-
-def __getattr__(name: str) -> Any:
-    return public.attribute(__name__, name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__getattr__("__all__")])
+__getattr__, __dir__ = public.face(__name__)

@@ -7,7 +7,8 @@ A name is imported on first use (PEP 562), so a package can export names from ma
 import ast
 import importlib
 import sys
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,3 +36,8 @@ def attribute(package: str, name: str) -> Any:
     if module == package:  # the name is a module of the package
         return importlib.import_module(f"{package}.{own}")
     return getattr(importlib.import_module(module), own)
+
+
+def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the ``__getattr__`` and the ``__dir__`` of a package with a stub of public names."""
+    return partial(attribute, package), lambda: sorted([*vars(sys.modules[package]), *homes(package)])
