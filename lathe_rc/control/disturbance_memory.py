@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lathe_rc.arrays import Array
+from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.interpolation import read
 from lathe_rc.errors import InputError
 from lathe_rc.jit import inlined, kernel
@@ -83,6 +83,43 @@ def smoothing_response(waves: float, points: int, at: Array) -> Array:
     taps = smoothing(waves, points)
     places = np.arange(taps.size) - taps.size // 2
     return np.asarray(np.cos(2 * np.pi / points * np.outer(at, places)) @ taps)
+
+
+def loop_response(
+    smooth: Array,
+    waves: Array,
+    speed: float,
+    *,
+    points_per_revolution: int,
+    learning_gain: float,
+    learning_bandwidth: float,
+    observer_bandwidth: float,
+    late: float,
+) -> tuple[Array, Complex, Complex]:
+    """Return the parts of the factor of a revolution, kept - learned·(1 + E)/(1 + E·L), with E the error of the model.
+
+    Args:
+        smooth: response of the filter S, shape (n,).
+        waves: waves per revolution, shape (n,).
+        speed: speed of the spindle [rad/s].
+        points_per_revolution: points of the memory.
+        learning_gain: part of what a revolution brings that the memory takes up.
+        learning_bandwidth: bandwidth of what is learned [rad/s].
+        observer_bandwidth: bandwidth of the observer [rad/s]; 0: none.
+        late: delay of the drive and of the measured position [s].
+
+    Returns:
+        What a revolution keeps of the memory, what it learns with an exact model, and the response L of the observer
+        with its delay, 0 without an observer; shape (n,) each.
+    """
+    p = 1j * waves * speed
+    stages = 1.0 + p / learning_bandwidth
+    learned = learning_gain * smooth * np.exp(3.0 * p / learning_bandwidth) / stages**3
+    learned *= np.exp(1j * np.pi * waves / points_per_revolution)  # from cell centres, read at their edges
+    low = np.zeros_like(p)
+    if observer_bandwidth:
+        low += np.exp(-p * late) / (1.0 + p / observer_bandwidth) ** 3
+    return 1.0 - LEAK * (1.0 - smooth), learned, low
 
 
 def empty_memory(nominal: float, gain: float, waves: float, points: int, *, follows_speed: bool) -> MemoryTable:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_rc.arrays import Array, Complex
-from lathe_rc.control.disturbance_memory import LEAK, smoothing_response
+from lathe_rc.control.disturbance_memory import loop_response, smoothing_response
 from lathe_rc.control.identification import LowPass, low_pass
 from lathe_rc.jit import inlined, kernel
 
@@ -117,16 +117,18 @@ def judge_of(
     """Return the memory loop of a law; arguments as of `lathe_rc.control.disturbance.disturbance`, ``late`` in s."""
     points, waves = points_per_revolution, _REACH * learned_waves * np.arange(1, _WAVES + 1) / _WAVES
     frequency = waves * nominal_speed
-    p = 1j * frequency
-    smooth = smoothing_response(learned_waves, points, waves)
-    lag = 1.0 + p / learning_bandwidth
-    ahead = 3.0 * p / learning_bandwidth + 1j * np.pi * waves / points
-    learned = learning_gain * smooth * np.exp(ahead) / lag**3
-    low = np.zeros_like(p)
-    if observer_bandwidth:
-        low += np.exp(-p * late) / (1.0 + p / observer_bandwidth) ** 3
+    kept, learned, low = loop_response(
+        smoothing_response(learned_waves, points, waves),
+        waves,
+        nominal_speed,
+        points_per_revolution=points,
+        learning_gain=learning_gain,
+        learning_bandwidth=learning_bandwidth,
+        observer_bandwidth=observer_bandwidth,
+        late=late,
+    )
     given = _parts(inverse_response(model, frequency))
-    return JudgeTable(frequency, given, 1.0 - LEAK * (1.0 - smooth), _parts(learned), _parts(low))
+    return JudgeTable(frequency, given, kept, _parts(learned), _parts(low))
 
 
 def inverse_response(model: Array, frequency: Array) -> Complex:

@@ -29,7 +29,7 @@ from lathe_rc.control.disturbance import (
     forget,
     observed,
 )
-from lathe_rc.control.disturbance_memory import LEAK, expected, smoothing_response, with_gain
+from lathe_rc.control.disturbance_memory import expected, loop_response, smoothing_response, with_gain
 from lathe_rc.control.rational_fit import (
     ADOPTED,
     LEAST_DAMPING,
@@ -95,6 +95,11 @@ class DisturbanceControllerParameters(FormLawParameters):
     )
     model_numerator: list[float] = parameter([], "its b1 and b2 of 1 + b1·p + b2·p²", "s^k", drive="inverse.numerator")
 
+    @property
+    def late(self) -> float:
+        """Delay of the drive and of the measured position [s]."""
+        return self.model_delay + self.feedback_delay * self.step
+
     def make(self, node: str) -> DisturbanceTable:
         """Return the state before the first sample.
 
@@ -132,8 +137,7 @@ class DisturbanceControllerParameters(FormLawParameters):
     def _rational(self, node: str) -> RationalTable:
         model, judge = self.coefficients(node), None
         if self.inverse == "fourth_order" and self.identify:
-            late = self.model_delay + self.feedback_delay * self.step
-            judge = made_of(judge_of, self, model=model, late=late)
+            judge = made_of(judge_of, self, model=model, late=self.late)
         return rational_inverse(
             model if model[-1] else None,
             step=self.step,
@@ -252,22 +256,15 @@ class DisturbanceController(FormLaw):
 
     def factors(self, drive: Response, waves: Array, speed: float) -> Complex:
         """Return the factor E·L of the observer and that of the memory, with the given model, shape (2, n)."""
-        parameters, frequency = self.parameters, waves * speed
-        error, p = self._model_error(drive, frequency), 1j * frequency
-        inside = np.zeros_like(error)
-        if parameters.observer_bandwidth:
-            late = parameters.model_delay + parameters.feedback_delay * parameters.step
-            inside = error * np.exp(-p * late) / (1.0 + p / parameters.observer_bandwidth) ** 3
+        parameters, error = self.parameters, self._model_error(drive, waves * speed)
+        smooth = _passed(parameters.learned_waves, parameters.points_per_revolution, waves.tobytes())
+        kept, learned, low = made_of(
+            loop_response, parameters, smooth=smooth, waves=waves, speed=speed, late=parameters.late
+        )
+        inside = error * low
         if not parameters.learning_gain:
             return inside[None]
-        smooth = _passed(parameters.learned_waves, parameters.points_per_revolution, waves.tobytes())
-        stages = 1.0 + p / parameters.learning_bandwidth
-        learned = parameters.learning_gain * smooth * np.exp(3.0 * p / parameters.learning_bandwidth) / stages**3
-        learned *= np.exp(
-            1j * np.pi * waves / parameters.points_per_revolution
-        )  # from cell centres, read at their edges
-        factor = 1.0 - LEAK * (1.0 - smooth) - learned * (1.0 + error) / (1.0 + inside)
-        return np.stack((inside, factor))
+        return np.asarray(np.stack((inside, kept - learned * (1.0 + error) / (1.0 + inside))))
 
     def highest_waves(self, speed: float) -> float:
         """Return the Nyquist limit of the memory [waves per revolution]."""
