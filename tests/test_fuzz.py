@@ -23,6 +23,7 @@ from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.reading.unpacking import unpack
 from lathe_rc.bag.repairing.salvage import Salvage
@@ -177,15 +178,16 @@ def test_times_of_an_index_are_not_added_up_in_memory(tmp_path):
 
 
 def test_messages_that_never_meet_their_blocks_are_not_kept_for_ever():
-    data = messages.encode("std_msgs/msg/Header", messages.header(0, 1))
+    event = messages.store().types[messages.EVENT](messages.header(0, 1), "run", "/tool", 0, "begin")
+    late = Batch.of(("/events", 2**62, messages.encode(messages.EVENT, event)))
     alone = Feeder({"/events": messages.EVENT}, [], 64)
     for _ in range(10):
-        alone.add("/events", 0, data)
+        alone.add(late)
     assert not alone._sparse["/events"]
     waiting = Feeder({"/events": messages.EVENT, "/tool": messages.TOOL}, [], 64)
-    waiting._sparse["/events"] = [(0, {})] * 2**18
+    waiting._sparse["/events"] = [(2**62, {})] * 2**18
     with pytest.raises(LatheError, match="without the blocks of their time"):
-        waiting.add("/events", 0, data)
+        waiting.add(late)
 
 
 @pytest.mark.parametrize(

@@ -5,32 +5,25 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.bag.reading.stream import feed
+from lathe_rc.bag.reading.stream import ALL, feed
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.recording import Recording, SparseTopic
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.messages import START_NS, Samples, Signals
+from lathe_rc.messages import START_NS, Signals
 
 
-class _Collector:
-    """Sink that collects all signal topics in memory."""
+class _Whole:
+    """Sink that keeps the signals of a whole bag, which it receives as one chunk."""
 
     def __init__(self) -> None:
-        self.dense: dict[str, dict[str, list[Samples]]] = {}
-        self.sparse: dict[str, list[Sparse]] = {}
+        self.dense: Mapping[str, Signals] = {}
+        self.sparse: Mapping[str, list[Sparse]] = {}
 
-    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Append a chunk to the collected signals."""
-        for topic, signals in dense.items():
-            fields = self.dense.setdefault(topic, {name: [] for name in signals})
-            for name, array in signals.items():
-                fields[name].append(array)
-        for topic, found in sparse.items():
-            self.sparse.setdefault(topic, []).extend(found)
+    def chunk(self, _first: int, _samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+        """Keep the chunk."""
+        self.dense, self.sparse = dense, sparse
 
 
 def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
@@ -58,17 +51,16 @@ def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
         InputError: the path is not a bag.
         LatheError: a block is missing or repeated.
     """
-    collected = _Collector()
-    header = feed(Path(path), [collected], whole=whole)
-    dense, sparse = {}, {}
+    found = _Whole()
+    header = feed(Path(path), [found], piece=ALL, whole=whole)
+    dense: dict[str, Signals] = {}
+    sparse: dict[str, SparseTopic] = {}
     for topic, msgtype in header.types.items():
         if msgtype in messages.block_types():
-            parts = collected.dense.get(topic, {})
-            empty = messages.allocate(msgtype, 0)
-            dense[topic] = {name: np.concatenate(parts.get(name) or [array]) for name, array in empty.items()}
+            dense[topic] = found.dense.get(topic) or messages.allocate(msgtype, 0)
         else:
             sparse[topic] = SparseTopic()
-            for message in collected.sparse.get(topic, []):
+            for message in found.sparse.get(topic, ()):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
     if not dense and sparse:  # without blocks, the log states the times
         with Source(Path(path)) as source:

@@ -13,6 +13,7 @@ import numpy as np
 from lathe_rc import event_log, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.reading.stream import Feeder, first_of
 from lathe_rc.bag.snapshot import span_of
 from lathe_rc.blocks.ports import Sparse
@@ -55,6 +56,12 @@ class Tally:
     first_ns: int = 0
     last_ns: int = 0
     open_end: bool = False
+
+    def add(self, found: Batch) -> None:
+        """Add messages of the topic, at least one."""
+        self.first_ns = self.first_ns if self.count else int(found.places[0, 1])
+        self.count, self.last_ns = self.count + len(found), int(found.places[-1, 1])
+        self.size += int((found.places[:, 3] - found.places[:, 2]).sum())
 
     @property
     def rate(self) -> float:
@@ -246,15 +253,16 @@ def gather(path: Path) -> Gathered:
 def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
     """Count every message, and pass it to the feeder or to the host data."""
     newest: dict[str, bytes] = {}
-    for topic, log_ns, data in source.messages():
-        tally = gathered.topics[topic]
-        tally.first_ns = tally.first_ns if tally.count else log_ns
-        tally.count, tally.size, tally.last_ns = tally.count + 1, tally.size + len(data), log_ns
-        if topic in feeder.types:
-            feeder.add(topic, log_ns, data)
-            newest[topic] = data  # decoded again only at the end, because the feeder has already decoded it
-        elif tally.type in HOST_TYPES:
-            gathered.host.add(tally.type, data)
+    host = {topic for topic, tally in gathered.topics.items() if tally.type in HOST_TYPES}
+    for batch in source.batches():
+        for topic in dict.fromkeys(batch.topics.values()):
+            if found := batch.only({topic}):
+                gathered.topics[topic].add(found)
+                begin, end = found.places[-1, 2:].tolist()
+                newest[topic] = found.whole[begin:end]
+        for topic, _, data in batch.only(host):
+            gathered.host.add(gathered.topics[topic].type, data)
+        feeder.add(batch)
     left = feeder.finish()
     if left:
         gathered.stopped = f"some topics have {left} samples more than others"

@@ -36,6 +36,7 @@ from lathe_rc.blocks.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import START_NS, block_types
 
+_TOGETHER, _TOGETHER_BYTES = 2**14, 2**22  # number and total size [B] of messages handed on together
 _NEVER = 2**64  # log time after all others [ns]
 _SQLITE = b"SQLite format 3\0"
 _KINDS = (".mcap", ".db3", ".zstd")
@@ -379,11 +380,10 @@ class Source:
                 and (not span.channels or not span.channels.isdisjoint(wanted))
             ]  # fmt: skip
         try:
-            for group in _overlapping(reads):
-                found = _merged(group, start, stop, budget)
-                if self._packed:
-                    found = chain.from_iterable(self._unpacked(each, budget) for each in found)
-                yield from found
+            found = chain.from_iterable(_merged(group, start, stop, budget) for group in _overlapping(reads))
+            if self._packed:
+                found = chain.from_iterable(self._unpacked(each, budget) for each in found)
+            yield from _larger(found)
         except _WRONG as error:
             hint = _RECOVER if any(map(_readable, reads)) else ""
             raise InputError(f"{self.path}: broken ({_reason(error)}){hint}") from None
@@ -436,6 +436,26 @@ def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Ite
     for message in heapq.merge(*(late(*read) for read in group), key=itemgetter(1)):
         if message[0]:
             yield Batch.of(message)
+
+
+def _larger(found: Iterator[Batch]) -> Iterator[Batch]:
+    """Join consecutive batches, since blocks that lie together are decoded together; the first come soon."""
+    some: list[Batch] = []
+    count = size = most = 0
+    try:
+        for batch in found:
+            if some and (size >= most or count + len(batch) > _TOGETHER):
+                yield Batch.joined(some)
+                most = min(most + size, _TOGETHER_BYTES)
+                some, count, size = [], 0, 0
+            some.append(batch)
+            count, size = count + len(batch), size + len(batch.whole)
+    except _WRONG:  # what precedes the damage is handed on
+        if some:
+            yield Batch.joined(some)
+        raise
+    if some:
+        yield Batch.joined(some)
 
 
 def _readable(read: Read) -> bool:

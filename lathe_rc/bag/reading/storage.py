@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Channels of bag files, and spans of messages that are read on demand."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,11 +41,38 @@ class Batch:
         for channel, log_ns, begin, end in self.places.tolist():
             yield self.topics[channel], log_ns, self.whole[begin:end]
 
+    def only(self, topics: Collection[str]) -> "Batch":
+        """Return the messages of some topics."""
+        found = np.zeros(len(self.places), dtype=bool)
+        for channel, topic in self.topics.items():
+            if topic in topics:
+                found |= self.places[:, 0] == channel
+        return Batch(self.whole, self.topics, self.places[found])
+
     @classmethod
     def of(cls, message: Message) -> "Batch":
         """Return a batch of one message."""
         topic, log_ns, data = message
         return cls(data, {0: topic}, np.array([[0, log_ns, 0, len(data)]], np.uint64))
+
+    @classmethod
+    def joined(cls, batches: Sequence["Batch"]) -> "Batch":
+        """Return the messages of consecutive batches, at least one, as one batch."""
+        if len(batches) == 1:
+            return batches[0]
+        topics = batches[0].topics
+        places = np.concatenate([batch.places for batch in batches])
+        if any(batch.topics is not topics for batch in batches):
+            numbers: dict[str, int] = {}
+            for batch in batches:
+                for name in batch.topics.values():
+                    numbers.setdefault(name, len(numbers))
+            names = (batch.topics[channel] for batch in batches for channel in batch.places[:, 0].tolist())
+            places[:, 0] = [numbers[name] for name in names]
+            topics = {number: name for name, number in numbers.items()}
+        starts = np.cumsum([0] + [len(batch.whole) for batch in batches[:-1]]).astype(np.uint64)
+        places[:, 2:] += np.repeat(starts, [len(batch) for batch in batches])[:, np.newaxis]
+        return cls(b"".join(batch.whole for batch in batches), topics, places)
 
 
 @dataclass

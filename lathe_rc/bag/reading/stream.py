@@ -14,6 +14,7 @@ from lathe_rc import messages
 from lathe_rc.bag.loss import Loss
 from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.snapshot import span_of
 from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.ports import Sparse
@@ -22,10 +23,10 @@ from lathe_rc.cell.engine import Sink
 from lathe_rc.errors import LatheError, shown
 from lathe_rc.messages import START_NS, Signals
 
-_TOGETHER, _TOGETHER_BYTES = 64, 2**18  # number and total size [B] of a topic's messages decoded together
-_AHEAD = 64  # chunks that one topic may be ahead of another
+_AHEAD = 2**22  # samples that one topic may be ahead of another
 _MOST_WAITING = 2**18  # messages of a sparse topic that may be waiting for blocks
 _ENDLESS = 2**64  # end of the samples where no member was lost
+ALL = 2**63  #: piece of `feed` with which a sink receives the whole bag as one chunk [samples]
 
 
 @dataclass(frozen=True)
@@ -72,48 +73,27 @@ def check_next(topic: str, block: Block, end: int, step_ns: int) -> None:
 class _Dense:
     """Blocks of a topic that have not been passed on yet, starting at sample ``first``."""
 
-    def __init__(self, topic: str, msgtype: str, first: int = 0) -> None:
+    def __init__(self, topic: str, msgtype: str, first: int = 0, stop: int = _ENDLESS) -> None:
         self.topic, self.type = topic, msgtype
         self.blocks: deque[Block] = deque()
         self.first = self.end = first
+        self._stop = stop
         self.newest: Block | None = None
-        self._messages: list[bytes] = []
-        self._bytes = 0
         self._decoder = Decoder(msgtype)
 
-    def add(self, data: bytes) -> bool:
-        """Add a message and return whether samples may be ready; several messages are decoded together.
-
-        Raises:
-            LatheError: see `read`.
-        """
-        self._messages.append(data)
-        self._bytes += len(data)
-        if len(self._messages) < _TOGETHER and self._bytes < _TOGETHER_BYTES:
-            return False
-        self.read()
-        return True
-
-    def read(self) -> None:
-        """Decode the messages added so far.
-
-        Raises:
-            LatheError: see `read_all`.
-        """
-        # The decoder joins blocks in one memory area: decoding them together is several times faster than one by one.
-        messages, self._messages, self._bytes = self._messages, [], 0
-        ends = np.cumsum([0, *map(len, messages)])
-        self.read_all(b"".join(messages), np.stack([ends[:-1], ends[1:]], axis=1))
-
-    def read_all(self, whole: bytes, places: Places) -> None:
+    def read(self, whole: bytes, places: Places) -> None:
         """Decode messages in ``whole``, given the start and end of each, shape (messages, 2).
 
         Raises:
             LatheError: samples are missing or repeated, or a block cannot be decoded.
         """
+        # Blocks after a loss may be those of a bad sender: decoded one by one, up to the loss.
+        together = [places] if self._stop == _ENDLESS else [places[k : k + 1] for k in range(len(places))]
         try:
-            for block in self._decoder.decode_all(whole, places):
-                self._append(block)
+            for some in together:
+                if self.end < self._stop:
+                    for block in self._decoder.decode_all(whole, some):
+                        self._append(block)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {shown(error)}") from None
 
@@ -167,12 +147,16 @@ class Feeder:
         self, types: Mapping[str, str], sinks: Iterable[Sink], piece: int, first: int = 0, loss: Loss | None = None
     ) -> None:
         self.types = {topic: msgtype for topic, msgtype in types.items() if msgtype in messages.signal_types()}
-        self._dense = {t: _Dense(t, kind, first) for t, kind in self.types.items() if kind in messages.block_types()}
+        self._end = loss.first if loss else _ENDLESS
+        self._dense = {
+            topic: _Dense(topic, kind, first, self._end)
+            for topic, kind in self.types.items()
+            if kind in messages.block_types()
+        }
         self._sparse: dict[str, list[tuple[int, Mapping[str, Any]]]] = {
             topic: [] for topic in self.types if topic not in self._dense
         }
-        self._sinks, self._piece = list(sinks), piece
-        self.first, self._end = first, loss.first if loss else _ENDLESS
+        self._sinks, self._piece, self.first = list(sinks), piece, first
 
     @property
     def step_ns(self) -> int:
@@ -184,25 +168,29 @@ class Feeder:
         """ID of the run; empty before the first block."""
         return next((dense.newest.run_id for dense in self._dense.values() if dense.newest), "")
 
-    def add(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Add a message, and pass on the chunks that it completes.
+    def add(self, batch: Batch) -> None:
+        """Add messages in order of log time, and pass on the chunks that they complete.
 
         Raises:
             LatheError: samples are missing, or a topic stalls while others continue.
         """
-        dense = self._dense.get(topic)
-        if dense is None:
-            if not self._dense:
-                return  # without blocks there are no chunks in which to pass on the messages
-            if len(self._sparse[topic]) >= _MOST_WAITING:
-                raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
-            try:
-                self._sparse[topic].append((log_ns, messages.values_of(self.types[topic], data)))
-            except ValueError as error:
-                raise LatheError(f"{topic}: at {log_ns} ns: {shown(error)}") from None
-            return
-        if dense.end < self._end and dense.add(data) and dense.end - self.first >= self._piece:
-            self._hand_on(self._piece)
+        if not self._dense:
+            return  # without blocks there are no chunks in which to pass on the messages
+        for topic in dict.fromkeys(batch.topics.values()):
+            if topic not in self.types:
+                continue
+            found = batch.only({topic})
+            if dense := self._dense.get(topic):
+                dense.read(batch.whole, found.places[:, 2:])
+            else:
+                self._sparse[topic].extend(self._values(*message) for message in found)
+        self._hand_on(self._piece)
+
+    def _values(self, topic: str, log_ns: int, data: bytes) -> tuple[int, Mapping[str, Any]]:
+        try:
+            return log_ns, messages.values_of(self.types[topic], data)
+        except ValueError as error:
+            raise LatheError(f"{topic}: at {log_ns} ns: {shown(error)}") from None
 
     def _ends(self) -> dict[str, int]:
         """Return the sample after the last one to pass on, by topic."""
@@ -213,8 +201,12 @@ class Feeder:
         while (ready := min(ends.values())) - self.first >= samples:
             self._give(samples)
         slow = min(ends, key=lambda topic: ends[topic])
-        if max(ends.values()) - ready > _AHEAD * self._piece:
+        if max(ends.values()) - ready > _AHEAD:
             raise LatheError(f"{slow} ends at sample {ready}, others at {max(ends.values())}")
+        ready_ns = START_NS + ready * self.step_ns
+        for topic, waiting in self._sparse.items():
+            if len(waiting) > _MOST_WAITING and waiting[-_MOST_WAITING][0] > ready_ns:
+                raise LatheError(f"{topic}: more than {_MOST_WAITING} messages without the blocks of their time")
 
     def _give(self, samples: int) -> None:
         end_ns = START_NS + (self.first + samples) * self.step_ns
@@ -240,8 +232,6 @@ class Feeder:
         """
         if not self._dense:
             return 0
-        for dense in self._dense.values():
-            dense.read()
         ends = self._ends().values()
         while min(ends) - self.first > self._piece:
             self._give(self._piece)
@@ -280,7 +270,7 @@ class SampleReader:
             found = next(self._batches, None)
             if found is None:
                 raise LatheError(f"{self._dense.topic} ends at sample {self._dense.end}")
-            self._dense.read_all(found.whole, found.places[:, 2:])
+            self._dense.read(found.whole, found.places[:, 2:])
         self._dense.take_into(signals)
 
 
@@ -339,9 +329,9 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536, whole: bool =
         types = {topic: kind.type for topic, kind in source.topics.items()}
         loss = source.loss
         feeder = Feeder(types, sinks, piece, first_of(source), loss)
-        for topic, log_ns, data in source.messages(set(feeder.types)):
+        for batch in source.batches(set(feeder.types)):
             try:
-                feeder.add(topic, log_ns, data)
+                feeder.add(batch)
             except LatheError as error:
                 raise type(error)(f"{path}: {error}") from None
         left = feeder.finish()
