@@ -21,8 +21,9 @@ class _Whole:
         self.dense: Mapping[str, Signals] = {}
         self.sparse: Mapping[str, list[Sparse]] = {}
 
-    def chunk(self, _first: int, _samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
+    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Keep the chunk."""
+        del first, samples
         self.dense, self.sparse = dense, sparse
 
 

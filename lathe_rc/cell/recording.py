@@ -246,10 +246,13 @@ class Recording:
         A digest is the SHA-256 of the concatenated SHA-256 hashes of each field's samples (little-endian), in the order
         of the fields; for sparse topics, the time stamps come first. The digest does not depend on the block size.
         """
-        digester = Digester()
-        for topic, signals in self.dense.items():
-            digester.dense(topic, signals)
-        return digester.result(self.sparse)
+        arrays = [(topic, array) for topic, signals in self.dense.items() for array in signals.values()]
+        with ThreadPoolExecutor() as threads:
+            hashes = list(threads.map(lambda each: hashlib.sha256(_bytes(each[1])).digest(), arrays))
+        found: dict[str, list[bytes]] = {}
+        for (topic, _), digest in zip(arrays, hashes, strict=True):
+            found.setdefault(topic, []).append(digest)
+        return _digests(found, self.sparse)
 
 
 class Digester:
@@ -271,11 +274,16 @@ class Digester:
 
     def result(self, sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
         """Return the digest of each topic; ``sparse`` contains the sparse topics in full."""
-        found = {topic: part.digests() for topic, part in self._topics.items()}
-        for topic, part in sparse.items():
-            arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
-            found[topic] = [hashlib.sha256(_bytes(array)).digest() for array in arrays]
-        return {topic: hashlib.sha256(b"".join(parts)).hexdigest() for topic, parts in sorted(found.items())}
+        return _digests({topic: part.digests() for topic, part in self._topics.items()}, sparse)
+
+
+def _digests(dense: Mapping[str, list[bytes]], sparse: Mapping[str, SparseTopic]) -> dict[str, str]:
+    """Return the digest of each topic; ``dense`` contains the hashes of fields."""
+    found = dict(dense)
+    for topic, part in sparse.items():
+        arrays = [np.array(part.stamps, dtype=np.int64), *map(_flat, part.values.values())]
+        found[topic] = [hashlib.sha256(_bytes(array)).digest() for array in arrays]
+    return {topic: hashlib.sha256(b"".join(parts)).hexdigest() for topic, parts in sorted(found.items())}
 
 
 class _Topic:

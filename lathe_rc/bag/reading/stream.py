@@ -8,8 +8,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lathe_rc import messages
 from lathe_rc.bag.loss import Loss
 from lathe_rc.bag.reading.chunk_messages import Places

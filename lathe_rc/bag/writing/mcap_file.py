@@ -15,6 +15,7 @@ import io
 import os
 import struct
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
@@ -106,7 +107,12 @@ class McapFile:
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        self._chunk = io.BytesIO()  # the messages of the chunk, followed by leftover bytes of earlier chunks
+        # The messages of the chunk, followed by leftover bytes of earlier chunks. Two buffers: one is filled while the
+        # thread compresses and writes the other; both release the interpreter lock.
+        self._chunk, self._written = io.BytesIO(), io.BytesIO()
+        self._thread = ThreadPoolExecutor(1)
+        self._at_work: Future[None] | None = None
+        self._begun = 0  # number of chunks handed to the thread
         self._begin_chunk()
         self._offset = self.checksum = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
@@ -130,7 +136,7 @@ class McapFile:
     def _begin_chunk(self) -> None:
         self._chunk.seek(0)  # its memory is reused
         self._size, self._filled = 0, False
-        before = self._chunks
+        before = self._begun
         if before and before & (before - 1) == 0:  # see the module docstring
             self._size += self._chunk.write(b"".join([*self._schemas, *self._channels]))
 
@@ -198,7 +204,7 @@ class McapFile:
         self._size += self._chunk.write(data)
         self._filled = True
         if self._size > self._chunk_size:
-            self.flush()
+            self._hand_over()
 
     def add_rows(self, size: int, data: bytes | memoryview) -> None:
         """Append rows of ``size`` bytes, each consisting of complete message records."""
@@ -209,32 +215,46 @@ class McapFile:
             self._size += self._chunk.write(rest[:fill])
             self._filled, rest = True, rest[fill:]
             if self._size > self._chunk_size:
-                self.flush()
+                self._hand_over()
 
     def flush(self) -> None:
         """Hand all messages added so far to the operating system as a chunk; they are lost if the write fails."""
-        if not self._filled:
-            return
+        if self._filled:
+            self._hand_over()
+        self._wait()
+
+    def _hand_over(self) -> None:
+        """Let the thread write the chunk, and begin another one."""
         try:
+            self._wait()
             if self._refused:
                 raise self._refused  # nothing is recorded after a gap
-            self._write_chunk()
-        except OSError as error:
-            self._refused = error
-            raise
+            self._chunk, self._written = self._written, self._chunk
+            self._at_work = self._thread.submit(self._write_chunk, self._size)
+            self._begun += 1
         finally:
             self._begin_chunk()
 
-    def _write_chunk(self) -> None:
+    def _wait(self) -> None:
+        """Wait for the chunk that the thread writes."""
+        work, self._at_work = self._at_work, None
+        try:
+            if work:
+                work.result()
+        except OSError as error:
+            self._refused = error
+            raise
+
+    def _write_chunk(self, size: int) -> None:
         self._keep_room()
-        with self._chunk.getbuffer() as memory, memory[: self._size] as whole:
+        with self._written.getbuffer() as memory, memory[:size] as whole:
             # Copies: views of the chunk, kept alive by the traceback of a full-disk error, would lock its buffer.
             messages = walk(whole.toreadonly()).messages
             crc = crc32(whole)
             data = self._compressor.compress(whole) if self._compressor else bytes(whole)
         first, last = int(messages[:, 1].min()), int(messages[:, 1].max())
         compression = "zstd" if self._compressor else ""
-        chunk = _encoded(records.Chunk(compression, data, last, first, crc, self._size))
+        chunk = _encoded(records.Chunk(compression, data, last, first, crc, size))
         pairs = np.stack([messages[:, 1], messages[:, 2] - np.uint64(BEFORE_DATA)], axis=1)
         counts = np.bincount(messages[:, 0].astype(np.int64))
         start = self._offset
@@ -245,7 +265,7 @@ class McapFile:
             parts += head, text
             offsets[channel] = end
             end += len(head) + len(text)
-        self._put(*parts)
+        self._put(b"".join(parts))
         for channel in offsets:
             self.counts[channel] += int(counts[channel])
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
@@ -261,7 +281,7 @@ class McapFile:
                 message_index_length=end - start - len(chunk),
                 compression=compression,
                 compressed_size=len(data),
-                uncompressed_size=self._size,
+                uncompressed_size=size,
             )
         )
 
@@ -306,6 +326,7 @@ class McapFile:
 
     def abort(self) -> None:
         """Close the file without writing a summary."""
+        self._thread.shutdown()
         self.free_room()
         self._stream.close()
 
