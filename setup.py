@@ -93,7 +93,7 @@ setup(
             "templates/*/*.j2",
         ],
         "lathe_bagtools": ["py.typed", "__init__.pyi"],
-        "lathe_commission": ["py.typed"],
+        "lathe_commission": ["py.typed", "__init__.pyi"],
         "lathe_explore": ["py.typed", "__init__.pyi", "sweep/*.j2"],
         "lathe_export": ["py.typed", "__init__.pyi", "templates/*/*.j2"],
         "lathe_live": ["py.typed", "*.j2", "*.css", "*.html", "*.js"],

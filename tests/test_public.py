@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import lathe_bagtools
+import lathe_commission
 import lathe_explore
 import lathe_export
 import lathe_rc
@@ -17,13 +18,13 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
-MOST = 30
+MOST = 31
 #: without an example of their own: constants, errors, and what the example of another name shows
 SHOWN_ELSEWHERE = {
     *("DONE", "Input", "InputError", "LatheError", "LawParameters", "NodeParameters", "Now", "Output"),
     *("PlantParameters", "Scenario", "messages", "study"),
 }
-PACKAGES = (lathe_rc, lathe_bagtools, lathe_explore, lathe_export)
+PACKAGES = (lathe_rc, lathe_bagtools, lathe_commission, lathe_explore, lathe_export)
 EXAMPLES = {
     name: getattr(package, name) for package in PACKAGES for name in sorted({*package.__all__} - SHOWN_ELSEWHERE)
 }
