@@ -81,7 +81,8 @@ def test_the_command_writes_the_scenario_of_the_best_law(tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert (found["drives"], found["laws"][0]["law"]) == (2, "disturbance")
-    run = lathe_rc.run(lathe_rc.load(tmp_path / "mine.yaml"))
+    assert lathe_rc.load(tmp_path / "mine.yaml").value("spindle_encoder.revolutions") == 200.0  # that of piston
+    run = lathe_rc.run(lathe_rc.load(tmp_path / "mine.yaml", ["spindle_encoder.revolutions=16"]))
     assert run.errors.largest[-10:].max() * 1e6 == pytest.approx(found["laws"][0]["largest_um"]["nominal"], rel=1e-12)
 
 

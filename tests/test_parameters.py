@@ -120,8 +120,3 @@ def test_run_id_that_messages_cannot_carry_is_refused(run_id):
     """BlockInfo.msg bounds it to 64, and CDR counts bytes."""
     with pytest.raises(InputError, match=r"^some_node.run_id = .* at most 64 bytes$"):
         NodeParameters.read("some_node", {"run_id": run_id})
-
-
-def test_table_is_frozen():
-    with pytest.raises(ValueError, match="frozen"):
-        NodeParameters.read("some_node", {}).block_size = 32

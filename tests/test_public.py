@@ -68,3 +68,28 @@ def test_pages_and_templates_import_public_names_only(page):
     for line in ast.walk(ast.parse(re.sub(r"\{%.*?%\}", "", "\n".join(lines)))):
         if isinstance(line, ast.ImportFrom):
             assert [alias.name for alias in line.names if not is_public(str(line.module), alias.name)] == []
+
+
+PISTON = lathe_rc.load("piston")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: lathe_rc.run("piston"), "scenario = 'piston': str; allowed: a Scenario"),
+        (lambda: lathe_rc.run([PISTON]), "list; allowed: a Scenario"),
+        (lambda: lathe_rc.run(PISTON, mode="Offline"), "mode = 'Offline'; allowed: offline, composed, processes"),
+        (lambda: list(lathe_rc.run_many(PISTON)), r"allowed: a list, \[scenario\]"),
+        (lambda: list(lathe_rc.run_many(["piston"])), "str; allowed: a Scenario"),
+        (lambda: lathe_rc.budget("piston"), "str; allowed: a Scenario"),
+        (lambda: lathe_rc.load(3), "allowed: the name of a scenario, or a file"),
+        (lambda: lathe_rc.load("piston", "tool.feed=1e-4"), r"allowed: a list of texts, \['tool.feed=1e-4'\]"),
+        (lambda: setattr(PISTON.nodes["tool"], "feed", "a"), r"allowed: scenario.varied\(\{'NODE.feed': VALUE\}\)"),
+        (lambda: lathe_explore.run_sweep(PISTON, {"tool.feed": 1}, "x"), "allowed: a lathe_explore.Space"),
+        (lambda: lathe_explore.tune("piston", {}, [], "x"), "str; allowed: a Scenario"),
+    ],
+)
+def test_a_wrong_argument_is_refused_in_one_line(call, message):
+    with pytest.raises(lathe_rc.InputError, match=message) as told:
+        call()
+    assert "\n" not in str(told.value)

@@ -94,6 +94,9 @@ def design(
             file = place.with_suffix(".states.csv")
             frequency_response.write_states(file, responses, ", ".join(map(str, points)))
         chosen = chosen.varied({f"{made.drive}response_file": str(file.resolve())})
+    if revolutions is not None:  # the length of the runs that compare the laws, not of the cell
+        given = scenarios.load(scenario, overrides)
+        chosen = chosen.varied({f"{name}.revolutions": given.value(f"{name}.revolutions") for name in given.masters})
     files.write(place, _comment(best, made) + chosen.to_yaml(given=True))
     if as_json:
         rows = [_summary(each) for each in found]

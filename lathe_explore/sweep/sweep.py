@@ -27,8 +27,9 @@ from lathe_explore.sweep.workers import Job, Order, client_of, rows
 from lathe_rc import allowed_code
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -168,8 +169,13 @@ def run_sweep(
         >>> lathe_explore.run_sweep(piston, space, "leads")
         <Sweep of piston in leads: 2 done, 1 refused>
     """
+    scenario = of_load(scenario)
     standard = [] if row.has_tool(scenario) else row.figures(scenario)
     asked = [row.measure(text, scenario) for text in dict.fromkeys([*standard, *measures])]
+    if not isinstance(space, Space):
+        raise InputError(
+            f"space = {space!r:.60}; allowed: a lathe_explore.Space, such as Space(grid={{'NODE.PARAM': [VALUES]}})"
+        )
     space = Space(**space.to_json())
     scenario = scenario.with_models_given() if models == "nominal" else scenario
     space.check(scenario)

@@ -26,7 +26,7 @@ from lathe_explore.sweep.study import Study
 from lathe_explore.sweep.sweep import Watch, crew_for, ignore
 from lathe_explore.sweep.tuning import Tuning
 from lathe_rc.cell.parameters import Value
-from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 
@@ -93,6 +93,7 @@ def tune(
         >>> tuning
         <Tuning of piston in lead: 8 trials, tool.rms_error = ... in trial ...>
     """
+    scenario = of_load(scenario)
     over = Space(**(over or Space()).to_json())
     wanted = objectives(scenario, goals, subjects, measures=measures, percentile=percentile)
     found = search_space(scenario, free)

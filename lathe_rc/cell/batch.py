@@ -24,11 +24,11 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
-from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import LatheError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
 
@@ -112,6 +112,8 @@ def run_many(
         >>> len(outcome.kept.frame("/tool"))
         38395
     """
+    if isinstance(scenarios, Scenario):
+        raise InputError("run_many of one scenario; allowed: a list, [scenario]")
     make = keep if callable(keep) else Errors if keep is None else partial(Topics, topics=keep)
     count = threads or os.cpu_count() or 1
     waiting: deque[Future[Outcome[Any]]] = deque()
@@ -119,7 +121,7 @@ def run_many(
     pool, idle = ThreadPoolExecutor(count), deque(CellRunner() for _ in range(count))
     try:
         for number, scenario in enumerate(scenarios):
-            waiting.append(pool.submit(_outcome, scenario, make, idle))
+            waiting.append(pool.submit(_outcome, of_load(scenario), make, idle))
             # The first run compiles the code that the others use.
             if number == 0 or len(waiting) > _AHEAD * count:
                 yield waiting.popleft().result()

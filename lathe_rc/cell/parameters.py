@@ -137,6 +137,16 @@ class Table(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
 
+    def __setattr__(self, name: str, value: object) -> None:
+        """Reject the assignment.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError(
+            f"{name} = {value!r:.60}: parameters are fixed; allowed: scenario.varied({{'NODE.{name}': VALUE}})"
+        )
+
     @classmethod
     def rows(cls) -> Mapping[str, Row]:
         """Return the parameter rows by name."""

@@ -529,6 +529,19 @@ def _agreed(name: str, tables: Mapping[str, NodeParameters], fingerprints: Mappi
     return Scenario(name, named, fingerprints)
 
 
+def of_load(value: object) -> Scenario:
+    """Return a scenario that a user's program passes.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not isinstance(value, Scenario):
+        raise InputError(
+            f"scenario = {value!r:.60}: {type(value).__name__}; allowed: a Scenario, as lathe_rc.load returns"
+        )
+    return value
+
+
 def load(
     path: str | os.PathLike[str],
     overrides: Iterable[str] = (),
@@ -561,6 +574,10 @@ def load(
         Traceback (most recent call last):
         lathe_rc.errors.InputError: --set 'tol.feed=1.0': no node 'tol' in the scenario; did you mean tool?
     """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"load({path!r:.60}); allowed: the name of a scenario, or a file")
+    if isinstance(overrides, str):
+        raise InputError(f"overrides = {overrides!r}; allowed: a list of texts, [{overrides!r}]")
     path = resources.scenario(Path(path)) if copies is None else Path(path)
     nodes = read(path, overrides, copies)
     shared = nodes.pop(_EVERYONE, {})

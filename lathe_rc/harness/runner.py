@@ -11,14 +11,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.ahead import compile_ahead
 from lathe_rc.cell.collect import Collector, check_room
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.harness import bags
@@ -78,6 +78,9 @@ def run(
         Traceback (most recent call last):
         lathe_rc.errors.InputError: piston_bag exists; a bag is never overwritten...
     """
+    scenario = of_load(scenario)
+    if mode not in get_args(Mode):
+        raise InputError(f"mode = {mode!r}; allowed: {', '.join(get_args(Mode))}")
     if mode != "offline" and start == "fork":
         from lathe_rc import process_launcher
 

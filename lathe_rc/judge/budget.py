@@ -13,7 +13,7 @@ from lathe_rc.analysis.tolerance import LAST
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch, models
 from lathe_rc.cell.parameters import NodeParameters, Value, Values
-from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.causes import EVERYWHERE, ORDER, PREFIXES
@@ -245,7 +245,7 @@ def budget(
         lead: 0.0 %
         feed: 16.9 %
     """
-    done = 0
+    scenario, done = of_load(scenario), 0
 
     def run(sets: Iterable[Causes], made: Mapping[str, Cause]) -> dict[Causes, _Tail]:
         nonlocal done
