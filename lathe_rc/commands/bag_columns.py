@@ -58,10 +58,17 @@ class BagColumns(measurement_file.Source):
 def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
     """Open a bag as a measurement; without a mapping command and response are those of the coarse drive.
 
+    A mapping of topics that have no blocks reads the messages of any type, resampled.
+
     Raises:
         InputError: the path is not a bag, or lacks a column of the mapping.
     """
     source = BagColumns(path)
+    asked = [found.column for found in mapping.values()]
+    if not source.units or not source.units.keys() >= set(asked):
+        from lathe_rc.commands.message_columns import MessageColumns
+
+        return Measurement(str(path), MessageColumns(path, asked), mapping)
     own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
     own = {quantity: found for quantity, found in own.items() if found.column in source.units}
     return Measurement(str(path), source, {**own, **mapping})

@@ -283,8 +283,7 @@ class Measurement:
     def negative(self, quantity: str) -> str:
         """Return the option that reads a quantity with the other sign."""
         column, unit = self._columns[quantity]
-        named = _unit_of(quantity, column)
-        factor = _factor(quantity, unit or (named if named is not None else self._source.units[column]))
+        factor = _factor(quantity, unit or self._unit(quantity, column))
         return "--column " + shlex.quote(f"{quantity}={column}:{-(factor or 1.0):.9g}")
 
     def swapped(self, one: str, other: str) -> str:
@@ -292,12 +291,17 @@ class Measurement:
         pairs = ((one, other), (other, one))
         return " ".join("--column " + shlex.quote(f"{to}={self._columns[of].column}") for to, of in pairs)
 
+    def _unit(self, quantity: str, column: str) -> str:
+        named = (
+            None if column.startswith("/") else _unit_of(quantity, column)
+        )  # the brackets of a topic hold an element
+        return named if named is not None else self._source.units[column]
+
     def _damaged(self) -> str:
         return f"{self.name}: damaged after its header; record or copy it again"
 
     def _in_si(self, quantity: str, column: str, unit: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        named = _unit_of(quantity, column)
-        unit = unit or (named if named is not None else self._source.units[column])
+        unit = unit or self._unit(quantity, column)
         factor = _factor(quantity, unit)
         if factor is None:
             known = ", ".join(each for each in UNITS[quantity] if each)

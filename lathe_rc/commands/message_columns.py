@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers in messages of any type as columns of a measurement, ``TOPIC.PATH``, resampled to common even times.
+
+A path names fields and elements: ``/commands.data[0]``, ``/joint_states.position[0]``; ``position[x]`` is the element
+with the number that x has in the field ``name`` of the same message.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from lathe_rc import messages
+from lathe_rc.bag.reading.source import Source
+from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import Samples
+from lathe_rc.signals import measurement_file
+from lathe_rc.signals.measurement_file import Clock
+
+_SI = "1"  # unit: ROS messages have SI units (REP 103)
+_MOST = 256  # columns of a topic
+_GAP = 10.0  # intervals between messages, over which nothing is known
+_NAMES = "name"
+
+
+class _Series(NamedTuple):
+    """Values of a column at times [ns], and the clock of the times: header or log."""
+
+    times: Samples
+    values: Samples
+    clock: str
+
+
+class MessageColumns(measurement_file.Source):
+    """Columns of messages; those that are asked for are resampled, linear between messages, which is said on stderr.
+
+    Args:
+        path: path of the bag.
+        asked: columns to read.
+
+    Raises:
+        InputError: the path is not a bag, or an asked column cannot be read or resampled.
+    """
+
+    def __init__(self, path: Path, asked: Collection[str]) -> None:
+        self.units: dict[str, str] = {}
+        with Source(path) as source:
+            for topic, about in sorted(source.topics.items()):
+                if about.count and about.type in messages.store().fielddefs:
+                    _, _, data = next(source.messages({topic}))
+                    self.units |= {f"{topic}.{name}": _SI for name in _names(_decoded(path, topic, about.type, data))}
+            known = self.units.keys() >= set(asked)
+            series = {column: _series(source, column) for column in asked} if known else {}
+        self._step_ns, self._columns = _resampled(path, series) if series else (0.0, {})
+
+    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, Samples]:
+        """Return asked columns, shape (n,) each; none has ``gaps``."""
+        return {name: self._columns[name] for name in names}
+
+    def clock(self, name: str) -> Clock:
+        """Return the sampling, which is that of all columns."""
+        return Clock(0.0, self._step_ns * 1e-9)
+
+
+def _decoded(path: Path, topic: str, msgtype: str, data: bytes) -> Any:
+    try:
+        return messages.decode(msgtype, data)
+    except ValueError as error:
+        raise LatheError(f"{path}: {topic}: {shown(error)}") from None
+
+
+def _names(message: Any, before: str = "") -> Iterator[str]:
+    """Yield the paths of the numbers in a message, up to `_MOST` of a list."""
+    for name, (kind, detail) in messages.fields(message.__msgtype__):
+        value = getattr(message, name)
+        if name == "header":
+            continue
+        if kind == Nodetype.NAME:
+            yield from _names(value, f"{before}{name}.")
+        elif kind == Nodetype.BASE and detail[0] != "string":
+            yield f"{before}{name}"
+        elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and len(value) and not isinstance(value[0], str):
+            if hasattr(value[0], "__msgtype__"):
+                continue
+            names = getattr(message, _NAMES, ())
+            yield from (f"{before}{name}[{k}]" for k in range(min(len(value), _MOST)))
+            if not isinstance(names, str) and len(names) == len(value):
+                yield from (f"{before}{name}[{each}]" for each in names)
+
+
+def _number(message: Any, path: str) -> float:
+    """Return the number at a path of a message.
+
+    Raises:
+        LookupError: the message has no such element.
+    """
+    owner, value = message, message
+    for part in path.split("."):
+        name, _, element = part.partition("[")
+        owner, value = value, getattr(value, name)
+        if element:
+            key = element[:-1]
+            value = value[int(key) if key.isdigit() else list(getattr(owner, _NAMES)).index(key)]
+    return float(value)
+
+
+def _series(source: Source, column: str) -> _Series:
+    topic = max((topic for topic in source.topics if column.startswith(f"{topic}.")), key=len)
+    msgtype, path = source.topics[topic].type, column.removeprefix(f"{topic}.")
+    has_header = messages.fields(msgtype)[:1] == [("header", (Nodetype.NAME, "std_msgs/msg/Header"))]
+    logged, stamped, values = [], [], []
+    for _, log_ns, data in source.messages({topic}):
+        message = _decoded(source.path, topic, msgtype, data)
+        try:
+            values.append(_number(message, path))
+        except (LookupError, ValueError):
+            raise InputError(
+                f"{source.path}: {topic} at {log_ns} ns has no {path}; allowed: in every message"
+            ) from None
+        logged.append(log_ns)
+        stamped.append(messages.stamp_ns(message) if has_header else 0)
+    by_header = has_header and stamped[0] > 0 and bool(np.all(np.diff(stamped) > 0))
+    times = np.array(stamped if by_header else logged, np.int64)
+    if times.size < 2 or np.any(np.diff(times) <= 0):
+        raise InputError(f"{source.path}: {topic}: {times.size} messages; allowed: two or more, at different times")
+    return _Series(times, np.array(values), "header" if by_header else "log")
+
+
+def _step(times: Samples) -> float:
+    """Return the interval between messages [ns]: the mean, or the median if some are missing."""
+    between = np.diff(times)
+    median = float(np.median(between))
+    return float(np.mean(between)) if np.abs(between - median).max() < 0.5 * median else median
+
+
+def _resampled(path: Path, series: Mapping[str, _Series]) -> tuple[float, dict[str, Samples]]:
+    """Return the step [ns] of the slowest column, and the columns at common times."""
+    steps = {column: _step(found.times) for column, found in series.items()}
+    for column, found in series.items():
+        between = np.diff(found.times)
+        if between.max() > _GAP * steps[column]:
+            at = (found.times[between.argmax()] - found.times[0]) * 1e-9
+            raise InputError(
+                f"{path}: no {column} for {between.max() * 1e-9:.4g} s from {at:.4g} s on; allowed: up to {_GAP:g} "
+                f"intervals of {steps[column] * 1e-9:.4g} s (record the part without the gap)"
+            )
+    step = max(steps.values())
+    first = max(int(found.times[0]) for found in series.values())
+    last = min(int(found.times[-1]) for found in series.values())
+    if last - first < step:
+        spans = ", ".join(
+            f"{c} ({f.clock} time) {f.times[0] * 1e-9:.3f} to {f.times[-1] * 1e-9:.3f} s" for c, f in series.items()
+        )
+        raise InputError(f"{path}: columns of different times: {spans}; allowed: recorded together, by one clock")
+    count = int((last - first) / step) + 1
+    columns = {
+        column: np.interp(step * np.arange(count), (found.times - first).astype(float), found.values)
+        for column, found in series.items()
+    }
+    told = ", ".join(f"{column} by {found.clock} time" for column, found in series.items())
+    uneven = max(float(np.abs(np.diff(f.times) - steps[c]).max()) for c, f in series.items())
+    both = " (a delay between the two clocks is in the result)" * (len({f.clock for f in series.values()}) > 1)
+    click.echo(
+        f"lathe: note: {path}: resampled every {step * 1e-6:.6g} ms over {step * (count - 1) * 1e-9:.4g} s, linear "
+        f"between messages, in SI units: {told}{both}; intervals differ by up to {uneven * 1e-6:.3g} ms",
+        err=True,
+    )
+    return step, columns
