@@ -230,7 +230,14 @@ def test_many_blocks_read_at_once_are_those_read_one_by_one(data, block):
     singles = [decoder.decode(message) for message in encoded]
     edges = np.cumsum([0, *map(len, encoded)])
     places = np.stack([edges[:-1], edges[1:]], axis=1)
-    joined = list(Decoder(messages.ENCODER).decode_all(b"".join(encoded), places))
+    found = list(Decoder(messages.ENCODER).decode_all(b"".join(encoded), places))
+    joined = [block for block, _ in found]
+    assert sum(count for _, count in found) == len(encoded)
+    assert not any(
+        block.last
+        for block in singles
+        if block.first_index + block.samples not in {b.first_index + b.samples for b in joined}
+    )
     assert sum(each.samples for each in joined) == sum(each.samples for each in singles)
     for name in singles[0].signals:
         whole = np.concatenate([each.signals[name] for each in joined])

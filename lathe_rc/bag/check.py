@@ -15,11 +15,13 @@ from lathe_rc.bag.loss import held
 from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
 from lathe_rc.bag.reading.source import Source, files_of
+from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.wire import Decoder
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.messages import Samples
 
 DIGESTS = "digests.json"  #: file in a bag's folder with the digest of each topic, written by the harness
 _MOST_FINDINGS = 20  # maximum number listed per topic
@@ -97,20 +99,32 @@ class _Dense:
         elif self._told == _MOST_FINDINGS + 1:
             where.append(f"{self._topic}: and more of the kind")
 
-    def add(self, log_ns: int, data: bytes) -> None:
-        try:
-            block = self._decoder.decode(data)
-        except ValueError as error:
-            self._tell(self._findings.wrong, shown(error))
-            return
+    def add(self, found: Batch) -> None:
+        """Check messages; consecutive blocks are checked as one."""
+        start = 0
+        while start < len(found):
+            try:
+                for block, count in self._decoder.decode_all(found.whole, found.places[start:, 2:]):
+                    self._add(found.places[start : start + count, 1], block)
+                    start += count
+            except ValueError as error:
+                self._tell(self._findings.wrong, shown(error))
+                start += 1
+
+    def _add(self, logged: Samples, block: Block) -> None:
+        """Check consecutive blocks with their log times [ns], shape (blocks,)."""
         if self._step_ns is None:
             self._step_ns, self._run_id = block.step_ns, block.run_id
         if (block.step_ns, block.run_id) != (self._step_ns, self._run_id):
             self._tell(self._findings.wrong, f"another run or step from sample {block.first_index} on")
         if self.ended:
             self._tell(self._findings.wrong, f"goes on at sample {block.first_index} after its last block")
-        if log_ns != block.log_ns and log_ns < SIMULATED:  # a recorder of any topics may use the wall time
-            self._tell(self._findings.wrong, f"log time {log_ns} ns of the block at {block.first_index}, not its stamp")
+        length = block.samples // len(logged)
+        later = np.arange(len(logged))[::-1] * (length * block.step_ns)
+        wrong = (logged != (block.log_ns - later).astype(np.uint64)) & (logged < SIMULATED)
+        for k in np.flatnonzero(wrong).tolist():  # a recorder of any topics may use the wall time
+            at = block.first_index + k * length
+            self._tell(self._findings.wrong, f"log time {logged[k]} ns of the block at {at}, not its stamp")
         self._sequence(block)
         self._finite(block)
         self._digester.dense(self._topic, block.signals)
@@ -147,12 +161,14 @@ def check(path: Path) -> Findings:
         findings.foreign = provenance.foreign(source.about)
         findings.unread = list(map(str, source.unread))
         findings.origin = provenance.origin(source.about)
-        for topic, log_ns, data in source.messages():
-            counts[topic] += 1
-            if topic in dense:
-                dense[topic].add(log_ns, data)
-            elif topic in sparse:
-                sparse[topic].add(log_ns, data)
+        for batch in source.batches():
+            for topic in dict.fromkeys(batch.topics.values()):
+                found = batch.only({topic})
+                counts[topic] += len(found)
+                if topic in dense:
+                    dense[topic].add(found)
+                for _, log_ns, data in found if topic in sparse else ():
+                    sparse[topic].add(log_ns, data)
         for topic, said in source.topics.items():
             if said.count != counts[topic]:
                 findings.wrong.append(f"{topic}: {counts[topic]} messages, {said.count} by the index")

@@ -263,12 +263,17 @@ class Decoder:
         if any(not is_finite(np.frombuffer(self.message, np.float64, *run[::-1])) for run in self._layout.numbers):
             Decoder(self._type).decode(self.message).check()
 
-    def decode_all(self, whole: bytes, places: Samples) -> Iterator[Block]:
+    def decode_all(self, whole: bytes, places: Samples) -> Iterator[tuple[Block, int]]:
         """Decode several blocks, joining consecutive ones, in a fraction of the time of separate calls.
+
+        Joined blocks follow one another also by their time stamps, and none but the last ends the run.
 
         Args:
             whole: bytes that contain all blocks, possibly among others.
             places: start and end of each block, shape (blocks, 2).
+
+        Yields:
+            Each joined block, and the number of blocks in it.
 
         Raises:
             ValueError: see `decode`.
@@ -279,7 +284,7 @@ class Decoder:
             begin, length = int(begins[start]), int(lengths[start])
             first = self.decode(data := whole[begin : begin + length])
             if self.message is not data:  # the block was encoded differently, so its samples have other offsets
-                yield first
+                yield first, 1
                 start += 1
                 continue
             assert self._layout is not None, "that has been learned"
@@ -289,7 +294,7 @@ class Decoder:
             anywhere: Samples = np.ndarray(len(whole) - length + 1, f"V{length}", whole, strides=(1,))
             records = anywhere[begins[start:stop]].view(self._layout.dtype)
             count = self._following(records, first)
-            yield self._joined(records[:count], first)
+            yield self._joined(records[:count], first), count
             start += count
 
     def _following(self, records: Samples, first: Block) -> int:
@@ -301,6 +306,9 @@ class Decoder:
         # Computed in uint64, as in the message: the first index of a damaged block may be any number.
         fits &= records["first_index"] == np.uint64(first.first_index) + counts
         fits &= records["step_ns"] == first.step_ns
+        stamps = records["sec"].astype(np.int64) * _BILLION + records["nanosec"]
+        fits &= (stamps - first.log_ns).astype(np.uint64) == counts * np.uint64(first.step_ns)
+        fits[1:] &= ~records["last"][:-1].astype(bool)
         return int(np.argmin(fits)) if not fits.all() else records.size
 
     def _joined(self, records: Samples, first: Block) -> Block:

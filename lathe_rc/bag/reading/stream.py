@@ -90,7 +90,7 @@ class _Dense:
         try:
             for some in together:
                 if self.end < self._stop:
-                    for block in self._decoder.decode_all(whole, some):
+                    for block, _ in self._decoder.decode_all(whole, some):
                         self._append(block)
         except ValueError as error:
             raise LatheError(f"{self.topic}: {shown(error)}") from None
