@@ -34,8 +34,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from lathe_commission import given
 from lathe_commission.design import LAWS, Known
-from lathe_commission.modal_fit import ResponseData, fit
+from lathe_commission.modal_fit import MOST_MODES, ResponseData, fit
+from lathe_commission.trials import Trials
 from lathe_rc.analysis.frequency_response import AVERAGES, FrequencyResponse, deviation_of, of_measurement
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
@@ -71,11 +73,14 @@ Filter = Literal["lead", "inverse", "zero-phase", "notch"]
 _NODE, _DRIVE, _TOOL, _SPINDLE = "learning_controller", "electrodynamic_actuator", "tool", "spindle_encoder"
 _PENALTY = 1e-3  # ρ of an FIR inverse
 _DELAY = 64  # samples, with which the position reaches the law
+_LINEAR, _FEWEST = 0.8, 3  # phase [rad] up to which the lag is fitted to points, and the least number of these
 _POINTS = 4096  # per revolution, at which an expected error is evaluated
+_ORDERS = 1000  # highest
 _TURN = 2.0 * math.pi
+_MAKE = "ilc.frequency_response(...)"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Response:
     """Response of a drive, from its command to its position.
 
@@ -96,16 +101,25 @@ class Response:
         Raises:
             InputError, LatheError: the points do not determine a model.
         """
-        return replace(self, model=fit(ResponseData(self.points), modes=modes).drive)
+        wanted = None if modes is None else given.whole("modes", modes, 0, MOST_MODES)
+        return replace(self, model=fit(ResponseData(self.points), modes=wanted).drive)
+
+    def __repr__(self) -> str:
+        """Return the range of the points, and the model."""
+        low, high = self.points.frequency[[0, -1]] / _TURN
+        told = f"{self.points.frequency.size} points from {low:.4g} to {high:.4g} Hz"
+        return f"<Response of {told}, {self.model or 'no model'}>"
 
     @cached_property
     def lag(self) -> float:
-        """Lag at low frequencies [s]: that of the model, or of the points below three times the lowest frequency."""
+        """Lag at low frequencies [s]: that of the model, or of the phase φ = -lag·ω + c·ω³ of the lowest points."""
         if self.model is not None:
             return float(-np.angle(self.model.response(np.ones(1))[0]))
-        low = self.points.frequency <= 3.0 * self.points.frequency[0]
-        phase = np.unwrap(np.angle(self.points.value[low]))
-        return float(-np.median(phase / self.points.frequency[low]))
+        phase = np.unwrap(np.angle(self.points.value))
+        low = np.arange(phase.size) < max(int(np.argmax(np.abs(phase) > _LINEAR)), _FEWEST)
+        frequency = self.points.frequency[low]
+        fitted = np.linalg.lstsq(np.stack([frequency, frequency**3], axis=1) / frequency[-1], phase[low], rcond=None)[0]
+        return float(-fitted[0] / frequency[-1])
 
     def __call__(self, frequency: Array) -> Complex:
         """Return the response at frequencies [rad/s], shape (n,).
@@ -154,32 +168,44 @@ def frequency_response(
     if isinstance(of, str | os.PathLike):
         return Response(of_measurement(measurement_file.read(Path(of), {}, ".csv"), averages))
     if hasattr(of, "omega"):
-        frequency, found = np.asarray(of.omega, float), np.asarray(getattr(of, "frdata", None), complex).ravel()
+        frequency, found = np.asarray(of.omega, float), np.ravel(getattr(of, "frdata", ()))
+        if found.size != frequency.size:
+            raise InputError("a response of several inputs or outputs; allowed: one of each")
     elif isinstance(of, scipy.signal.lti | scipy.signal.dlti) or callable(of):
         if value is None:
             raise InputError("a system without frequencies; allowed: frequency_response(system, frequencies in Hz)")
-        frequency = _TURN * np.asarray(value, float)
+        frequency = _TURN * given.array("frequencies", value)
         found = _of_system(of, frequency)
     else:
-        frequency, found = _TURN * np.asarray(of, float), np.asarray(value, complex)
-    if frequency.shape != found.shape or frequency.ndim != 1:
-        raise InputError(f"frequency response: shapes {frequency.shape} and {found.shape}; allowed: equal ones, (n,)")
-    if not np.isfinite(found).all():
-        raise InputError(f"frequency response: {found[~np.isfinite(found)][0]}; allowed: finite numbers")
-    known = None if coherence is None else np.asarray(coherence, float)
-    count = AVERAGES if averages is None else averages
-    deviation = None if known is None else deviation_of(known, count)
-    return Response(FrequencyResponse(frequency, found, deviation, known, 0.0 if known is None else count))
+        frequency = _TURN * given.array("frequencies", of)
+        found = given.complex_array("response", value, size=frequency.size)
+    if coherence is None:
+        return Response(FrequencyResponse(frequency, given.complex_array("response", found, size=frequency.size)))
+    known = given.array("coherence", coherence, size=frequency.size)
+    if not np.all((known > 0.0) & (known <= 1.0)):
+        raise InputError(f"coherence of {known.min():g} to {known.max():g}; allowed: above 0 to 1")
+    count = given.number("averages", AVERAGES if averages is None else averages, 1.0)
+    return Response(FrequencyResponse(frequency, found, deviation_of(known, count), known, count))
 
 
 def _of_system(of: Any, frequency: Array) -> Complex:
-    step: float = getattr(of, "dt", None) or 0.0  # 0 and None: continuous
-    if isinstance(of, scipy.signal.dlti):
-        return np.asarray(scipy.signal.dfreqresp(of, frequency * step)[1])
-    if isinstance(of, scipy.signal.lti):
-        return np.asarray(scipy.signal.freqresp(of, frequency)[1])
-    p = 1j * frequency
-    return np.asarray(of(np.exp(p * step) if step else p), complex).ravel()
+    step = getattr(of, "dt", None) or 0.0  # 0 and None: continuous
+    if step is True or step * frequency.max() > math.pi:
+        raise InputError(
+            f"frequencies up to {frequency.max() / _TURN:.4g} Hz with dt = {step}; allowed: up to half of 1/dt"
+        )
+    try:
+        if isinstance(of, scipy.signal.dlti):
+            return np.asarray(scipy.signal.dfreqresp(of, frequency * step)[1])
+        if isinstance(of, scipy.signal.lti):
+            return np.asarray(scipy.signal.freqresp(of, frequency)[1])
+        p = 1j * frequency
+        found = np.asarray(of(np.exp(p * step) if step else p), complex)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the system gives no response ({error}); allowed: one input and one output") from None
+    if found.size != frequency.size:
+        raise InputError("a system of several inputs or outputs; allowed: one of each")
+    return found.ravel()
 
 
 def learning_filter(response: Response, kind: Filter = "zero-phase", *, gain: float = 1.0) -> Values:
@@ -187,15 +213,17 @@ def learning_filter(response: Response, kind: Filter = "zero-phase", *, gain: fl
 
     Args:
         response: response of the drive.
-        kind: ``lead``: the lag at low frequencies; ``inverse``: delay and second order of a fitted model;
-            ``zero-phase``: an FIR filter conj(G)/(|G|² + ρ), stable also for drives that are not minimum-phase;
-            ``notch``: a lead with zero-phase notches at the modes of a fitted model.
-        gain: γ.
+        kind: ``zero-phase``: an FIR filter conj(G)/(|G|² + ρ), for all drives, also those that are not minimum-phase;
+            ``lead``: the lag at low frequencies, for drives with little resonance; ``notch``: a lead with zero-phase
+            notches at the modes of a fitted model; ``inverse``: delay and second order of a fitted model, without its
+            modes, at which it needs a small gain.
+        gain: γ. Where Q is 0, the loop still needs |γZ| < 1.
 
     Raises:
         InputError: the kind needs a fitted model.
     """
-    known, chosen = response.known, {"learning_gain": gain}
+    known = given.instance("response", response, Response, _MAKE).known
+    chosen = {"learning_gain": given.number("gain", gain, 0.0, 2.0, above=True)}
     if kind in ("inverse", "notch") and response.model is None:
         raise InputError(f"learning filter {kind!r} of a response without a model; allowed: of response.fit()")
     if kind == "notch" and not known.resonances:
@@ -222,23 +250,33 @@ def q_filter(response: Response, learning: Values, *, margin: float = 0.3, rpm: 
         margin: least drive margin [1].
         rpm: speed of the spindle [rev/min].
 
+    Returns:
+        The filter, ``q_pass`` and ``q_stop`` in rad/s.
+
     Raises:
-        InputError: no Q has the margin.
+        InputError: an argument is wrong, or no Q has the margin.
     """
-    found = []
-    for values in sorted(LAWS["lead, flat Q"].filters, key=lambda each: -_number(each["q_pass"])):
-        beyond = _number(values["q_stop"]) > response.points.frequency[-1]
-        if beyond and response.model is None:
-            continue  # nothing is known there
+    least = given.number("margin", margin, 0.0, 1.0)
+    highest = given.instance("response", response, Response, _MAKE).points.frequency[-1]
+    filters = sorted(LAWS["lead, flat Q"].filters, key=lambda each: -_number(each["q_pass"]))
+    if response.model is None:  # nothing is known above the points
+        filters = [each for each in filters if _number(each["q_stop"]) <= highest]
+    found, refused = [], None
+    for values in filters:
         made: Values = {"q_filter": "fir", **values}
         try:
             found.append(Loop(response, learning, made, rpm).margin())
-        except InputError:  # the filter does not fit into the memory
+        except InputError as error:  # such as a filter that does not fit into the memory
+            refused = error
             continue
-        if found[-1].error >= margin:
+        if found[-1].error >= least:
             return made
+    if not found and refused:
+        raise refused
     most = max((each.error for each in found), default=0.0)
-    raise InputError(f"Q with a drive margin of {margin:g}; allowed: up to {most:.3g} (another learning filter or rpm)")
+    raise InputError(
+        f"Q with a drive margin of {margin:g}; allowed: up to {most:.3g} (more by a smaller gain or another filter)"
+    )
 
 
 def _number(value: Value) -> float:
@@ -260,8 +298,18 @@ class Part:
 
 
 def reference(harmonics: Mapping[int, float], rpm: float = 1000.0) -> Part:
-    """Return a form with amplitudes [m] by waves per revolution, at a speed [rev/min]."""
-    return Part(dict(harmonics), rpm)
+    """Return a form with amplitudes [m] by waves per revolution, at a speed [rev/min].
+
+    Raises:
+        InputError: an order is no whole number from 1 on, or an amplitude or the speed is none.
+    """
+    if not isinstance(harmonics, Mapping) or not harmonics:
+        raise InputError(f"harmonics = {harmonics!r:.60}; allowed: {{ORDER: AMPLITUDE, ...}}, such as {{2: 100e-6}}")
+    found = {
+        given.whole("order", order, 1, _ORDERS): given.number(f"amplitude of {order} waves", size, -1.0, 1.0)
+        for order, size in harmonics.items()
+    }
+    return Part(found, given.number("rpm", rpm, 0.0, above=True))
 
 
 class Margin(NamedTuple):
@@ -270,26 +318,21 @@ class Margin(NamedTuple):
     Attributes:
         error: error relative to the response, at one frequency, of any phase [1].
         frequency: where it occurs [Hz].
-        points: lowest and highest frequency of the points that the law acts on [Hz]; nothing is known beyond unless
-            there is a model.
-        model: whether the response has a model, with which the margin is evaluated up to ``highest``.
-        highest: highest frequency at which the law acts [Hz].
+        points: lowest and highest frequency of the points within the grid of the memory [Hz].
+        beyond: magnitude of the drive above the points up to which learning converges there whatever its phase; None
+            with a model, whose margin is evaluated there.
     """
 
     error: float
     frequency: float
     points: tuple[float, float]
-    model: bool
-    highest: float
+    beyond: float | None
 
     def __str__(self) -> str:
         """Return the margin, where it is, and what it is known from."""
-        beyond = "beyond them by the model" if self.model else "beyond them unknown"
         low, high = self.points
-        return (
-            f"{self.error:.4g} at {self.frequency:.3g} Hz, from points of {low:.4g} to {high:.4g} Hz, {beyond} "
-            f"(the law acts up to {self.highest:.4g} Hz)"
-        )
+        rest = "beyond by the model" if self.beyond is None else f"beyond unknown: below {self.beyond:.3g} it converges"
+        return f"{self.error:.4g} at {self.frequency:.3g} Hz, from points of {low:.4g} to {high:.4g} Hz, {rest}"
 
 
 class Expected(NamedTuple):
@@ -320,9 +363,25 @@ class Loop:
     q: Values
     rpm: float = 1000.0
 
+    def __post_init__(self) -> None:
+        """Check the arguments."""
+        given.instance("response", self.response, Response, _MAKE)
+        given.instance("learning", self.learning, dict, "ilc.learning_filter(...)")
+        given.instance("q", self.q, dict, "ilc.q_filter(...)")
+        given.number("rpm", self.rpm, 0.0, above=True)
+
+    def _check(self, part: Part) -> None:
+        given.instance("part", part, Part, "ilc.reference(...)")
+        if part.rpm != self.rpm:
+            raise InputError(f"a part at {part.rpm:g} rpm in a loop at {self.rpm:g} rpm; allowed: equal speeds")
+
+    @property
+    def _speed(self) -> float:
+        return self.rpm * _TURN / 60.0
+
     @cached_property
     def _stage(self) -> LearningController:
-        cell = Cell(self.scenario(reference({2: 1e-6}, self.rpm), trials=2).nodes)
+        cell = Cell(self._scenario(reference({2: 1e-6}, self.rpm), {}, 2).nodes)
         stage = cell.stages[_NODE]
         assert isinstance(stage, LearningController), "it is that of piston"
         return stage
@@ -340,35 +399,66 @@ class Loop:
         """Return the cell ``piston`` with this loop.
 
         Args:
-            part: the form and the speed.
-            drive: drive with a model; None: that of the loop, or without a model the drive of ``piston``.
+            part: the form and the speed, which is that of the loop.
+            drive: drive with a model; None: that of the loop, which may have been designed for another one.
             trials: number of revolutions.
             noise_rms: noise of the position sensor [m].
             speed_deviation: amplitude over the nominal speed, and frequency [rad/s]; None: constant speed.
             seed: seed of the noise.
 
         Raises:
-            InputError: a value is out of its range.
+            InputError: the drive has no model, or a value is out of its range.
         """
-        model = (drive or self.response).model
-        amplitude, frequency = ([each] for each in speed_deviation) if speed_deviation else ([], [])
+        self._check(part)
+        model = given.instance("drive", drive or self.response, Response, _MAKE).model
+        if model is None:
+            raise InputError("a cell with a response without a model; allowed: response.fit()")
+        values = cast("Values", model.parameters())
+        return self._scenario(part, values, trials, noise_rms, speed_deviation, seed)
+
+    def _scenario(
+        self,
+        part: Part,
+        drive: Values,
+        trials: int,
+        noise_rms: float = 0.0,
+        speed_deviation: tuple[float, float] | None = None,
+        seed: int = 1,
+    ) -> Scenario:
+        swing = () if speed_deviation is None else given.array("speed_deviation", speed_deviation, size=2).tolist()
         harmonics: Values = {"harmonic_order": [*part.harmonics], "harmonic_amplitude": [*part.harmonics.values()]}
         nodes: dict[str, Values] = {
-            _SPINDLE: {"revolutions": trials, "deviation_amplitude": amplitude, "deviation_frequency": frequency},
+            _SPINDLE: {
+                "revolutions": trials,
+                "deviation_amplitude": [*swing[:1]],
+                "deviation_frequency": [*swing[1:]],
+            },
             _NODE: {"feedback_delay": _DELAY, **self.learning, **self.q},
-            _DRIVE: {"noise_rms": noise_rms, **(cast("Values", model.parameters()) if model else {})},
+            _DRIVE: {"noise_rms": noise_rms, **drive},
             _TOOL: {"profile": "harmonics", "profile_file": "", **harmonics},
         }
         values = {f"{node}.{name}": value for node, table in nodes.items() for name, value in table.items()}
         return load("piston").varied({"nominal_rpm": part.rpm, "seed": seed, **values})
 
-    def to_scenario(self, path: str | os.PathLike[str], part: Part, drive: Response | None = None) -> None:
-        """Write the cell with this loop as a scenario (see `scenario`), for ``lathe run`` and all other commands.
+    def to_scenario(
+        self, path: str | os.PathLike[str], part: Part, drive: Response | None = None, **conditions: Any
+    ) -> None:
+        """Write the cell with this loop as a scenario, for ``lathe run`` and all other commands.
+
+        Args:
+            path: file to write.
+            part: see `scenario`.
+            drive: see `scenario`.
+            conditions: trials, noise_rms, speed_deviation and seed, see `scenario`.
 
         Raises:
-            InputError: a value is out of its range.
+            InputError: see `scenario`; or the file cannot be written.
         """
-        Path(path).write_text(self.scenario(part, drive).to_yaml(given=True), encoding="utf-8")
+        text = self.scenario(part, drive, **conditions).to_yaml(given=True)
+        try:
+            Path(path).write_text(text, encoding="utf-8")
+        except (OSError, TypeError) as error:
+            raise InputError(f"{path}: cannot be written ({error})") from None
 
     def margin(self) -> Margin:
         """Return the smallest relative error of the response, at one frequency, with which learning diverges.
@@ -378,17 +468,30 @@ class Loop:
         Raises:
             InputError: no point is among the frequencies at which the law acts.
         """
-        speed = self.rpm * _TURN / 60.0
+        speed, points = self._speed, self.response.points.frequency
         found = [self._stage.drive_margin(drive, speed) for drive in self.response.drives]
         least = min(each for each in found if each is not None)
-        frequency, highest = self.response.points.frequency / _TURN, self._stage.highest_waves(speed) * speed / _TURN
-        points = float(frequency[0]), float(frequency[frequency <= highest][-1])
-        where = least.waves * speed / _TURN
-        return Margin(least.error, where, points, self.response.model is not None, highest)
+        highest = self._stage.highest_waves(speed) * speed
+        within = points[points <= highest]
+        beyond = None
+        if self.response.model is None:
+            waves = np.linspace(within[-1], highest, _POINTS) / speed
+            loop = self._stage.loop(np.ones_like)
+            kept = np.abs(loop.q.response(_TURN * waves / loop.grid))
+            beyond = float(
+                np.min((1.0 - kept) / np.maximum(np.abs(loop.gain * loop.corrected_drive(waves, speed)), 1e-9))
+            )
+        ends = float(within[0] / _TURN), float(within[-1] / _TURN)
+        return Margin(least.error, least.waves * speed / _TURN, ends, beyond)
+
+    def supremum(self) -> tuple[float, float]:
+        """Return the largest |Q - γZ| over all frequencies, and where it is [Hz]; learning converges below 1."""
+        factor, waves = self._stage.loop(self.response).worst(self._speed)
+        return factor, waves * self._speed / _TURN
 
     def factor(self, waves: npt.ArrayLike) -> Complex:
         """Return the factor Q - γZ of a revolution at ``waves`` per revolution, shape (n,); it converges below 1."""
-        (factor,) = self._stage.factors(self.response, np.asarray(waves, float), self.rpm * _TURN / 60.0)
+        (factor,) = self._stage.factors(self.response, given.array("waves", np.atleast_1d(waves)), self._speed)
         return np.asarray(factor)
 
     def expected_errors(self, part: Part, revolutions: int) -> Array:
@@ -399,7 +502,7 @@ class Loop:
         orders, limit = self._limit(part)
         factor = self.factor(orders)
         excess = np.array([*part.harmonics.values()]) - limit
-        errors = [limit + factor**k * excess for k in range(revolutions)]
+        errors = [limit + factor**k * excess for k in range(given.whole("revolutions", revolutions, 1, 1_000_000))]
         return np.array([np.sqrt(0.5 * np.sum(np.abs(each) ** 2)) for each in errors])
 
     def asymptotic_error(self, part: Part) -> Expected:
@@ -410,33 +513,23 @@ class Loop:
 
     def _limit(self, part: Part) -> tuple[Array, Complex]:
         """Return the harmonics of a part, and the error that learning leaves of each, shape (n,) each."""
-        if part.rpm != self.rpm:
-            raise InputError(f"a part at {part.rpm:g} rpm in a loop at {self.rpm:g} rpm; allowed: equal speeds")
+        self._check(part)
         orders = np.array([*part.harmonics], float)
-        ratio = self._stage.loop(self.response).steady_error(orders, self.rpm * _TURN / 60.0)
+        ratio = self._stage.loop(self.response).steady_error(orders, self._speed)
         return orders, ratio * np.array([*part.harmonics.values()])
 
-    def simulate(
-        self,
-        drive: Response,
-        part: Part,
-        *,
-        trials: int = 40,
-        noise_rms: float = 0.0,
-        speed_deviation: tuple[float, float] | None = None,
-        seed: int = 1,
-    ) -> "Run":
-        """Run the cell with a drive (see `scenario`); the loop may have been designed for another one.
+    def simulate(self, drive: Response, part: Part, **conditions: Any) -> "Run":
+        """Run the cell with a drive.
+
+        Args:
+            drive: see `scenario`.
+            part: see `scenario`.
+            conditions: trials, noise_rms, speed_deviation and seed, see `scenario`.
 
         Raises:
-            InputError: the drive has no model, a value is out of its range, or learning would diverge.
+            InputError: see `scenario`; or learning would diverge.
         """
-        if drive.model is None:
-            raise InputError("simulate with a response without a model; allowed: response.fit()")
-        made = self.scenario(
-            part, drive, trials=trials, noise_rms=noise_rms, speed_deviation=speed_deviation, seed=seed
-        )
-        return Run(run(made), part)
+        return Run(run(self.scenario(part, drive, **conditions)), part)
 
 
 @dataclass(frozen=True)
@@ -465,6 +558,7 @@ class Run:
         turns = np.arange(1, self.errors.size + 1)
         axes.semilogy(turns, self.errors * 1e6, ".-", label="run")
         if loop is not None:
+            given.instance("loop", loop, Loop, "ilc.Loop(...)")
             expected = loop.expected_errors(self.part, turns.size)
             axes.semilogy(turns, expected * 1e6, label="expected at constant speed")
             limit = loop.asymptotic_error(self.part).rms
@@ -473,69 +567,3 @@ class Run:
         axes.legend()
         axes.grid(alpha=0.3)
         return figure
-
-
-class Trials:
-    """Learning over time, in trials of n samples that begin in the same state: u' = Q(u + L·e), e = r - G·u.
-
-    Args:
-        system: impulse response, shape (n,) or more; or a discrete system (``scipy.signal.dlti``, or a StateSpace of
-            python-control with ``dt``), from the command to the position.
-        samples: n.
-
-    Attributes:
-        plant: lifted plant G, lower triangular, shape (n, n).
-
-    Raises:
-        InputError: the system has no sampling step, or its impulse response is shorter than a trial.
-    """
-
-    def __init__(self, system: object, samples: int) -> None:
-        if isinstance(system, scipy.signal.dlti) or hasattr(system, "A"):
-            step = getattr(system, "dt", None)
-            if not step:
-                raise InputError("a continuous system; allowed: a discrete one, with dt (system.to_discrete)")
-            state: Any = system.to_ss() if isinstance(system, scipy.signal.dlti) else system
-            _, (impulse,) = scipy.signal.dimpulse((state.A, state.B, state.C, state.D, step), n=samples)
-        else:
-            impulse = np.asarray(system, float)
-        found: Array = np.ravel(impulse)
-        if found.size < samples:
-            raise InputError(f"impulse response of {found.size} samples; allowed: at least the {samples} of a trial")
-        self.plant: Array = np.asarray(scipy.linalg.toeplitz(found[:samples], np.zeros(samples)))
-
-    def norm_optimal(
-        self, *, effort: float = 0.0, change: float = 0.0, basis: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Return Q and L, shape (n, n), with the least |e'|² + ``effort``·|u'|² + ``change``·|u' - u|².
-
-        Gunnarsson and Norrlöf 2001 (Automatica 37); with a basis Ψ, shape (n, k), the command is Ψ·θ (van de Wijdeven
-        and Bosgra 2010, Int. J. Control 83). Plants that are not minimum-phase need ``effort`` or ``change`` above 0.
-
-        Raises:
-            InputError: the least is not unique.
-        """
-        basis = np.eye(len(self.plant)) if basis is None else np.asarray(basis, float)
-        seen = self.plant @ basis
-        weight = seen.T @ seen + (effort + change) * basis.T @ basis
-        if np.linalg.cond(weight) > 1e13:
-            raise InputError("norm-optimal law: the least is not unique; allowed: effort or change above 0")
-        inner = np.linalg.solve(weight, np.concatenate((seen.T @ self.plant + change * basis.T, seen.T), axis=1))
-        both = basis @ inner
-        kept, learned = both[:, : len(self.plant)], both[:, len(self.plant) :]
-        return kept, np.asarray(np.linalg.lstsq(kept, learned, rcond=None)[0])
-
-    def norm(self, q: Array, learning: Array) -> float:
-        """Return the largest singular value of Q(I - L·G): below 1 the command converges monotonously."""
-        return float(np.linalg.norm(q @ (np.eye(len(self.plant)) - learning @ self.plant), 2))
-
-    def errors(
-        self, wanted: Array, q: Array, learning: Array, trials: int, *, noise_rms: float = 0.0, seed: int = 1
-    ) -> Array:
-        """Return the RMS error of each trial, shape (trials,), for a wanted position, shape (n,), and noise of e."""
-        random, command, found = np.random.default_rng(seed), np.zeros(wanted.size), []
-        for _ in range(trials):
-            error = wanted - self.plant @ command
-            found.append(np.sqrt(np.mean(error**2)))
-            command = q @ (command + learning @ (error + noise_rms * random.standard_normal(wanted.size)))
-        return np.array(found)

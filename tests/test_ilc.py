@@ -17,7 +17,7 @@ OVAL = ilc.reference({2: 100e-6, 6: 5e-6}, rpm=1000.0)
 SPEED = 1000.0 * 2.0 * np.pi / 60.0
 DRIVE = signal.lti([W**2], [1.0, 2.0 * ZETA * W, W**2])
 DELAY = np.exp(-2j * np.pi * F * 0.36e-3)
-PLANT = signal.dlti([0.2, 0.1], [1.0, -0.7], dt=1e-3)
+PLANT = signal.dlti([0.2, 0.1], [1.0, -0.7, 0.1], dt=1e-3)  # with a delay of one sample
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,14 @@ def test_the_margin_of_arrays_is_that_of_the_formula_at_each_point(measured):
     assert found.error == pytest.approx(brute.min(), rel=1e-6)
     assert found.frequency == pytest.approx(F[brute.argmin()])
     assert found.points == pytest.approx((5.0, 2000.0))
-    assert "beyond them unknown" in str(found)
     assert q["q_stop"] <= 2.0 * np.pi * 2000.0
+    assert f"beyond unknown: below {found.beyond:.3g} it converges" in str(found)
+    high = np.linspace(waves[-1], 500.0, 2000)
+    ones = ilc.Loop(measured, learning, q)._stage.loop(np.ones_like)
+    for size, least in ((0.999 * found.beyond, False), (1.01 * found.beyond, True)):
+        phases = np.exp(2j * np.pi * np.arange(60) / 60)
+        kept = ones.operators(high, SPEED, list(size * phases))
+        assert (max(np.abs(each).max() for each in kept) > 1.0) == least
 
 
 @pytest.mark.parametrize("kind", ["lead", "inverse", "zero-phase"])
@@ -63,9 +69,19 @@ def test_a_run_leaves_the_expected_error(kind, known):
 def test_the_written_scenario_is_the_run(known, tmp_path):
     learning = ilc.learning_filter(known)
     loop = ilc.Loop(known, learning, ilc.q_filter(known, learning, margin=0.5))
-    loop.to_scenario(tmp_path / "cell.yaml", OVAL)
-    written = lathe_rc.load(tmp_path / "cell.yaml", ["spindle_encoder.revolutions=3"])
-    assert lathe_rc.run(written).digest == loop.simulate(known, OVAL, trials=3).result.digest
+    conditions = {"trials": 3, "noise_rms": 50e-9, "speed_deviation": (0.05, 37.0), "seed": 7}
+    loop.to_scenario(tmp_path / "cell.yaml", OVAL, **conditions)
+    written = lathe_rc.load(tmp_path / "cell.yaml")
+    assert lathe_rc.run(written).digest == loop.simulate(known, OVAL, **conditions).result.digest
+    factor, where = loop.supremum()
+    assert lathe_rc.run(written).margins["learning_controller"] == pytest.approx(1.0 - factor, abs=0.02)
+    assert where > 0.0
+
+
+def test_the_lag_of_noisy_points_is_that_of_the_drive(known):
+    random = np.random.default_rng(4)
+    noisy = known.points.value * (1.0 + 0.005 * (random.standard_normal(F.size) + 1j * random.standard_normal(F.size)))
+    assert ilc.frequency_response(F, noisy).lag == pytest.approx(known.lag, rel=0.01)
 
 
 def test_systems_and_files_are_read_like_arrays(tmp_path, measured):
@@ -90,27 +106,55 @@ def test_systems_and_files_are_read_like_arrays(tmp_path, measured):
     assert ilc.frequency_response(tmp_path / "g.csv").points.value == pytest.approx(measured.points.value)
 
 
+ONES = np.ones(F.size)
+LOOP = "ilc.Loop(G, {}, {})"
+
+
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("call", "message"),
     [
-        (lambda _: ilc.frequency_response(F, np.ones(3)), "allowed: equal ones"),
-        (lambda _: ilc.frequency_response(F, np.full(F.size, np.nan)), "allowed: finite numbers"),
-        (lambda _: ilc.frequency_response(DRIVE), "allowed: frequency_response"),
-        (lambda g: ilc.learning_filter(g, "inverse"), "without a model; allowed: of response.fit"),
-        (lambda g: ilc.learning_filter(g, "P"), "allowed: lead, inverse, zero-phase, notch"),
-        (lambda g: ilc.q_filter(g, {"lead_time": 0.0}, margin=0.9), "with a drive margin of 0.9; allowed: up to"),
-        (lambda g: ilc.Loop(g, {}, {}).simulate(g, OVAL), "without a model; allowed"),
-        (lambda g: ilc.Loop(g, {}, {}, rpm=500.0).asymptotic_error(OVAL), "allowed: equal speeds"),
-        (lambda g: ilc.Loop(g, {"q_pas": 1.0}, {}).margin(), "q_pas"),
-        (lambda _: ilc.Trials(DRIVE.to_ss(), 10), "a continuous system"),
-        (lambda _: ilc.Trials(np.ones(5), 10), "of 5 samples; allowed: at least the 10"),
-        (lambda _: ilc.Trials(np.r_[0.0, np.ones(9)], 10).norm_optimal(), "the least is not unique"),
+        ("ilc.frequency_response(F, np.ones(3))", r"response of shape \(3,\); allowed: \(240,\)"),
+        ("ilc.frequency_response(F, ONES * np.nan)", "response: .*nan.* allowed: finite numbers"),
+        ("ilc.frequency_response(F * np.nan, ONES)", "frequencies: .*nan.* allowed: finite numbers"),
+        ("ilc.frequency_response(['a'], ONES)", "allowed: an array of numbers"),
+        ("ilc.frequency_response(F + 1j, ONES)", "allowed: real numbers"),
+        ("ilc.frequency_response(F, ONES, coherence=0.0 * ONES)", "allowed: above 0 to 1"),
+        ("ilc.frequency_response(F, ONES, coherence=ONES, averages=0)", "averages = 0; allowed: a number from 1"),
+        ("ilc.frequency_response(DRIVE)", "allowed: frequency_response"),
+        ("ilc.frequency_response(PLANT, F)", "allowed: up to half of 1/dt"),
+        ("G.fit(modes=-1)", "modes = -1; allowed: a whole number from 0 to 8"),
+        ("ilc.learning_filter((F, ONES))", r"allowed: Response \(ilc.frequency_response"),
+        ("ilc.learning_filter(G, 'inverse')", "without a model; allowed: of response.fit"),
+        ("ilc.learning_filter(G, 'P')", "allowed: lead, inverse, zero-phase, notch"),
+        ("ilc.learning_filter(G, gain=np.nan)", "gain = nan; allowed: a number above 0 to 2"),
+        ("ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)", "margin of 0.9; allowed: up to .* by a smaller gain"),
+        ("ilc.q_filter(G, {'lead_tme': 1e-3})", "lead_tme: unknown parameter; did you mean lead_time"),
+        ("ilc.q_filter(G, {}, rpm='1000')", "rpm = '1000'; allowed: a number above 0"),
+        ("ilc.Loop(G, None, {})", "learning = None: NoneType; allowed: dict"),
+        (f"{LOOP}.simulate(G, OVAL)", "without a model; allowed"),
+        (f"{LOOP}.to_scenario('x.yaml', OVAL)", "without a model; allowed"),
+        ("ilc.Loop(G, {}, {}, rpm=500.0).asymptotic_error(OVAL)", "allowed: equal speeds"),
+        (f"{LOOP}.asymptotic_error({{2: 1e-6}})", "allowed: Part"),
+        (f"{LOOP}.expected_errors(OVAL, 2.5)", "revolutions = 2.5; allowed: a whole number"),
+        ("ilc.reference({2.5: 1e-6})", "order = 2.5; allowed: a whole number from 1"),
+        ("ilc.reference({2: 'x'})", "amplitude of 2 waves = 'x'; allowed: a number"),
+        ("ilc.reference([1e-6])", "allowed: {ORDER: AMPLITUDE"),
+        ("ilc.Trials(DRIVE, 10)", "without a sampling step; allowed: a discrete one"),
+        ("ilc.Trials(np.ones(5), 10)", "of 5 samples; allowed: at least the 10"),
+        ("ilc.Trials(np.zeros(9), 9)", "allowed: a plant that moves"),
+        ("ilc.Trials(PLANT, 2.5)", "samples = 2.5; allowed: a whole number"),
+        ("ilc.Trials([1, 1.5, *np.zeros(80)], 82).norm_optimal()", "the least is not unique"),
+        ("ilc.Trials(PLANT, 9).norm_optimal(effort=-1)", "effort = -1; allowed: a number from 0"),
+        ("ilc.Trials(PLANT, 9).norm(1.0, np.eye(9))", r"Q of shape \(\); allowed: \(8, 8\)"),
+        ("ilc.Trials(PLANT, 9).errors(ONES, np.eye(8), np.eye(8), 3)", r"wanted of shape \(240,\); allowed: \(9,\)"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(make, message, measured):
+def test_bad_input_is_refused_in_one_line(call, message, measured, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=message) as told:
-        make(measured)
+        eval(call, {**globals(), "G": measured})  # noqa: S307 - the calls above, which are the names of the cases
     assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_loop_that_diverges_is_not_run(known):
@@ -118,43 +162,50 @@ def test_a_loop_that_diverges_is_not_run(known):
         ilc.Loop(known, {"lead_time": 0.0}, {"q_time": 0.0}).simulate(known, OVAL, trials=3)
 
 
+def lifted(impulse):
+    return np.array([[impulse[k - j] if k >= j else 0.0 for j in range(len(impulse))] for k in range(len(impulse))])
+
+
 def test_norm_optimal_trials_converge_monotonously_to_the_least():
     """The command has the least |e|² + effort·|u|², and comes nearer by at least the norm in each trial."""
     trials, wanted = ilc.Trials(PLANT, 60), np.sin(np.linspace(0.0, np.pi, 60)) ** 2
-    plant = trials.plant
-    assert plant[:, 0] == pytest.approx(PLANT.impulse(n=60)[1][0].ravel())
+    assert trials.delay == 1
+    plant, goal = trials.plant, wanted[1:]
+    assert plant == pytest.approx(lifted(PLANT.impulse(n=60)[1][0].ravel()[1:]))
     q, learning = trials.norm_optimal(effort=0.02, change=0.5)
-    least = np.linalg.solve(plant.T @ plant + 0.02 * np.eye(60), plant.T @ wanted)
+    least = np.linalg.solve(plant.T @ plant + 0.02 * np.eye(59), plant.T @ goal)
     norm = trials.norm(q, learning)
     assert norm < 1.0
-    command = np.zeros(60)
+    command = np.zeros(59)
     for _ in range(80):
         far = np.linalg.norm(command - least)
-        command = q @ (command + learning @ (wanted - plant @ command))
+        command = q @ (command + learning @ (goal - plant @ command))
         assert np.linalg.norm(command - least) <= norm * far * (1.0 + 1e-9) + 1e-12
     errors = trials.errors(wanted, q, learning, 80)
-    assert errors[0] == pytest.approx(np.sqrt(np.mean(wanted**2)))
-    assert errors[-1] == pytest.approx(np.sqrt(np.mean((wanted - plant @ least) ** 2)), rel=1e-3)
-    assert trials.errors(wanted, q, learning, 80, noise_rms=1e-3)[-1] > errors[-1]
+    assert errors[0] == pytest.approx(np.sqrt(np.mean(goal**2)))
+    assert errors[-1] == pytest.approx(np.sqrt(np.mean((goal - plant @ least) ** 2)), rel=1e-3)
+    assert trials.errors(wanted, q, learning, 80, noise_rms=0.1)[-1] > 1.5 * errors[-1]
+    assert trials.norm(*trials.norm_optimal()) < 1e-9  # the inverse: one trial
 
 
 def test_a_plant_that_is_not_minimum_phase_is_learned():
     """With a zero at 1.5 the inverse diverges; weights leave the part of the form that the plant cannot reach."""
-    trials = ilc.Trials(signal.dlti([0.5, -0.75], [1.0, -0.5], dt=1e-3), 80)
-    plant, wanted = trials.plant, np.sin(np.linspace(0.0, np.pi, 80)) ** 2
-    assert np.abs(np.linalg.solve(plant, wanted)).max() > 1e6
+    impulse = np.concatenate(([0.0], signal.dlti([0.5, -0.75], [1.0, -0.5], dt=1e-3).impulse(n=80)[1][0].ravel()))
+    trials = ilc.Trials(impulse, 81)
+    plant, wanted = trials.plant, np.sin(np.linspace(0.0, np.pi, 81)) ** 2
+    assert np.abs(np.linalg.solve(plant, wanted[1:])).max() > 1e6
     q, learning = trials.norm_optimal(effort=1e-4, change=1e-2)
     errors = trials.errors(wanted, q, learning, 400)
-    least = np.linalg.solve(plant.T @ plant + 1e-4 * np.eye(80), plant.T @ wanted)
+    least = np.linalg.solve(plant.T @ plant + 1e-4 * np.eye(80), plant.T @ wanted[1:])
     assert np.abs(least).max() < 10.0
     assert np.all(np.diff(errors) < 1e-12)
-    assert errors[-1] == pytest.approx(np.sqrt(np.mean((wanted - plant @ least) ** 2)), rel=0.01)
+    assert errors[-1] == pytest.approx(np.sqrt(np.mean((wanted[1:] - plant @ least) ** 2)), rel=0.01)
 
 
 def test_basis_functions_keep_the_command_in_their_span():
-    trials = ilc.Trials(PLANT, 50)
-    wanted, basis = np.linspace(0.0, 1.0, 50) ** 2, np.vander(np.linspace(0.0, 1.0, 50), 3)
+    trials = ilc.Trials(PLANT, 51)
+    wanted, basis = np.linspace(0.0, 1.0, 51) ** 2, np.vander(np.linspace(0.0, 1.0, 50), 3)
     q, learning = trials.norm_optimal(basis=basis)
     seen = trials.plant @ basis
-    least = wanted - seen @ np.linalg.lstsq(seen, wanted, rcond=None)[0]
+    least = wanted[1:] - seen @ np.linalg.lstsq(seen, wanted[1:], rcond=None)[0]
     assert trials.errors(wanted, q, learning, 2)[-1] == pytest.approx(np.sqrt(np.mean(least**2)), rel=1e-6)
