@@ -63,14 +63,14 @@ class Terminal(io.StringIO):
 def test_a_terminal_that_cannot_show_it_gets_none(kind, width, drawn):
     """A dumb or a narrow terminal gets no plot; others get it in colours."""
     console = Console(file=Terminal(), width=width, _environ={"TERM": kind})
-    plot.show(run(), console)
+    console.print(*plot.shown(run(), console))
     assert (HEADING in console.file.getvalue()) == (COLOUR in console.file.getvalue()) == drawn
 
 
 def test_neither_a_pipe_nor_json_has_it(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     assert HEADING not in lathe(*COMMAND[3:]).stdout
-    monkeypatch.setattr(plot, "show", None)
+    monkeypatch.setattr(plot, "shown", None)
     assert lathe(*COMMAND[3:], "--json").stdout.startswith("{"), "also in a terminal"
 
 
