@@ -118,6 +118,15 @@ def test_a_pipe_cuts_no_column_of_any_command(monkeypatch, capsys):
     assert not others, "each command prints with tables.console"
 
 
+def test_lines_of_a_result_stay_whole_and_its_tables_fit(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    path = "folder/" * 10
+    tables.show({}, [path, tables.table("first" * 12)], as_json=False)
+    line, *table = capsys.readouterr().out.splitlines()
+    assert line == path
+    assert max(map(len, table)) <= 40
+
+
 def test_headings_that_do_not_fit_break_after_dots_and_underscores():
     names = ["cell", "learning_controller.lead_time", "tool.max_error"]
     assert tables.broken(names, 80) == names
