@@ -342,7 +342,7 @@ class LiveCell:
         if stage is None:
             raise InputError(f"no node {node!r} in the cell; {instead(node, self.cell.stages)}")
         stage.check_action(action)
-        if action.startswith(f"{events.SET} "):
+        if events.parse(action).verb == events.SET:
             stage.tuned(action).check_cell(self.cell, cures=False)
         stage.schedule(action, self.reached)
         text = f"sample {self.reached}: {action}"

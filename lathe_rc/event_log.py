@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
-from lathe_rc.cell.events import FAULT, FREE, LIMITED, REPAIR
+from lathe_rc.cell.events import FAULT, FREE, LIMITED, REPAIR, parse
 from lathe_rc.cell.recording import Recording
 from lathe_rc.safety.state_machine import Reaction, State
 
@@ -94,20 +94,17 @@ class Conditions:
 
         The condition is empty if there is no fault or limit any more; None: the event changes nothing.
         """
-        node, action = message.topic.strip("/").removesuffix("/events"), str(message.values["action"])
-        verb, _, fault = action.partition(" ")
-        if verb in (FAULT, REPAIR):
-            target, several, _ = fault.partition(" ")
-            there = self.faults.setdefault((node, target), [])
-            if verb == FAULT:
-                there.append(fault)
-            elif not several:  # all faults of the target
+        node, event = message.topic.strip("/").removesuffix("/events"), parse(str(message.values["action"]))
+        if event.verb in (FAULT, REPAIR):
+            there = self.faults.setdefault((node, event.target), [])
+            if event.verb == FAULT:
+                there.append(event.fault)
+            elif not event.values:  # all faults of the target
                 there.clear()
-            elif fault in there:
-                there.remove(fault)
-            return f"{node}/fault/{target}", ", ".join(there)
-        kind = action.partition(":")[0]
-        if kind not in (LIMITED, FREE):
+            elif event.fault in there:
+                there.remove(event.fault)
+            return f"{node}/fault/{event.target}", ", ".join(there)
+        if event.verb not in (LIMITED, FREE):
             return None
-        (self.limited.add if kind == LIMITED else self.limited.discard)(node)
-        return f"{node}/limits", LIMITED if kind == LIMITED else ""
+        (self.limited.add if event.verb == LIMITED else self.limited.discard)(node)
+        return f"{node}/limits", LIMITED if event.verb == LIMITED else ""

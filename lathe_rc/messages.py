@@ -29,7 +29,6 @@ EVENT = f"{PACKAGE}/msg/Event"
 MARGIN = f"{PACKAGE}/msg/MarginBlock"
 SAFETY = f"{PACKAGE}/msg/SafetyBlock"
 SAFETY_STATUS = f"{PACKAGE}/msg/SafetyStatus"
-MEMBER = f"{PACKAGE}/msg/Member"
 CELL_STATE = f"{PACKAGE}/msg/CellState"
 JOINTS = "sensor_msgs/msg/JointState"
 ALIVE = "alive"  #: topic on which each node asserts its liveliness; it carries no messages

@@ -63,14 +63,14 @@ class Terminal(io.StringIO):
 def test_a_terminal_that_cannot_show_it_gets_none(kind, width, drawn):
     """A dumb or a narrow terminal gets no plot; others get it in colours."""
     console = Console(file=Terminal(), width=width, _environ={"TERM": kind})
-    plot.show(run(), console)
+    console.print(*plot.shown(run(), console))
     assert (HEADING in console.file.getvalue()) == (COLOUR in console.file.getvalue()) == drawn
 
 
 def test_neither_a_pipe_nor_json_has_it(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     assert HEADING not in lathe(*COMMAND[3:]).stdout
-    monkeypatch.setattr(plot, "show", None)
+    monkeypatch.setattr(plot, "shown", None)
     assert lathe(*COMMAND[3:], "--json").stdout.startswith("{"), "also in a terminal"
 
 
@@ -116,6 +116,15 @@ def test_a_pipe_cuts_no_column_of_any_command(monkeypatch, capsys):
     assert [told.count(name) for name in names] == [2, 2]
     others = [path.name for path in Path(tables.__file__).parent.glob("*.py") if "Console()" in path.read_text()]
     assert not others, "each command prints with tables.console"
+
+
+def test_lines_of_a_result_stay_whole_and_its_tables_fit(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    path = "folder/" * 10
+    tables.show({}, [path, tables.table("first" * 12)], as_json=False)
+    line, *table = capsys.readouterr().out.splitlines()
+    assert line == path
+    assert max(map(len, table)) <= 40
 
 
 def test_headings_that_do_not_fit_break_after_dots_and_underscores():

@@ -180,7 +180,7 @@ def state(tmp_path):
     kept = Restart(role(), str(tmp_path / "state"))
     kept.begin(joins=False)
     kept.keep_event("set learning_gain 0.5", 3.0)
-    kept.keep_event("freeze", 9000)
+    kept.keep_event("freeze", 1234567)
     return tmp_path / "state"
 
 
@@ -193,7 +193,7 @@ def resumed(state, **about):
 def test_a_parameter_that_was_set_for_the_next_cycle_is_set_by_the_process_that_goes_on(state):
     """The state file keeps events by their sample and by their revolution."""
     assert state.stat().st_mode & 0o777 == 0o600
-    assert resumed(state).stage.waiting == ["revolution 3: set learning_gain 0.5", "sample 9000: freeze"]
+    assert resumed(state).stage.waiting == ["revolution 3: set learning_gain 0.5", "sample 1234567: freeze"]
 
 
 def test_a_state_that_is_missing_foreign_damaged_or_open_to_others_is_refused(state, tmp_path):

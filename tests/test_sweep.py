@@ -280,7 +280,7 @@ def test_a_folder_of_something_else_is_refused(piston, client, tmp_path, monkeyp
     (tmp_path / "two" / "thesis.tex").touch()
     with pytest.raises(InputError, match="holds something else than a sweep"):
         lathe_explore.run_sweep(piston, space_, tmp_path / "two", client=client)
-    with Folder(tmp_path / "one").locked(), pytest.raises(InputError, match="another sweep computes into it"):
+    with Folder(tmp_path / "one").locked(), pytest.raises(InputError, match="another program computes into it"):
         lathe_explore.run_sweep(piston, space_, tmp_path / "one", client=client)
     with pytest.raises(InputError, match=r"tcp://127.0.0.1:9"):
         lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.4e-3]}), tmp_path / "one", scheduler="tcp://127.0.0.1:9")

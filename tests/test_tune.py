@@ -18,8 +18,6 @@ from lathe_explore.sweep import formulas, history, row, sweep, tune
 from lathe_explore.sweep.objectives import objectives
 from lathe_explore.sweep.search_space import Dimension, search_space
 from lathe_explore.sweep.space import Space
-from lathe_explore.sweep.study import Study
-from lathe_explore.sweep.tuning import Tuning
 from lathe_rc import cli, harness, resources
 from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
@@ -220,43 +218,12 @@ class TestSearch:
         rows = tuned.sweep.table().drop_columns(["seconds"])
         assert found.sweep.table().drop_columns(["seconds"]).equals(rows)
 
-    def test_trials_of_another_program_are_waited_for_and_taken_over_once_it_is_gone(self, search, client):
-        """Both programs end with the same trials and the same best."""
+    def test_one_program_at_a_time_computes_into_a_folder(self, search):
+        def beside(_event):
+            with pytest.raises(InputError, match="another program computes into it; allowed: one at a time"):
+                search("beside", 4)
 
-        def go(trials, watch=sweep.ignore):
-            return search("two programs", trials, ["margin"], batch=4, watch=watch)
-
-        folder = go(4).folder
-        state = Study(tune.Folder(folder.path))
-
-        def compute(event):
-            if event["event"] == "waiting":
-                state.compute(client, asked, sweep.ignore)
-
-        with state.present() as other:
-            asked = state.ask(other, 8)
-            assert [trial.number for trial in asked] == [4, 5, 6, 7]
-            beside = go(12, compute)
-            assert [trial.number for trial in beside.trials] == list(range(12))
-            assert outcomes(beside) == outcomes(state.tuning())
-            written = scenario.load(folder.path / "best.yaml")
-            assert written.identity == beside.scenario(beside.best).identity
-            assert len(state.ask(other, 16)) == 4
-        assert [trial.number for trial in go(16).trials] == list(range(16))
-
-    def test_the_best_is_written_while_no_other_program_can(self, search, monkeypatch):
-        """Otherwise a program that knows fewer trials could overwrite a better one."""
-        write, written = Tuning.write, []
-
-        def locked(tuning, trial, path):
-            with pytest.raises(InputError, match="another sweep computes into it"), tuning.folder.locked():
-                pass
-            written.append(trial.number)
-            write(tuning, trial, path)
-
-        monkeypatch.setattr(Tuning, "write", locked)
-        search("locked", 2)
-        assert written
+        search("beside", 4, watch=beside)
 
     @pytest.fixture
     def journal(self, tuned, tmp_path):

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe resim``: re-simulation of a run from its recorded spindle, unchanged or with another controller."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
+from rich.console import RenderableType
 from rich.table import Table
 
 from lathe_bagtools.resimulation import identify
@@ -27,38 +26,35 @@ _UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": (
 
 def _table(found: Resimulation) -> Table:
     """Return a table of the recorded and the re-simulated form error."""
-    positions = found.between_rms.size > 0
-    columns = ("revolution", "recorded", "re-simulated", "ratio", *(["positions differ by"] if positions else []))
-    table = tables.table(*columns, title="form error, RMS [µm]")
-    whole = min(found.rms.size, found.recorded_rms.size)
-    for k in tables.spread(whole):
-        old, new = found.recorded_rms[k] * 1e6, found.rms[k] * 1e6
-        between = [f"{found.between_rms[k] * 1e6:#.4g}"] if positions else []
-        table.add_row(
-            str(found.turns_before + k + 1), f"{old:#.4g}", f"{new:#.4g}", f"{new / old:.3g}" if old else "", *between
-        )
-    return table
+    rms, recorded = (of[: min(found.rms.size, found.recorded_rms.size)] * 1e6 for of in (found.rms, found.recorded_rms))
+    columns = {
+        "revolution": lambda k: str(found.turns_before + k + 1),
+        "recorded": lambda k: f"{recorded[k]:#.4g}",
+        "re-simulated": lambda k: f"{rms[k]:#.4g}",
+        "ratio": lambda k: f"{rms[k] / recorded[k]:.3g}" if recorded[k] else "",
+    }
+    if found.between_rms.size:
+        columns["positions differ by"] = lambda k: f"{found.between_rms[k] * 1e6:#.4g}"
+    return tables.of_rows(tables.spread(rms.size), columns, title="form error, RMS [µm]")
 
 
-def _drive_table(drive: Identified) -> Table:
-    """Return a table of the identified parameters and of the scenario's parameters."""
-    columns = ("parameter", "unit", "identified", "standard error", *(["scenario"] if drive.before else []))
-    table = tables.table(*columns, title=f"{drive.node} from {drive.command} and {drive.position[0]}", left=2)
-    for name in drive_fit.PARAMETERS:
-        unit, factor = _UNITS[name]
-        values = [f"{drive.fit.values[name] * factor:.6g}", f"{drive.fit.errors[name] * factor:.2g}"]
-        before = [f"{drive.before[name] * factor:.6g}"] if drive.before else []
-        table.add_row(name, unit, *values, *before)
-    return table
-
-
-def _drive_lines(drive: Identified) -> list[str]:
-    fit = drive.fit
+def _drive_told(drive: Identified) -> Iterator[RenderableType]:
+    """Yield the identified parameters beside those of the scenario, and the quality of the fit."""
+    fit, before = drive.fit, drive.before
+    columns: dict[str, Callable[[str], str]] = {
+        "parameter": str,
+        "unit": lambda name: _UNITS[name][0],
+        "identified": lambda name: f"{fit.values[name] * _UNITS[name][1]:.6g}",
+        "standard error": lambda name: f"{fit.errors[name] * _UNITS[name][1]:.2g}",
+    }
+    if before:
+        columns["scenario"] = lambda name: f"{before[name] * _UNITS[name][1]:.6g}"
+    title = f"{drive.node} from {drive.command} and {drive.position[0]}"
+    yield tables.of_rows(drive_fit.PARAMETERS, columns, left=2, title=title)
     good = f"R² = {fit.r_squared:.8g}, NRMSE = {100.0 * fit.nrmse:.3g} %, residual {fit.residual_rms * 1e6:.3g} µm RMS"
-    lines = [f"{good}; {fit.samples} samples, condition number {fit.condition:.3g}"]
+    yield f"{good}; {fit.samples} samples, condition number {fit.condition:.3g}"
     if fit.vague:
-        lines.append(f"warning: the command hardly tells {' and '.join(fit.vague)} apart; record one that moves more")
-    return lines
+        yield f"warning: the command hardly tells {' and '.join(fit.vague)} apart; record one that moves more"
 
 
 def _drive_summary(drive: Identified) -> dict[str, Any]:
@@ -143,23 +139,16 @@ def resim(
     A BAG without a scenario needs --scenario; its drive can be identified without one (docs/bags.md).
     """
     topics = _topics(topic)
-    console = tables.console()
     if write_form:
-        _write_form(bag, topics, write_form, console, quiet=as_json)
+        _write_form(bag, topics, write_form, quiet=as_json)
     if identified and scenario is None and not _has_scenario(bag):
         if overrides or controller or output or start_from:
             raise InputError(
                 "--set, --controller, --from and -o need a cell, and the bag holds no scenario; give --scenario FILE"
             )
         drives, rest = _identified_alone(bag, topics, write_parameters)
-        if as_json:
-            click.echo(
-                json.dumps({"bag": str(bag), "drives": [_drive_summary(drive) for drive in drives], "asked_for": rest})
-            )
-            lossy.end(bag)
-            return
-        _show_drives(console, drives, write_parameters)
-        console.print(rest)
+        summary = {"bag": str(bag), "drives": [_drive_summary(drive) for drive in drives], "asked_for": rest}
+        tables.show(summary, [*_drives_told(drives, write_parameters), rest], as_json=as_json)
         lossy.end(bag)
         return
     found = resimulate(
@@ -176,11 +165,8 @@ def resim(
     for warning in found.warnings:
         click.echo(f"lathe: warning: {warning}", err=True)
     wrong = bool(found.different) and not found.changed
-    if as_json:
-        click.echo(json.dumps(_summary(found, bag, output)))
-    else:
-        _show_drives(console, found.drives, write_parameters)
-        _show(console, found, output)
+    text = [*_drives_told(found.drives, write_parameters), *_told(found, output)]
+    tables.show(_summary(found, bag, output), text, as_json=as_json)
     ctx.exit(_DIFFERENT if wrong else 0)
 
 
@@ -205,42 +191,39 @@ def _summary(found: Resimulation, bag: Path, output: Path | None) -> dict[str, A
     }
 
 
-def _show_drives(console: Console, drives: Sequence[Identified], parameters: Path | None) -> None:
+def _drives_told(drives: Sequence[Identified], parameters: Path | None) -> Iterator[RenderableType]:
     for drive in drives:
-        console.print(_drive_table(drive))
-        for line in _drive_lines(drive):
-            console.print(line)
+        yield from _drive_told(drive)
     if parameters:
-        console.print(f"parameters: {parameters}")
+        yield f"parameters: {parameters}"
 
 
-def _show(console: Console, found: Resimulation, output: Path | None) -> None:
+def _told(found: Resimulation, output: Path | None) -> Iterator[RenderableType]:
     if found.changed and min(found.rms.size, found.recorded_rms.size):
-        console.print(_table(found))
+        yield _table(found)
     if found.positions:
         recorded = " + ".join(f"{topic} {name}" for topic, name in found.positions)
-        console.print(f"recorded: {recorded}, against the scenario's form")
+        yield f"recorded: {recorded}, against the scenario's form"
     elif not found.recorded:
-        console.print("the recording is not complete: nothing to compare the whole with")
+        yield "the recording is not complete: nothing to compare the whole with"
     if found.recorded and not found.different:
-        equal = len(found.recorded)
-        console.print(f"equal to the recording to the bit: {equal} topics, {found.samples} samples")
+        yield f"equal to the recording to the bit: {len(found.recorded)} topics, {found.samples} samples"
     elif found.recorded:
-        console.print(f"different from the recording: {', '.join(found.different)}")
+        yield f"different from the recording: {', '.join(found.different)}"
     factor = found.simulated_s / found.wall_s
-    console.print(f"{found.simulated_s:.2f} s simulated in {found.wall_s:.2f} s: {factor:.1f}x real time")
+    yield f"{found.simulated_s:.2f} s simulated in {found.wall_s:.2f} s: {factor:.1f}x real time"
     if output:
-        console.print(f"bag: {output}")
+        yield f"bag: {output}"
 
 
-def _write_form(bag: Path, topics: Mapping[str, str], path: Path, console: Console, *, quiet: bool) -> None:
+def _write_form(bag: Path, topics: Mapping[str, str], path: Path, *, quiet: bool) -> None:
     """Write the recorded tool position as a function of the angle."""
     with Source(bag) as source:
         found = identify.form(Recorded(source, topics))
     identify.write_form(path, found)
     first, last = found.revolutions
     if not quiet:
-        console.print(
+        click.echo(
             f"form: {path}, the tool's position in revolutions {first} to {last}, which differ from it by "
-            f"{found.scatter * 1e6:.4g} µm RMS",
+            f"{found.scatter * 1e6:.4g} µm RMS"
         )

@@ -14,6 +14,7 @@ from lathe_rc.bag.reading.recorded import Recorded, Spindle
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import SampleReader, first_of
 from lathe_rc.blocks.ports import Sparse
+from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import DONE, Fields, Reached
@@ -120,7 +121,7 @@ class _RecordedSpindle(TimeMaster):
 
     def replay(self, action: str, index: int) -> None:
         """Schedule a recorded event at its sample."""
-        self._scheduled.append((index, action))
+        self._triggers.append(Trigger("sample", index, action, "events"))
 
     def act(self, action: str, index: int) -> None:
         """Ignore the action: encoder faults are already in the recording."""

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe correct``: programmed form of the next part, from records of finished parts."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import numpy as np
+from rich.console import RenderableType
 
 from lathe_commission import form_correction, part_record
 from lathe_commission.form_correction import Alignment, Correction, Revolution
@@ -279,38 +279,41 @@ def _summary(found: _Read, made: Correction, records: Sequence[Path], forms: _Fo
     }
 
 
-def _show(summary: dict[str, Any], output: Path) -> None:
-    """Print the result."""
-    out = tables.console()
+_COLUMNS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "UPR": lambda wave: str(wave["upr"]),
+    "deviation [µm]": lambda wave: f"{wave['amplitude']:.4g}",
+    "noise [µm]": lambda wave: f"{wave['noise']:.3g}",
+    "correction [µm]": lambda wave: (
+        f"{wave['change']:.4g}" if wave["corrected"] else "in the noise" if wave["noise"] else "none"
+    ),
+}
+
+
+def _told(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     for each in summary["records"]:
         how = "as given" if each["correlation"] is None else f"correlation {each['correlation']:.6f}"
         count = each["revolutions"]
-        out.print(
+        yield (
             f"{each['record']}: {count} revolution{'s' if count > 1 else ''}, angle 0 of the part at "
             f"{each['offset_deg']:.4g}° ({how})"
         )
     left_out = summary["left_out"]
     for each in left_out[:_ROWS]:
-        out.print(
+        yield (
             f"left out, since it stands out: {each['value_um']:.6g} µm at {each['angle_deg']:.6g}° in revolution "
             f"{each['revolution']} of {each['record']}"
         )
     if len(left_out) > _ROWS:
-        out.print(f"and {len(left_out) - _ROWS} more: see --json")
-    lines = tables.table("UPR", "deviation [µm]", "noise [µm]", "correction [µm]")
+        yield f"and {len(left_out) - _ROWS} more: see --json"
     largest = sorted(summary["harmonics"], key=lambda wave: -wave["amplitude"])
-    shown = [wave for wave in largest if wave["corrected"]][:_ROWS]
-    shown += [wave for wave in largest if not wave["corrected"]][:_LEFT]
-    for wave in sorted(shown, key=lambda wave: wave["upr"]):
-        change = f"{wave['change']:.4g}" if wave["corrected"] else "in the noise" if wave["noise"] else "none"
-        lines.add_row(str(wave["upr"]), f"{wave['amplitude']:.4g}", f"{wave['noise']:.3g}", change)
-    out.print(lines)
-    count = sum(wave["corrected"] for wave in summary["harmonics"])
-    out.print(
-        f"{count} of {len(summary['harmonics'])} harmonics corrected: up to {summary['change']:.4g} of "
+    corrected = [wave for wave in largest if wave["corrected"]]
+    shown = corrected[:_ROWS] + [wave for wave in largest if not wave["corrected"]][:_LEFT]
+    yield tables.of_rows(sorted(shown, key=lambda wave: int(wave["upr"])), _COLUMNS)
+    yield (
+        f"{len(corrected)} of {len(largest)} harmonics corrected: up to {summary['change']:.4g} of "
         f"{summary['deviation']:.4g} µm"
     )
-    out.print(f"next part: --set {summary['node']}.programmed_file={output}")
+    yield f"next part: --set {summary['node']}.programmed_file={summary['file']}"
 
 
 @click.command()
@@ -398,8 +401,5 @@ def correct(
     summary = _summary(found, made, records, forms, output)
     if hidden:
         click.echo(f"warning: {hidden}", err=True)
-    if as_json:
-        click.echo(json.dumps(summary))
-    else:
-        _show(summary, output)
+    tables.show(summary, _told(summary), as_json=as_json)
     lossy.end(*filter(measured.is_bag, records))

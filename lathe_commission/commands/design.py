@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe design``: learning law for a measured drive, by its margin and the form error of its runs."""
 
-import json
 import math
 import sys
+from collections.abc import Callable, Iterator
 from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,9 @@ from lathe_rc.commands import options
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
-    from lathe_commission.design import Candidate, Covered, Design
+    from rich.console import RenderableType
+
+    from lathe_commission.design import Candidate, Covered, Design, Found
     from lathe_rc.cell.parameters import Values
     from lathe_rc.cell.scenario import Scenario
 
@@ -69,6 +71,7 @@ def design(
     from lathe_rc import files
     from lathe_rc.analysis import frequency_response
     from lathe_rc.commands import scenario as scenarios
+    from lathe_rc.commands import tables
     from lathe_rc.signals.measurement_file import read
 
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions)
@@ -98,11 +101,9 @@ def design(
         given = scenarios.load(scenario, overrides)
         chosen = chosen.varied({f"{name}.revolutions": given.value(f"{name}.revolutions") for name in given.masters})
     files.write(place, _comment(best, made) + chosen.to_yaml(given=True))
-    if as_json:
-        rows = [_summary(each) for each in found]
-        click.echo(json.dumps({"drives": len(drives), "speeds": speeds, "laws": rows, "scenario": str(place)}))
-    else:
-        _show(found, made, speeds, place)
+    laws = [_summary(each) for each in found]
+    summary = {"drives": len(drives), "speeds": speeds, "laws": laws, "scenario": str(place)}
+    tables.show(summary, _told(found, made, speeds, place), as_json=as_json)
 
 
 def _points(measured: Path) -> list[Path]:
@@ -154,12 +155,14 @@ def _drives(path: Path) -> list["Values"]:
 
 
 def _summary(candidate: "Candidate") -> dict[str, Any]:
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     if candidate.reason:
         return {"law": candidate.law, "offered": False, "reason": candidate.reason}
-    nominal, worst, other, covered = candidate.nominal, candidate.worst, candidate.other, candidate.covered
+    covered = candidate.covered
+    runs = {"nominal": candidate.nominal, "worst": candidate.worst, "other_speed": candidate.other}
+
+    def by_run(of: Callable[["Found"], float]) -> dict[str, float | None]:
+        return {name: value if math.isfinite(value := of(run)) else None for name, run in runs.items()}
+
     return {
         "law": candidate.law,
         "offered": True,
@@ -172,21 +175,9 @@ def _summary(candidate: "Candidate") -> dict[str, Any]:
             "model_hz": [0.0, covered.highest / _TURN],
         },
         "feedback_delay": candidate.shortened,
-        "largest_um": {
-            "nominal": finite(nominal.largest * 1e6),
-            "worst": finite(worst.largest * 1e6),
-            "other_speed": finite(other.largest * 1e6),
-        },
-        "in_tolerance_from": {
-            "nominal": finite(nominal.settled),
-            "worst": finite(worst.settled),
-            "other_speed": finite(other.settled),
-        },
-        "effort": {
-            "nominal": finite(nominal.effort),
-            "worst": finite(worst.effort),
-            "other_speed": finite(other.effort),
-        },
+        "largest_um": by_run(lambda run: run.largest * 1e6),
+        "in_tolerance_from": by_run(lambda run: run.settled),
+        "effort": by_run(lambda run: run.effort),
     }
 
 
@@ -210,38 +201,32 @@ def _comment(best: "Candidate", made: "Design") -> str:
     return "".join(f"# {line}\n" for line in lines)
 
 
-def _show(found: list["Candidate"], made: "Design", speeds: list[str], place: Path) -> None:
-    from lathe_rc.commands.tables import console, table
+def _told(found: list["Candidate"], made: "Design", speeds: list[str], place: Path) -> Iterator["RenderableType"]:
+    from lathe_rc.commands import tables
 
-    out = console()
-    rows = table("law", "margin", "error [µm]", "worst [µm]", "other speed [µm]", "good from", "effort", left=1)
-    offered = [each for each in found if not each.reason]
-    for each in offered:
-        assert each.margin is not None, "the law is offered"
-        rows.add_row(
-            each.law,
-            f"{each.margin.error:.3g}",
-            f"{each.nominal.largest * 1e6:.3g}",
-            f"{each.worst.largest * 1e6:.3g}",
-            f"{each.other.largest * 1e6:.3g}" if len(speeds) > 1 else "-",
-            f"{each.settled:.0f}" if math.isfinite(each.settled) else "-",
-            f"{max(each.worst.effort, each.other.effort):.3g}",
-        )
-    out.print(rows)
-    for each in found:
-        if each.reason:
-            out.print(f"not offered: {each.law}: {each.reason}", soft_wrap=True)
+    offered = [each for each in found if each.margin is not None and not each.reason]
+    columns: dict[str, Callable[[Candidate], str]] = {
+        "law": lambda each: each.law,
+        "margin": lambda each: f"{each.margin.error:.3g}" if each.margin else "",
+        "error [µm]": lambda each: f"{each.nominal.largest * 1e6:.3g}",
+        "worst [µm]": lambda each: f"{each.worst.largest * 1e6:.3g}",
+        "other speed [µm]": lambda each: f"{each.other.largest * 1e6:.3g}" if len(speeds) > 1 else "-",
+        "good from": lambda each: f"{each.settled:.0f}" if math.isfinite(each.settled) else "-",
+        "effort": lambda each: f"{max(each.worst.effort, each.other.effort):.3g}",
+    }
+    yield tables.of_rows(offered, columns, left=1)
+    yield from (f"not offered: {each.law}: {each.reason}" for each in found if each.reason)
     for each in offered:
         if each.shortened is not None:
-            out.print(f"{each.law}: with feedback_delay = {each.shortened}; {made.feedback_delay} is too long for it")
+            yield f"{each.law}: with feedback_delay = {each.shortened}; {made.feedback_delay} is too long for it"
     best = found[0]
-    out.print("error: largest of the last 10 revolutions; worst: with the worst of", f"{len(made.drives)} drives")
-    out.print(f"speed: {'; other speed: '.join(speeds)}")
-    out.print(f"margin: smallest of {len(made.drives)} drives and all measured points; with {best.where}")
-    out.print(f"checked: {_checked(best.covered)}")
+    yield f"error: largest of the last 10 revolutions; worst: with the worst of {len(made.drives)} drives"
+    yield f"speed: {'; other speed: '.join(speeds)}"
+    yield f"margin: smallest of {len(made.drives)} drives and all measured points; with {best.where}"
+    yield f"checked: {_checked(best.covered)}"
     if not math.isfinite(best.settled):
-        out.print("no law is in tolerance with every drive at both speeds: the first has the smallest error")
+        yield "no law is in tolerance with every drive at both speeds: the first has the smallest error"
     for name, value in best.values.items():
         told = f"{value:.4g}" if isinstance(value, float) else value
-        out.print(f"{made.node}.{name}: {f'{len(value)} values' if isinstance(value, list) else told}")
-    out.print(f"scenario: {place}; lathe run {place}", soft_wrap=True)
+        yield f"{made.node}.{name}: {f'{len(value)} values' if isinstance(value, list) else told}"
+    yield f"scenario: {place}; lathe run {place}"

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command group ``lathe fit``: models from measurements, with the parameters to set."""
 
-import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import numpy as np
 from lathe_commission import hysteresis_fit, reduced_order
 from lathe_commission.commands.fit_drive import drive
 from lathe_rc.analysis import frequency_response
-from lathe_rc.commands import lossy, options, picture
+from lathe_rc.commands import lossy, options, picture, tables
 from lathe_rc.commands import measured as measured_options
-from lathe_rc.commands.tables import console
 from lathe_rc.control.decoupler import LAG
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.transfer import TransferFunction
@@ -61,15 +59,11 @@ def hysteresis(
         "offset_m": found.offset,
         "residual": found.residual,
     }
-    if as_json:
-        click.echo(json.dumps(summary))
-        return
-    out = console()
-    out.print(f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:")
+    text = [f"left by the fit: {100 * found.residual:.3g} % RMS; parameters of piezo_actuator:"]
     for name in ("identified_proportional", "identified_thresholds", "identified_weights"):
-        values = np.atleast_1d(summary[name])
-        text = ", ".join(f"{value:.6g}" for value in values)
-        out.print(f"{name}: {text if np.ndim(summary[name]) == 0 else f'[{text}]'}")
+        values = ", ".join(f"{value:.6g}" for value in np.atleast_1d(summary[name]))
+        text += [f"{name}: {values if np.ndim(summary[name]) == 0 else f'[{values}]'}"]
+    tables.show(summary, text, as_json=as_json)
 
 
 Model = reduced_order.Fit | reduced_order.ResponseFit
@@ -167,10 +161,8 @@ def channel(
         missing.append(str(error))
     _draw(figure, model, inverse)
     summary["figure"] = str(figure)
-    if as_json:
-        click.echo(json.dumps({"inverse": None, "pid": None, "loop": None, **summary, "missing": missing}))
-    else:
-        _show(summary, delay + model.delay)
+    summary = {"inverse": None, "pid": None, "loop": None, **summary, "missing": missing}
+    tables.show(summary, _told(summary, delay + model.delay), as_json=as_json)
     if missing:
         raise LatheError(f"{measured}: {'; '.join(missing)}")
 
@@ -206,22 +198,18 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
     }
 
 
-def _show(summary: Mapping[str, Any], delay: float) -> None:
-    """Print the results of the fit."""
-    out = console()
-
+def _told(summary: Mapping[str, Any], delay: float) -> Iterator[str]:
     for name in ("model", "inverse"):
-        if found := summary.get(name):
+        if found := summary[name]:
             top, bottom = (", ".join(f"{value:.5g}" for value in found[part]) for part in ("numerator", "denominator"))
             delayed = f", delay {found['delay']:.4g} s" if found.get("delay") else ""
-            out.print(f"{name:8} [{top}] / [{bottom}]{delayed}, RMS {found['rms']:.3g}")
-    if "pid" in summary:
-        loop = summary["loop"]
-        out.print("pid      " + ", ".join(f"{name} {value:.5g}" for name, value in summary["pid"].items()))
+            yield f"{name:8} [{top}] / [{bottom}]{delayed}, RMS {found['rms']:.3g}"
+    if loop := summary["loop"]:
+        yield "pid      " + ", ".join(f"{name} {value:.5g}" for name, value in summary["pid"].items())
         margin = "any" if loop["gain_margin"] is None else f"{loop['gain_margin']:.3g}"
-        out.print(
+        yield (
             f"loop     rise {loop['rise_s']:.3g} s, settling {loop['settling_s']:.3g} s, "
             f"overshoot {loop['overshoot_pct']:.3g} %, margins {margin} and {loop['phase_margin_deg']:.3g}° "
             f"with a delay of {delay * 1e3:g} ms"
         )
-    out.print(f"figure:  {summary['figure']}")
+    yield f"figure:  {summary['figure']}"

@@ -4,15 +4,16 @@
 import csv
 import glob
 import io
-import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 import numpy as np
 import yaml
+from rich.console import RenderableType
+from rich.table import Table
 
 from lathe_commission import drive_measurement, modal_fit
 from lathe_commission.modal_fit import ModalFit, NoFitError, ResponseData, StepData, Structure
@@ -182,19 +183,14 @@ def _write_points(found: Sequence[_Measured], output: Path) -> dict[str, Path]:
 
 def _tell(found: Sequence[_Measured], places: dict[str, Path], *, chosen: bool, as_json: bool) -> None:
     """Print the results."""
-    if as_json:
-        first, *further = (_summary(one.data, one.fit) for one in found)
-        click.echo(
-            json.dumps({**first, "further": further, "files": {name: str(path) for name, path in places.items()}})
-        )
-        return
-    out = tables.console()
+    first, *further = (_summary(one.data, one.fit) for one in found)
+    summary = {**first, "further": further, "files": {name: str(path) for name, path in places.items()}}
+    text: list[RenderableType] = []
     for one in found:
-        if len(found) > 1:
-            out.print(f"{one.path}:")
-        _show(one, chosen=chosen)
-    for name, path in places.items():
-        out.print(f"{name + ':':12}{path}")
+        text += [f"{one.path}:"] if len(found) > 1 else []
+        text += _told(one, chosen=chosen)
+    text += (f"{name + ':':12}{path}" for name, path in places.items())
+    tables.show(summary, text, as_json=as_json)
 
 
 def _count(fit: ModalFit) -> str:
@@ -269,74 +265,67 @@ def _summary(data: ResponseData | StepData, fit: ModalFit) -> dict[str, Any]:
     }
 
 
-def _show(one: _Measured, *, chosen: bool) -> None:
-    """Print the results of a measurement."""
-    out, data, fit = tables.console(), one.data, one.fit
+def _value(value: float, error: float, digits: int = 5) -> str:
+    return f"{value:#.{digits}g} ± {error:.1g}"
+
+
+def _sections(fit: ModalFit) -> Table:
+    """Return a table of the second order, the modes and the lags of a drive."""
+    drive, errors = fit.drive, fit.errors
+    velocities = ["velocity"] if drive.mode_velocity else []
+    table = tables.table("", "frequency [Hz]", "damping", "participation", *velocities, "delay [µs]", left=1)
+    _, _, own, own_velocity = drive.sections[0]
+    table.add_row(
+        "drive",
+        _value(drive.natural_frequency / _TURN, errors.natural_frequency / _TURN),
+        _value(drive.damping, errors.damping, 4),
+        f"{own:.4g}",
+        *(f"{own_velocity:.4g}" for _ in velocities),
+        _value(drive.delay * 1e6, errors.delay * 1e6),
+    )
+    for number, (mode, error) in enumerate(zip(drive.modes, errors.modes, strict=True), 1):
+        shares = zip(mode[1 : 3 + len(velocities)], error[1:], strict=False)
+        frequency = _value(mode[0] / _TURN, error[0] / _TURN)
+        table.add_row(f"mode {number}", frequency, *(_value(value, off, 4) for value, off in shares))
+    for number, ((time, share), (time_error, share_error)) in enumerate(zip(drive.lags, errors.lags, strict=True), 1):
+        corner = 1.0 / (_TURN * time)
+        table.add_row(f"lag {number}", _value(corner, corner * time_error / time), "", _value(share, share_error, 4))
+    return table
+
+
+_MISSED: Mapping[str, Callable[[Mapping[str, float]], str]] = {
+    "octave [Hz]": lambda row: f"{row['from_hz']:.4g} to {row['to_hz']:.4g}",
+    "largest residual [%]": lambda row: f"{100.0 * row['residual']:.3g}",
+    "at [Hz]": lambda row: f"{row['frequency_hz']:.5g}",
+    "noise [%]": lambda row: f"{100.0 * row['noise']:.2g}" if row["noise"] else "unknown",
+    "RMS [%]": lambda row: f"{100.0 * row['rms']:.3g}",
+}
+
+
+def _told(one: _Measured, *, chosen: bool) -> Iterator[RenderableType]:
+    """Yield the results of a measurement."""
+    data, fit = one.data, one.fit
     if isinstance(data, ResponseData):
         measured = data.measured
         band = f"{measured.frequency[0] / _TURN:.4g} to {measured.frequency[-1] / _TURN:.4g} Hz"
         averages = f", {measured.averages:.3g} averages" if measured.averages else ""
-        out.print(f"frequency response: {measured.frequency.size} points from {band}{averages}")
-        for line in measured.left_out:
-            out.print(line)
+        yield f"frequency response: {measured.frequency.size} points from {band}{averages}"
+        yield from measured.left_out
     else:
-        out.print(f"step response: {data.time.size} samples")
-    drive, errors = fit.drive, fit.errors
-    velocities = ["velocity"] if drive.mode_velocity else []
-    table = tables.table("", "frequency [Hz]", "damping", "participation", *velocities, "delay [µs]", left=1)
-
-    def told(value: float, error: float, digits: int = 5) -> str:
-        return f"{value:#.{digits}g} ± {error:.1g}"
-
-    _, _, own, own_velocity = drive.sections[0]
-    table.add_row(
-        "drive",
-        told(drive.natural_frequency / _TURN, errors.natural_frequency / _TURN),
-        told(drive.damping, errors.damping, 4),
-        f"{own:.4g}",
-        *[f"{own_velocity:.4g}" for _ in velocities],
-        told(drive.delay * 1e6, errors.delay * 1e6),
-    )
-    for number, (mode, error) in enumerate(zip(drive.modes, errors.modes, strict=True), 1):
-        table.add_row(
-            f"mode {number}",
-            told(mode[0] / _TURN, error[0] / _TURN),
-            *(told(value, off, 4) for value, off in zip(mode[1 : 3 + len(velocities)], error[1:], strict=False)),
-            "",
-        )
-    for number, ((time, share), (time_error, share_error)) in enumerate(zip(drive.lags, errors.lags, strict=True), 1):
-        corner = 1.0 / (_TURN * time)
-        table.add_row(
-            f"lag {number}",
-            told(corner, corner * time_error / time),
-            "",
-            told(share, share_error, 4),
-            *velocities and [""],
-            "",
-        )
-    out.print(table)
-    out.print(f"gain: {told(drive.gain, errors.gain)}{_sign(one.measurement, drive.gain)}")
+        yield f"step response: {data.time.size} samples"
+    yield _sections(fit)
+    yield f"gain: {_value(fit.drive.gain, fit.errors.gain)}{_sign(one.measurement, fit.drive.gain)}"
     if chosen:
         near = sorted(fit.bic.items(), key=lambda pair: pair[1])[:_ALIKE]
         values = ", ".join(f"{structure}: {value - near[0][1]:.4g}" for structure, value in near)
-        out.print(f"{_count(fit)}, chosen by BIC (above the least: {values})", soft_wrap=True)
-    for text in fit.unresolved:
-        out.print(f"{text}; its height there rests on the model alone", soft_wrap=True)
+        yield f"{_count(fit)}, chosen by BIC (above the least: {values})"
+    yield from (f"{text}; its height there rests on the model alone" for text in fit.unresolved)
     if isinstance(data, ResponseData):
-        missed = tables.table("octave [Hz]", "largest residual [%]", "at [Hz]", "noise [%]", "RMS [%]", left=1)
-        for row in _missed(data, fit):
-            missed.add_row(
-                f"{row['from_hz']:.4g} to {row['to_hz']:.4g}",
-                f"{100.0 * row['residual']:.3g}",
-                f"{row['frequency_hz']:.5g}",
-                f"{100.0 * row['noise']:.2g}" if row["noise"] else "unknown",
-                f"{100.0 * row['rms']:.3g}",
-            )
-        out.print(missed)
+        yield tables.of_rows(_missed(data, fit), _MISSED, left=1)
         beyond = f"{100.0 * fit.model_error:.2g} % of the magnitude" if fit.model_error > _NOTHING else "none"
-        out.print(f"error of the model beyond the noise: {beyond}")
+        yield f"error of the model beyond the noise: {beyond}"
     else:
-        out.print(f"residual: {100.0 * fit.model_error:.3g} % of the step, RMS")
+        yield f"residual: {100.0 * fit.model_error:.3g} % of the step, RMS"
 
 
 def _sign(measurement: Measurement, gain: float) -> str:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe measure``: workshop measurements of a recorded part by revolution."""
 
-import json
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
-from rich.table import Table
+from rich.console import RenderableType
 
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.bag import provenance, reader
@@ -17,23 +18,16 @@ from lathe_rc.commands import lossy, measured, options, tables
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge import part
 
-_COLUMNS = ("rev", "RMS", "max", "P-V", "RONt", "eccentric", "largest UPR", "Ra")
-
-
-def table(found: Measurement, revolutions: list[int]) -> Table:
-    """Return a table of the revolutions, in µm."""
-    lines = tables.table(*_COLUMNS, title="form error and roundness [µm]")
-    for revolution in revolutions:
-        numbers = part.numbers(found, revolution)
-        upr = numbers["largest_upr"]
-        lines.add_row(
-            str(numbers["revolution"]),
-            *(f"{numbers[name]:#.4g}" for name in ("rms", "max", "peak_to_valley", "ront")),
-            f"{np.hypot(*numbers['centre']):.3g}",
-            f"{upr['upr']}: {upr['amplitude']:.3g}",
-            f"{numbers['ra']:.3g}",
-        )
-    return lines
+_COLUMNS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "rev": lambda row: str(row["revolution"]),
+    "RMS": lambda row: f"{row['rms']:#.4g}",
+    "max": lambda row: f"{row['max']:#.4g}",
+    "P-V": lambda row: f"{row['peak_to_valley']:#.4g}",
+    "RONt": lambda row: f"{row['ront']:#.4g}",
+    "eccentric": lambda row: f"{np.hypot(*row['centre']):.3g}",
+    "largest UPR": lambda row: f"{row['largest_upr']['upr']}: {row['largest_upr']['amplitude']:.3g}",
+    "Ra": lambda row: f"{row['ra']:.3g}",
+}
 
 
 def _chosen(text: str, whole: int) -> list[int]:
@@ -98,33 +92,24 @@ def measure(
     chosen = _chosen(revolutions, found.form.rms.size)
     if profile:
         part.write_profile(profile, recording, found, chosen)
-    if as_json:
-        summary = {
-            "bag": str(bag),
-            "cutoff_upr": cutoff,
-            "unit": "um",
-            "revolutions": [part.numbers(found, k) for k in chosen],
-            "along": part.along(surface) if isinstance(surface, Lay) else surface,
-            "profile": str(profile) if profile else None,
-            "not_measured": recording.sound_form[1] or None,
-        }
-        click.echo(json.dumps(summary))
-        _end(bag, recording)
-        return
-    console = tables.console(soft_wrap=False)
-    console.print(table(found, chosen))
-    if why := recording.sound_form[1]:
-        console.print(f"revolutions from {recording.turns_before + found.form.rms.size + 1} on: {why}", soft_wrap=True)
+    rows, why = [part.numbers(found, k) for k in chosen], recording.sound_form[1]
+    summary = {
+        "bag": str(bag),
+        "cutoff_upr": cutoff,
+        "unit": "um",
+        "revolutions": rows,
+        "along": part.along(surface) if isinstance(surface, Lay) else surface,
+        "profile": str(profile) if profile else None,
+        "not_measured": why or None,
+    }
+    text: list[RenderableType] = [tables.of_rows(rows, _COLUMNS, title="form error and roundness [µm]")]
+    if why:
+        text += [f"revolutions from {recording.turns_before + found.form.rms.size + 1} on: {why}"]
     if surface:
-        text = part.along_in_words(surface) if isinstance(surface, Lay) else surface
-        console.print(text, soft_wrap=True)
+        text += [part.along_in_words(surface) if isinstance(surface, Lay) else surface]
     if profile:
-        console.print(f"profile: {profile}", soft_wrap=True)
-    _end(bag, recording)
-
-
-def _end(bag: Path, recording: Recording) -> None:
-    """End with exit code 3 if members were lost, and 1 if the form error rests on a fault."""
+        text += [f"profile: {profile}"]
+    tables.show(summary, text, as_json=as_json)
     lossy.end(bag)
-    if recording.sound_form[1]:
+    if why:  # the form error rests on a fault
         raise click.exceptions.Exit(LatheError.exit_code)

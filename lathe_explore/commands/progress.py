@@ -76,8 +76,6 @@ class SweepWatch:
         elif event["event"] == "ready":
             self._console.print(f"Dask's dashboard: {event['dashboard']}")
             self._bar.reset(self._task, total=self._cells, completed=self._done, description="computing")
-        elif event["event"] == "waiting":
-            update(self._task, description="another program computes the last trials")
         elif event["event"] == "told":
             tuning = event["tuning"]
             self._trials_done = len(tuning.trials)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe sweep``: compute variations of a scenario into a table, and show the table."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,6 +17,9 @@ from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError, LatheError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from lathe_explore.sweep.outcomes import Outcome
     from lathe_explore.sweep.page import Written
     from lathe_explore.sweep.sweep import Sweep
 
@@ -159,45 +162,48 @@ def run(
 
 
 def _show(found: "Sweep", goals: Sequence[str] = (), written: "Written | None" = None, *, as_json: bool) -> None:
-    from lathe_rc.commands.tables import broken, console, table
+    from lathe_rc.commands import tables
 
-    statuses, folder = found.statuses(), found.folder
-    top = found.best(*goals)
-    if as_json:
-        summary = {"folder": str(folder.path), "scenario": folder.name, "statuses": statuses, "best": top}
-        summary["reasons"] = [each._asdict() for each in found.outcomes() if each.reason]
-        if written:
-            summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
-        click.echo(json.dumps(summary))
-        return
-    out = console()
-    if top:
-        title = (
-            "no other cell is better in all goals"
-            if len(goals) > 1
-            else f"best {goals[0]}"
-            if goals
-            else "smallest errors"
-        )
-        lines = table(*broken(list(top[0]), out.width), title=title, overflow="fold")
-        for each in top:
-            lines.add_row(*(_formatted(value, *folder.description.unit(name)) for name, value in each.items()))
-        out.print(lines, soft_wrap=False)
-    out.print(", ".join(f"{count} {status}" for status, count in statuses.items()))
-    for goal in goals:
-        if missing := found.count_without(goal):
-            out.print(f"{missing} done cells without a value of {goal}", soft_wrap=True, highlight=False)
+    top, folder = found.best(*goals), found.folder
+    summary = {"folder": str(folder.path), "scenario": folder.name, "statuses": found.statuses(), "best": top}
     reasons = [each for each in found.outcomes() if each.reason]
-    for outcome in reasons[:_REASONS]:
-        out.print(f"{outcome.cells} {outcome.status}, such as {outcome.example}", soft_wrap=True, highlight=False)
-    if more := reasons[_REASONS:]:
-        out.print(f"{sum(outcome.cells for outcome in more)} for {len(more)} more reasons, which are on the page")
-    out.print(f"rows:    {folder.path}/rows")
-    out.print(f"page:    {written.page if written else f'lathe sweep show {folder.path}'}")
-    if written and written.figures:
-        out.print(f"figures: {written.figures[0].parent} ({len(written.figures)} PNG)")
+    summary["reasons"] = [each._asdict() for each in reasons]
+    if written:
+        summary |= {"page": str(written.page), "figures": [str(path) for path in written.figures]}
+    tables.show(summary, _told(found, summary, reasons, goals, written), as_json=as_json)
     if goals and not top:
         raise LatheError(f"no cell of {folder.path} has a value of {' and '.join(goals)}")
+
+
+def _told(
+    found: "Sweep",
+    summary: dict[str, Any],
+    reasons: Sequence["Outcome"],
+    goals: Sequence[str],
+    written: "Written | None",
+) -> Iterator["RenderableType"]:
+    from lathe_rc.commands.tables import broken, console, table
+
+    folder = found.folder
+    if top := summary["best"]:
+        best = f"best {goals[0]}" if goals else "smallest errors"
+        title = "no other cell is better in all goals" if len(goals) > 1 else best
+        lines = table(*broken(list(top[0]), console().width), title=title, overflow="fold")
+        for each in top:
+            lines.add_row(*(_formatted(value, *folder.description.unit(name)) for name, value in each.items()))
+        yield lines
+    yield ", ".join(f"{count} {status}" for status, count in summary["statuses"].items())
+    for goal in goals:
+        if missing := found.count_without(goal):
+            yield f"{missing} done cells without a value of {goal}"
+    for each in reasons[:_REASONS]:
+        yield f"{each.cells} {each.status}, such as {each.example}"
+    if more := reasons[_REASONS:]:
+        yield f"{sum(each.cells for each in more)} for {len(more)} more reasons, which are on the page"
+    yield f"rows:    {folder.path}/rows"
+    yield f"page:    {written.page if written else f'lathe sweep show {folder.path}'}"
+    if written and written.figures:
+        yield f"figures: {written.figures[0].parent} ({len(written.figures)} PNG)"
 
 
 def _formatted(value: object, factor: float, unit: str) -> str:
@@ -219,7 +225,7 @@ def compare(first: Path, second: Path, goal: str, *, as_json: bool) -> None:
     from lathe_explore.sweep import comparison
     from lathe_explore.sweep.figures import effect_said
     from lathe_explore.sweep.folder import Folder
-    from lathe_rc.commands.tables import console, table
+    from lathe_rc.commands import tables
 
     found = comparison.compare(Folder(first), Folder(second), goal)
     name, effects = found.sides[0].goal.name, list(dict.fromkeys(key for side in found.sides for key in side.effects))
@@ -239,33 +245,24 @@ def compare(first: Path, second: Path, goal: str, *, as_json: bool) -> None:
         rows[f"effect of {key}"] = [total or share for total, share, _ in told]
     changed = found.changes
     middle = [float(np.quantile(changed, share)) for share in (0.0, 0.5, 1.0)] if changed.size else []
-    if as_json:
-        summary = {"differences": list(found.differences), "common": changed.size, "better": found.better}
-        click.echo(json.dumps(summary | {"changes": middle, "rows": rows}))
-        return
-    out = console()
-    for each in found.differences or ["no difference of the scenarios, the code and the version of lathe_rc"]:
-        out.print(each, soft_wrap=True, highlight=False)
-    made = table("", str(first), str(second), left=1, overflow="fold")
+    text: list[RenderableType] = [
+        *(found.differences or ["no difference of the scenarios, the code and the version of lathe_rc"])
+    ]
+    made = tables.table("", str(first), str(second), left=1, overflow="fold")
     for key, texts in rows.items():
         made.add_row(key, *texts)
-    out.print(made, soft_wrap=False)
+    text += [made]
     if changed.size:
         low, half, high = (found.sides[0].goal.told(value) for value in middle)
         equal = int((changed == 0.0).sum())
-        out.print(
-            f"{changed.size} cells in common: {found.better} better in {second}, {equal} equal, "
-            f"{changed.size - found.better - equal} worse; change {low} to {high}, median {half}",
-            soft_wrap=True,
-            highlight=False,
-        )
+        counts = f"{found.better} better in {second}, {equal} equal, {changed.size - found.better - equal} worse"
+        text += [f"{changed.size} cells in common: {counts}; change {low} to {high}, median {half}"]
     else:
-        out.print("no cell in common")
-    for side in found.sides:
-        if side.best:
-            out.print(
-                f"best run: lathe sweep show {side.folder.path} --cell {side.best['cell']} --panel", soft_wrap=True
-            )
+        text += ["no cell in common"]
+    bests = [(side.folder.path, side.best["cell"]) for side in found.sides if side.best]
+    text += (f"best run: lathe sweep show {path} --cell {cell} --panel" for path, cell in bests)
+    summary = {"differences": list(found.differences), "common": changed.size, "better": found.better}
+    tables.show(summary | {"changes": middle, "rows": rows}, text, as_json=as_json)
 
 
 @sweep.command()
@@ -311,20 +308,16 @@ def show(
         return
     if goals:
         raise InputError(f"--goal {goals[0]} with --cell {cell}; allowed: one of them")
-    from lathe_rc.commands import outcome
+    from lathe_rc.commands import outcome, tables
 
     if report or panel:
         bag = bag or folder / f"cell-{cell}"
     result = lathe_rc.run(found.scenario(cell), bag=bag)
     kept = found.row(cell)
     same = row.digest(result.recording, found.folder.measures) == kept["digest"]
-    if as_json:
-        click.echo(json.dumps({**result.summary(), "cell": cell, "same_digest": same}))
-    else:
-        outcome.show(result, {})
-        click.echo(
-            f"cell {cell}: {'the digest of its row' if same else 'ANOTHER DIGEST than in its row: ' + kept['version']}"
-        )
+    told = f"cell {cell}: {'the digest of its row' if same else 'ANOTHER DIGEST than in its row: ' + kept['version']}"
+    summary = {**result.summary(), "cell": cell, "same_digest": same}  # its digests are there already
+    tables.show(summary, chain(outcome.told(result, {}), [told]), as_json=as_json)
     if not same:
         raise click.exceptions.Exit(1)
     if report:

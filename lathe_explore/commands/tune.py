@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command ``lathe tune``: search for the parameters of a scenario that meet goals best."""
 
-import json
 import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from lathe_rc.commands import options
 from lathe_rc.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.table import Table
 
     from lathe_explore.sweep.tuning import Trial, Tuning
@@ -86,6 +87,7 @@ def tune(
     from lathe_explore.sweep import history
     from lathe_explore.sweep.distributions import is_law
     from lathe_rc.commands import scenario as scenarios
+    from lathe_rc.commands import tables
 
     check_crew(scheduler, workers)
     if worst and percentile is not None:
@@ -112,40 +114,34 @@ def tune(
             **search,
         )
     picture = history.write(found)
-    if as_json:
-        click.echo(json.dumps(_summary(found)))
-    else:
-        _show(found, picture)
+    tables.show(_summary(found), _told(found, picture), as_json=as_json)
 
 
-def _show(tuning: "Tuning", picture: Path) -> None:
-    from lathe_rc.commands.tables import console
-
-    out = console()
+def _told(tuning: "Tuning", picture: Path) -> Iterator["RenderableType"]:
     folder, start, best = tuning.folder.path, tuning.start, tuning.best
     if improvements := _history(tuning):
-        out.print(improvements)
+        yield improvements
     if len(tuning.front) > 1:
-        out.print(_front_table(tuning), soft_wrap=False)
-        out.print(f"{folder / 'front'}: a parameter file of each")
+        yield _front_table(tuning)
+        yield f"{folder / 'front'}: a parameter file of each"
     if best and start:
-        out.print(_best_table(tuning), soft_wrap=False)
+        yield _best_table(tuning)
         if not math.isnan(best.score.margin):
-            out.print(_cost_of(start, best))
+            yield _cost_of(start, best)
     for formula in dict.fromkeys(found.formula for found in tuning.formulas.values()):
         targets = [target for target, found in tuning.formulas.items() if found.formula == formula]
-        out.print(f"by formula, {', '.join(targets)}: {formula}")
-    out.print(f"{len(tuning.trials)} trials, {len(tuning.feasible)} meet all subjects")
+        yield f"by formula, {', '.join(targets)}: {formula}"
+    yield f"{len(tuning.trials)} trials, {len(tuning.feasible)} meet all subjects"
     if best:
-        out.print(f"best:    lathe run {folder / 'best.yaml'} (trial {best.number})")
+        yield f"best:    lathe run {folder / 'best.yaml'} (trial {best.number})"
     else:
-        out.print("nothing meets all subjects; allowed: wider ranges, weaker subjects, more trials")
+        yield "nothing meets all subjects; allowed: wider ranges, weaker subjects, more trials"
         reasons = Counter(filter(None, tuning.folder.table(["reason"]).column("reason").to_pylist()))
         for reason, count in reasons.most_common(1):
-            out.print(f"{count} cells did not run to their end, as this one: {reason}")
-    out.print(f"history: {picture}")
+            yield f"{count} cells did not run to their end, as this one: {reason}"
+    yield f"history: {picture}"
     shown = best or start
-    out.print(f"rows:    lathe sweep show {folder} --cell {shown.number * tuning.cells if shown else 0}")
+    yield f"rows:    lathe sweep show {folder} --cell {shown.number * tuning.cells if shown else 0}"
 
 
 def _best_table(tuning: "Tuning") -> "Table":

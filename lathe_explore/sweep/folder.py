@@ -148,7 +148,7 @@ class Folder:
             _refuse_others(path)
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        # A sweep that computes into the folder has a fixed set of columns; the processes of a tuning have the same set.
+        # A sweep that computes into the folder has a fixed set of columns; that of a tuning never changes.
         with locked(path / _WRITING), nullcontext() if tuning else locked(path / _COMPUTING, wait=False):
             _refuse_others(path)
             return Folder._with(path, scenario, space, measures, tuning)
@@ -341,7 +341,6 @@ class Folder:
             LatheError: the file cannot be written; existing rows are preserved.
         """
         place = self.path / _ROWS
-        # Several processes may compute a tuning, so without the lock two files could get the same number.
         with locked(self.path / _WRITING), writing(self.path):
             taken = [int(path.stem) for path in place.glob("*.parquet") if path.stem.isdigit()]
             with files.replacing(place / f"{max(taken, default=-1) + 1:06d}.parquet") as stream:
@@ -431,7 +430,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
         try:
             lock.acquire(blocking=wait)
         except filelock.Timeout:
-            raise InputError(f"{path.parent}: another sweep computes into it; allowed: one at a time") from None
+            raise InputError(f"{path.parent}: another program computes into it; allowed: one at a time") from None
     try:
         yield
     finally:

@@ -43,7 +43,7 @@ from lathe_rc import __version__, allowed_code, messages
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
-from lathe_rc.cell.events import LIMITED, OUT_OF_REACH
+from lathe_rc.cell.events import LIMITED, OUT_OF_REACH, parse
 from lathe_rc.cell.parameters import Value, form_doubt, judged
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from lathe_explore.sweep.description import Target
 
 DONE, REFUSED, DIVERGED, FAILED = "done", "refused", "diverged", "failed"
-LIMITS = (LIMITED, OUT_OF_REACH)  # beginnings of the events of a limit
+LIMITS = (LIMITED, OUT_OF_REACH)  # verbs of the events of a limit
 
 Samples = NDArray[np.float64]
 
@@ -244,7 +244,7 @@ class _Keeper(Errors):
         if self._whole:
             self._whole.chunk(first, samples, dense, sparse)
         for topic, said in sparse.items():
-            if topic in self._events and any(message.values["action"].startswith(LIMITS) for message in said):
+            if topic in self._events and any(parse(message.values["action"]).verb in LIMITS for message in said):
                 self._limited.add(topic.removesuffix("/events"))
         if self._tool:
             self._hash.update(_bytes(dense[self._tool]["error"]))

@@ -10,16 +10,14 @@ import hashlib
 import json
 import os
 import sys
-import uuid
 import warnings
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import distributed
-import filelock
 import numpy as np
 import optuna
 import pyarrow as pa
@@ -29,7 +27,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lathe_explore.sweep import BATCH, formulas
-from lathe_explore.sweep.folder import Folder, locked, writing
+from lathe_explore.sweep.folder import Folder, writing
 from lathe_explore.sweep.objectives import Score, objectives
 from lathe_explore.sweep.search_space import search_space
 from lathe_explore.sweep.sweep import Key, Watch, keep, order_of
@@ -43,7 +41,7 @@ _STUDY = "tuning"
 _POPULATION = 3 * BATCH  # population of NSGA-II
 _UNKNOWN = 1e9  # stands for an infinite cost, which the samplers do not accept; larger than all other costs
 _CHECKSUM = "checksum"  # key of a journal line's checksum, stored in the line itself
-_BY, _SCORE = "by", "score"  # attributes of a trial: the process that computes it, its result
+_SCORE = "score"  # attribute of a trial: its result
 
 
 class _Journal(BaseJournalBackend):
@@ -178,39 +176,16 @@ class Study:
                             {name: each.encoded(values[name]) for name, each in self._space.items()}
                         )
 
-    @contextmanager
-    def present(self) -> Iterator[str]:
-        """Hold a lock that marks this process as computing; yield the process's name."""
-        place, me = self._folder.path / "running", uuid.uuid4().hex
-        with writing(self._folder.path):
-            place.mkdir(exist_ok=True)
-        with locked(place / me):
-            try:
-                yield me
-            finally:
-                (place / me).unlink(missing_ok=True)
+    def count_trials(self) -> int:
+        """Return the number of computed trials."""
+        return len(self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
 
-    def _is_left(self, trial: FrozenTrial, me: str) -> bool:
-        """Return whether the process assigned to a trial has ended, which leaves its lock free."""
-        by = str(trial.user_attrs.get(_BY))
-        path = self._folder.path / "running" / by
-        with suppress(filelock.Timeout):
-            if by != me:
-                with filelock.FileLock(path, timeout=0):
-                    path.unlink(missing_ok=True)
-                    return True
-        return False
-
-    def count_trials(self, state: TrialState, most: int = sys.maxsize) -> int:
-        """Count the trials in a state, including trials of other processes, among the first ``most`` trials."""
-        return sum(trial.number < most for trial in self._study.get_trials(deepcopy=False, states=(state,)))
-
-    def ask(self, me: str, most: int) -> list[FrozenTrial]:
-        """Return the next batch: abandoned trials of ended processes, and new ones up to a total of ``most``."""
+    def ask(self, most: int) -> list[FrozenTrial]:
+        """Return the next batch: trials that a stopped process has left, and new ones up to a total of ``most``."""
         with writing(self._folder.path), self._folder.locked(wait=True), _quiet():
             there = self._study.get_trials(deepcopy=False)
             asked = [trial for trial in there if trial.state != TrialState.WAITING]
-            left = [trial.number for trial in asked if trial.state == TrialState.RUNNING and self._is_left(trial, me)]
+            left = [trial.number for trial in asked if trial.state == TrialState.RUNNING]
             number, batch = len(asked), self._asked.batch
             # Batches end at multiples of their size, even after a restart, so that each trial uses the same results.
             missing = batch - number % batch if number % batch or not left else 0
@@ -222,7 +197,6 @@ class Study:
             for each in left:
                 self._study.sampler = self._sampler(each)
                 trial = self._trial(each)
-                trial.set_user_attr(_BY, me)
                 for target, dimension in self._space.items():  # a stopped process may not have drawn all values
                     dimension.suggest(trial, target)
             return [trial for trial in self._study.get_trials() if trial.number in left]
@@ -252,7 +226,6 @@ class Study:
             for number, each in jobs.items():
                 self._tell(number, self._objectives.score(self._known[job.key] for job in each))
             tuning = self.tuning()
-            # Within the lock; otherwise a process with fewer trials could overwrite this best trial with an older one.
             if best := tuning.best:
                 tuning.write(best, self._folder.path / "best.yaml")
         watch({"event": "told", "tuning": tuning})

@@ -2,23 +2,21 @@
 """Tuning: a parameter search by Optuna; the workers of a sweep compute its trials.
 
 DIR/trials.log       Optuna's journal: the trials and their scores
-DIR/running/         one lock file per computing process; the lock is free when the process has ended
+DIR/tune.lock        held by the process that computes
 DIR/best.yaml        the cell with the best trial's parameters
 DIR/front/           for several goals, the cells of the Pareto front
 DIR, other files     see `lathe_explore.sweep.folder`: cell n of trial m is row m * (cells per trial) + n
 """
 
 import os
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import distributed
-from optuna.trial import TrialState
 
 from lathe_explore.sweep import BATCH, SAMPLERS
-from lathe_explore.sweep.folder import Folder, Request, writing
+from lathe_explore.sweep.folder import Folder, Request, locked, writing
 from lathe_explore.sweep.objectives import Objectives, objectives
 from lathe_explore.sweep.search_space import Dimension, search_space
 from lathe_explore.sweep.space import Space, check_distinct
@@ -29,8 +27,6 @@ from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
-
-_PAUSE = 0.2  # [s] between checks of other processes' trials
 
 
 def tune(
@@ -60,7 +56,7 @@ def tune(
         scenario: the cell; its own parameters are the start, trial 0. It must specify a number of revolutions.
         free: search space by ``NODE.PARAM``: ``LOW:HIGH``, ``LOW:HIGH:log``, or values: ``A,B,C`` or a list.
         goals: columns of a row to be minimised, see `lathe_explore.sweep.objectives`; several yield a Pareto front.
-        folder: folder of the results. Several processes, even on different machines, may compute into it at once.
+        folder: folder of the results.
         subjects: constraints, ``COLUMN>=NUMBER`` or ``COLUMN<=NUMBER``.
         over: uncertain plants and spindles; each goal is its worst value over them, or a percentile; None: only the
             scenario's plant and spindle.
@@ -76,11 +72,10 @@ def tune(
         client: Dask client, used instead of ``scheduler`` and ``workers``.
         cell_time: time limit of a cell [s]; None: 20 times the slowest cell so far, at least 60 s.
         watch: called with the events of `lathe_explore.run_sweep` (``began`` gives the number of existing trials), with
-            ``told`` (tuning: all trials so far) after each batch, and repeatedly with ``waiting`` while other
-            processes compute the remaining trials.
+            ``told`` (tuning: all trials so far) after each batch.
 
     Raises:
-        InputError: the arguments are invalid, or the folder has other contents.
+        InputError: the arguments are invalid, the folder has other contents, or another process computes into it.
         LatheError: workers died, or the disk is full; the computed rows are saved.
 
     Example:
@@ -119,20 +114,13 @@ def tune(
     )
     kept = Folder.begin(Path(folder), scenario, None, wanted.measures, request)
     state = Study(kept)
-    with state.present() as me:
-        asked = state.ask(me, trials)
-        there = state.count_trials(TrialState.COMPLETE)
+    with locked(kept.path / "tune.lock", wait=False), ExitStack() as stack:
+        there = state.count_trials()
         watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
-        with ExitStack() as stack:
-            crew = None
-            while asked or state.count_trials(TrialState.RUNNING, trials):
-                if asked:
-                    crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
-                    state.compute(crew, asked, watch, cell_time)
-                else:  # the best trial is known only when all are, including those of other processes
-                    watch({"event": "waiting"})
-                    time.sleep(_PAUSE)
-                asked = state.ask(me, trials)
+        crew = None
+        while asked := state.ask(trials):
+            crew = crew or stack.enter_context(crew_for(scenario, client, scheduler, workers, watch))
+            state.compute(crew, asked, watch, cell_time)
     with kept.locked(wait=True):
         tuning = state.tuning()
         if len(goals) > 1:

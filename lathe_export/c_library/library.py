@@ -19,7 +19,7 @@ from lathe_export.c_library.memory_image import MemoryImage
 from lathe_export.c_library.object_code import temporary_arrays
 from lathe_rc import messages
 from lathe_rc.blocks.columns import units
-from lathe_rc.cell.events import SET
+from lathe_rc.cell import events
 from lathe_rc.cell.parameters import Row, explain_overflow, remapped
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
@@ -236,8 +236,8 @@ class Library:
         """Check that the caller can cause the events of a stage by its parameters, and list them."""
         known = {parameter.name for parameter in self.parameters}
         for event in stage.waiting:
-            verb, _, rest = event.partition(": ")[2].partition(" ")
-            name = rest.partition(" ")[0] if verb == SET else "learning" if verb in LEARN else ""
+            verb, target, _ = events.parse(event.partition(": ")[2])
+            name = target if verb == events.SET else "learning" if verb in LEARN else ""
             if f"{stage.name}.{name}" not in known:
                 raise InputError(
                     f"{stage.name}: the event {event!r} changes no parameter of the exported step; allowed: a scenario "

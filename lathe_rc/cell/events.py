@@ -4,6 +4,7 @@
 import math
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.errors import InputError
@@ -19,6 +20,35 @@ _EVENT = re.compile(r"\s*(revolution|second|sample)\s+([0-9.eE+-]+)(?:\s+to\s+([
 _MOST_SAMPLES = 2**53  # largest exact integer of a double
 
 
+class Action(NamedTuple):
+    """Action of an event, parsed.
+
+    Attributes:
+        verb: `FAULT`, `REPAIR`, `SET`, or of any other action the text before a colon.
+        target: faulty signal or device, or the parameter to set; empty for other verbs.
+        values: the rest.
+    """
+
+    verb: str
+    target: str
+    values: str
+
+    @property
+    def fault(self) -> str:
+        """Fault of a `FAULT` or `REPAIR`, see `lathe_rc.safety.faults.parse`."""
+        return f"{self.target} {self.values}".rstrip()
+
+
+def parse(action: str) -> Action:
+    """Parse the action of an event, as listed in a scenario, requested from a node, or recorded."""
+    verb, _, rest = action.partition(" ")
+    if verb in (FAULT, REPAIR, SET):
+        target, _, values = rest.strip().partition(" ")
+        return Action(verb, target, values)
+    kind, _, values = action.partition(":")
+    return Action(kind, "", values)
+
+
 @dataclass(frozen=True)
 class Trigger:
     """Trigger: the time at which an event takes effect."""
@@ -32,7 +62,7 @@ class Trigger:
     @property
     def text(self) -> str:
         """Text of the trigger as written in a scenario."""
-        return f"{self.kind} {self.value:g}: {self.action}"
+        return f"{self.kind} {self.value:.15g}: {self.action}"
 
     def sample(self, rate: int) -> int:
         """Return the sample of a trigger that does not depend on the angle; ``rate`` in Hz."""

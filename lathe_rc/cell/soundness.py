@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
-from lathe_rc.cell.events import FAULT
+from lathe_rc.cell.events import FAULT, parse
 from lathe_rc.errors import InputError
 from lathe_rc.messages import full
 
@@ -68,15 +68,17 @@ class Soundness:
         return samples if self.end is None else min(max(self.end - first, 0), samples)
 
     def _take(self, message: Sparse) -> None:
-        verb, _, fault = str(message.values["action"]).partition(" ")
-        target, kind = [*fault.split(" "), ""][:2]
-        if verb != FAULT:
+        event = parse(str(message.values["action"]))
+        if event.verb != FAULT:
             return
+        kind = event.values.partition(" ")[0]
         from lathe_rc.safety.faults import KINDS  # few runs have faults
 
         if kind not in KINDS or KINDS[kind].what == "cut":  # of the material, not of a signal
             return
         # The target is a field, or the whole encoder.
-        if any(place.endswith(f"/{target}") for name in self._fields for place in (name, name.rpartition(".")[0])):
+        places = (place for name in self._fields for place in (name, name.rpartition(".")[0]))
+        if any(place.endswith(f"/{event.target}") for place in places):
             node = message.topic.strip("/").removesuffix("/events")
-            self.end, self.why = message.index, f"not measured from sample {message.index} on: {node}: fault {fault}"
+            self.end = message.index
+            self.why = f"not measured from sample {self.end} on: {node}: fault {event.fault}"

@@ -157,7 +157,6 @@ class Stage(ABC):
         self.own_inputs, self.tells = 0, False
         self._native: CompiledStep | None = None
         self._room: Samples | None = None
-        self._scheduled: list[tuple[int, str]] = []
         self._remarks: list[str] = []  # events caused by the current event
 
     def warnings(self, seconds: float) -> list[str]:
@@ -243,17 +242,20 @@ class Stage(ABC):
         Raises:
             InputError: the event is unknown to the stage, or a prerequisite is missing.
         """
-        verb, _, rest = action.partition(" ")
-        if verb in (events.FAULT, events.REPAIR):
+        asked = events.parse(action)
+        if asked.verb in (events.FAULT, events.REPAIR):
             if self._injection is None:
                 raise InputError(
                     f"{self.name}: {action!r} is refused; set allow_faults = true under /** to let things break"
                 )
-            self._injection.check_event(verb, rest)
+            if asked.verb == events.FAULT or asked.values:
+                self._injection.check(self._injection.parse(asked.fault, asked.verb))
+            else:
+                self._injection.check_target(asked.target)
             return
-        if verb == events.SET:
-            if (parameter := rest.partition(" ")[0]) not in self.tunable:
-                known = instead(parameter, self.tunable)
+        if asked.verb == events.SET:
+            if asked.target not in self.tunable:
+                known = instead(asked.target, self.tunable)
                 raise InputError(f"{self.name}: event {action!r}: no PARAM of 'set PARAM VALUE'; {known}")
             self.tuned(action)
             return
@@ -267,15 +269,15 @@ class Stage(ABC):
         Raises:
             InputError: a value is invalid.
         """
-        scheduled = [action for _, action in sorted(self._scheduled, key=lambda event: event[0])]
-        return self._after([*(trigger.action for trigger in self._triggers), *scheduled, *actions])
+        ordered = sorted(self._triggers, key=lambda trigger: trigger.value if trigger.kind == "sample" else -1.0)
+        return self._after([*(trigger.action for trigger in ordered), *actions])
 
     def variants(self) -> Iterator["Stage"]:
         """Yield the stage as it is after each ``set`` event of its scenario, in their order, for checks."""
         done: list[str] = []
         for trigger in self._triggers:
             done.append(trigger.action)
-            if trigger.action.startswith(f"{events.SET} "):
+            if events.parse(trigger.action).verb == events.SET:
                 yield self._after(done)
 
     def _after(self, actions: Sequence[str]) -> "Stage":
@@ -286,44 +288,38 @@ class Stage(ABC):
     def _table_after(self, actions: Sequence[str]) -> NodeParameters:
         """Return the parameters after all ``set`` events among some actions."""
         table = self.parameters
-        for verb, _, rest in (action.partition(" ") for action in actions):
+        for verb, parameter, value in map(events.parse, actions):
             if verb == events.SET:
-                parameter, _, value = rest.partition(" ")
                 table = table.changed(self.name, {parameter: ros_yaml.parse_value(value, f"{self.name}.{parameter}")})
         return table
 
-    def schedule(self, action: str, index: int) -> None:
-        """Schedule an event at sample ``index``, which the host has not issued yet.
+    def schedule(self, action: str, at: float, kind: str = "sample") -> None:
+        """Schedule an event.
+
+        Args:
+            action: what to do.
+            at: sample, which the host has not issued yet, or number of turns of the measured spindle angle.
+            kind: ``sample`` or ``revolution``.
 
         Raises:
             InputError: the stage cannot carry it out.
         """
         self.check_action(action)
-        self._scheduled.append((index, action))
-
-    def schedule_at_revolution(self, action: str, revolution: float) -> None:
-        """Schedule an event at the first sample whose measured spindle angle has reached ``revolution`` turns.
-
-        Raises:
-            InputError: the stage cannot carry it out.
-        """
-        self.check_action(action)
-        self._triggers.append(Trigger("revolution", revolution, action, "events"))
+        self._triggers.append(Trigger(kind, at, action, "events"))
 
     def replay(self, action: str, index: int) -> None:
         """Schedule a recorded event at its original sample; events that the stage generates itself are skipped."""
-        if action.partition(":")[0] not in (*self.announces, events.NOTHING_TO_REPAIR):
+        if events.parse(action).verb not in (*self.announces, events.NOTHING_TO_REPAIR):
             self.schedule(action, index)
 
     @property
     def waiting(self) -> list[str]:
         """Return the events that have not taken effect yet, excluding the ends of faults."""
-        triggers = [trigger.text for trigger in self._triggers if not trigger.ends]
-        return triggers + [f"sample {index}: {action}" for index, action in self._scheduled]
+        return [trigger.text for trigger in self._triggers if not trigger.ends]
 
     def lose(self, index: int) -> None:
         """Schedule the transition to the safe state at sample ``index``, not issued yet, after a loss of members."""
-        self._scheduled.append((index, events.SAFE))
+        self._triggers.append(Trigger("sample", index, events.SAFE, ""))
 
     def _scheduled_actions(self, action: str) -> bool:
         """Return whether the scenario lists an event with this action."""
@@ -342,18 +338,17 @@ class Stage(ABC):
         """Return the sample and spindle angle [rad] from which a block needs `compute` instead of the step alone."""
         if self._injection and self._injection.any:
             return 0, 0.0
-        if not self._triggers and not self._scheduled:
+        if not self._triggers:
             return NEVER, np.inf
         samples = [
             trigger.sample(self.shared.sample_rate) for trigger in self._triggers if trigger.kind != "revolution"
         ]
         turns = [trigger.value * 2 * np.pi for trigger in self._triggers if trigger.kind == "revolution"]
-        samples += [index for index, _ in self._scheduled]
         return min(samples, default=NEVER), min(turns, default=np.inf)
 
     def _due(self, first: int, samples: int, inputs: Sequence[Signals]) -> list[tuple[int, str]]:
         """Remove and return the events that fall into a block, ordered by sample, then by scheduling."""
-        waiting = []
+        due, waiting = [], []
         for trigger in self._triggers:
             if trigger.kind != "revolution":
                 index = trigger.sample(self.shared.sample_rate)
@@ -362,13 +357,11 @@ class Stage(ABC):
                 assert place is not None, "declare() refuses revolutions without an angle"
                 index = first + int(np.searchsorted(inputs[place]["angle"], trigger.value * 2 * np.pi))
             if index < first + samples:
-                self._scheduled.append((max(index, first), trigger.action))
+                due.append((max(index, first), trigger.action))
             else:
                 waiting.append(trigger)
         self._triggers = waiting
-        due = sorted((event for event in self._scheduled if event[0] < first + samples), key=lambda event: event[0])
-        self._scheduled = [event for event in self._scheduled if event[0] >= first + samples]
-        return due
+        return sorted(due, key=lambda event: event[0])
 
     def advance(
         self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals], *, last: bool = False
@@ -398,7 +391,7 @@ class Stage(ABC):
 
     def compute(self, first: int, inputs: Sequence[Signals], outputs: Sequence[Signals]) -> list[Sparse]:
         """Compute a block with its events and faults (see `advance`)."""
-        if self._triggers or self._scheduled or (self._injection and self._injection.any):
+        if self._triggers or (self._injection and self._injection.any):
             return self._compute_with_events(first, inputs, outputs)
         own = inputs if len(inputs) == self.own_inputs else inputs[: self.own_inputs]
         return self.process(first, own, outputs)
@@ -455,25 +448,26 @@ class Stage(ABC):
 
     def act(self, action: str, index: int) -> None:
         """Carry out an event at sample ``index``, which is the next one."""
-        verb, _, rest = action.partition(" ")
-        if verb == events.SAFE:
+        asked = events.parse(action)
+        if asked.verb == events.SAFE:
             self.go_safe()
-        elif verb == events.FAULT:
+        elif asked.verb == events.FAULT:
             assert self._injection is not None, "the fault has been checked"
-            fault = self._injection.parse(rest)
+            fault = self._injection.parse(asked.fault)
             if self._injection.is_of_device(fault):
                 self.damage(fault)
             else:
                 self._injection.begin(fault, index)
-        elif verb == events.SET:
+        elif asked.verb == events.SET:
             self.parameters = self._table_after([action])
             self.tune(self.parameters)
-        elif verb == events.REPAIR:
+        elif asked.verb == events.REPAIR:
             assert self._injection is not None, "the event has been checked"
-            target, one = rest.partition(" ")[0], self._injection.parse(rest) if " " in rest else None
-            mended = self.mend(one) if target in self.devices else self._injection.end(target, index, one)
+            one = self._injection.parse(asked.fault) if asked.values else None
+            is_device = asked.target in self.devices
+            mended = self.mend(one) if is_device else self._injection.end(asked.target, index, one)
             if not mended:
-                self._remarks.append(f"{events.NOTHING_TO_REPAIR}: {target}")
+                self._remarks.append(f"{events.NOTHING_TO_REPAIR}: {asked.target}")
         else:
             self.perform(action)
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command group ``lathe bag``: content, verification and recovery of a bag, and its tachogram."""
 
-import json
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
+from rich.console import RenderableType
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
@@ -65,10 +65,7 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
     """
     with Source(path, partial=True) as source:
         summary = _info(path, source, metrics=metrics)
-        if as_json:
-            click.echo(json.dumps(summary))
-        else:
-            _print_info(source, summary, whole=whole)
+        tables.show(summary, _told(source, summary, whole=whole), as_json=as_json)
         ctx.exit(_LOSSY if source.damage or summary["lost"] else 0)
 
 
@@ -115,55 +112,57 @@ def _info(path: Path, source: Source, *, metrics: bool) -> dict[str, Any]:
     return summary
 
 
-def _print_info(source: Source, summary: Mapping[str, Any], *, whole: bool | None) -> None:
-    console = tables.console()
-    table = tables.table("topic", "type", "messages", "rate [Hz]", left=2, no_wrap=True)
-    for topic, entry in summary["topics"].items():
-        rate = f"{entry['rate_hz']:.4g}" if entry["rate_hz"] else ""
-        table.add_row(topic, entry["type"].rpartition("/")[2], str(entry["messages"]), rate)
-    console.print(table)
-    for each in source.unread:
-        console.print(f"not read: {each}")
+def _told(source: Source, summary: Mapping[str, Any], *, whole: bool | None) -> Iterator[RenderableType]:
+    yield tables.of_rows(
+        summary["topics"].items(),
+        {
+            "topic": lambda row: row[0],
+            "type": lambda row: row[1]["type"].rpartition("/")[2],
+            "messages": lambda row: str(row[1]["messages"]),
+            "rate [Hz]": lambda row: f"{row[1]['rate_hz']:.4g}" if row[1]["rate_hz"] else "",
+        },
+        left=2,
+        no_wrap=True,
+    )
+    yield from (f"not read: {each}" for each in source.unread)
     for what in (*summary["contradictions"], *summary["damage"], *filter(None, [summary["lost"]])):
         click.echo(what, err=True)
-    for what in summary["foreign"]:
-        console.print(what)
+    yield from summary["foreign"]
     start = summary["start"] or format(summary["start_s"], ".6g") + " s"
-    console.print(f"span: {summary['span_s']:.6g} s from {start} on")
-    console.print(f"written: {summary['written']}")
+    yield f"span: {summary['span_s']:.6g} s from {start} on"
+    yield f"written: {summary['written']}"
     if source.seal:
-        console.print(f"seal: {source.seal}")
+        yield f"seal: {source.seal}"
     if summary["first_sample"]:
-        console.print(f"recorded from sample {summary['first_sample']} of the run on")
+        yield f"recorded from sample {summary['first_sample']} of the run on"
     if summary["error_um"]:
         first, last = summary["error_um"]["first"], summary["error_um"]["last"]
-        console.print(
+        yield (
             f"form error: {first['rms']:.4g} µm RMS in revolution {first['revolution']}, "
             f"{last['rms']:.4g} in {last['revolution']}"
         )
         if summary["not_measured"] and not summary["lost"]:
-            console.print(f"form error {summary['not_measured']}")
+            yield f"form error {summary['not_measured']}"
     for event in summary["events"]:
-        console.print(f"event: sample {event['sample']}, {event['node']}: {event['action']}")
-    _print_about(console, summary["about"], whole=not console.is_terminal if whole is None else whole)
+        yield f"event: sample {event['sample']}, {event['node']}: {event['action']}"
+    yield from _about_told(summary["about"], whole=not sys.stdout.isatty() if whole is None else whole)
 
 
-def _print_about(console: Console, about: Mapping[str, str], *, whole: bool) -> None:
-    """Print the metadata strings of a bag; of the scenario the ``whole`` or its length."""
+def _about_told(about: Mapping[str, str], *, whole: bool) -> Iterator[str]:
+    """Yield the metadata strings of a bag; of the scenario the ``whole`` or its length."""
     for key, text in about.items():
         if key == provenance.SCENARIO and not whole:
-            console.print(f"scenario: {text.strip().count(chr(10)) + 1} lines; --scenario prints them")
+            yield f"scenario: {text.strip().count(chr(10)) + 1} lines; --scenario prints them"
         elif key == provenance.SCENARIO:
-            console.print("scenario:")
-            console.print("  " + text.strip().replace("\n", "\n  "))
+            yield "scenario:\n  " + text.strip().replace("\n", "\n  ")
         elif key == provenance.ORIGINS:
             for origin in provenance.origins({key: text}):
                 of = f" of {origin.package}" if origin.package else ""
-                console.print(f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}")
+                yield f"{', '.join(origin.used)}: {origin.name}{of}, source {origin.source}"
         elif key.startswith(provenance.FILE):
-            console.print(f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64")
+            yield f"{key.removeprefix(provenance.FILE)}: a file, {len(text)} characters in base64"
         else:
-            console.print(f"{key.removeprefix('lathe_rc.')}: {text}")
+            yield f"{key.removeprefix('lathe_rc.')}: {text}"
 
 
 def _date(log_ns: int) -> str | None:
@@ -197,15 +196,11 @@ def check(ctx: click.Context, path: Path, *, as_json: bool) -> None:
         "digests_compared": found.compared,
         "digest": found.digests,
     }
-    if as_json:
-        click.echo(json.dumps(summary))
-    else:
-        unread = (f"not read: {each}" for each in found.unread)
-        for what in (*found.origin, *found.wrong, *found.lost, *found.foreign, *unread):
-            click.echo(what)
-        state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
-        digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"
-        click.echo(f"{state}: {found.messages} messages, {found.samples} samples, {digests}")
+    unread = (f"not read: {each}" for each in found.unread)
+    state = {0: "clean", 1: "wrong", _LOSSY: "lossy"}[found.exit_code]
+    digests = f"{found.compared} digests as recorded" if found.compared else "no digests recorded"
+    told = f"{state}: {found.messages} messages, {found.samples} samples, {digests}"
+    tables.show(summary, [*found.origin, *found.wrong, *found.lost, *found.foreign, *unread, told], as_json=as_json)
     ctx.exit(found.exit_code)
 
 
@@ -227,13 +222,8 @@ def recover(ctx: click.Context, path: Path, output: Path | None, *, as_json: boo
         "lost_bytes": found.lost_bytes,
         "damage": list(found.damage),
     }
-    if as_json:
-        click.echo(json.dumps(summary))
-    else:
-        for what in found.damage:
-            click.echo(what)
-        click.echo(f"{found.saved} messages saved, {found.skipped} skipped, {found.lost_bytes} B lost")
-        click.echo(f"bag: {target}")
+    told = f"{found.saved} messages saved, {found.skipped} skipped, {found.lost_bytes} B lost"
+    tables.show(summary, [*found.damage, told, f"bag: {target}"], as_json=as_json)
     ctx.exit(_LOSSY if found.lossy else 0)
 
 
@@ -279,14 +269,9 @@ def copy_bags(
     to_ns = 2**64 if end is None else begin_ns + round(end * 1e9)
     found = copy_chosen(paths, output, Choice(frozenset(topics), frozenset(without), from_ns, to_ns))
     damage = [f"{each.path}: {what}" for each in found for what in each.damage]
-    if as_json:
-        bags = [{"bag": str(each.path), "saved": each.saved, "damage": list(each.damage)} for each in found]
-        click.echo(json.dumps({"output": str(output), "bags": bags}))
-    else:
-        for what in damage:
-            click.echo(what)
-        click.echo("\n".join(f"{each.saved} messages of {each.path}" for each in found))
-        click.echo(f"bag: {output}")
+    saved = [f"{each.saved} messages of {each.path}" for each in found]
+    bags = [{"bag": str(each.path), "saved": each.saved, "damage": list(each.damage)} for each in found]
+    tables.show({"output": str(output), "bags": bags}, [*damage, *saved, f"bag: {output}"], as_json=as_json)
     ctx.exit(_LOSSY if any(each.lossy for each in found) else 0)
 
 
@@ -306,15 +291,10 @@ def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, 
     """Write the recorded spindle speed as a CSV file for tachogram_file, with as few rows as the tolerance allows."""
     target = output or Path(f"{name_of(path).removesuffix('.mcap')}-tachogram.csv")
     made = make_tachogram(path, target, tolerance, topic)
-    if as_json:
-        click.echo(json.dumps({"bag": str(path), "output": str(target), **asdict(made)}))
-        lossy.end(path)
-        return
     held = f"{made.points} rows for {made.samples} samples of {made.field}"
-    click.echo(f"{held}, within {made.largest:.4g} rpm: {target}")
+    text = [f"{held}, within {made.largest:.4g} rpm: {target}"]
     if made.stands_from is not None:
-        click.echo(
-            f"the spindle stands still for {made.standstill:.4g} s, first at {made.stands_from:.4g} s: a "
-            "spindle_encoder refuses the rows with 0 rpm"
-        )
+        stands = f"the spindle stands still for {made.standstill:.4g} s, first at {made.stands_from:.4g} s"
+        text += [f"{stands}: a spindle_encoder refuses the rows with 0 rpm"]
+    tables.show({"bag": str(path), "output": str(target), **asdict(made)}, text, as_json=as_json)
     lossy.end(path)

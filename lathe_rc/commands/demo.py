@@ -73,6 +73,9 @@ def demo(name: str, revolutions: float, folder: Path) -> None:
 
 
 def _show(shown: Demo, revolutions: float, folder: Path) -> None:
+    from rich.console import RenderableType
+    from rich.text import Text
+
     from lathe_rc import harness
     from lathe_rc.commands import outcome, picture, plot, running, tables
     from lathe_rc.commands import scenario as scenarios
@@ -93,11 +96,10 @@ def _show(shown: Demo, revolutions: float, folder: Path) -> None:
         beside = (shown.peer_name, peer.recording)
     drawn = place.with_suffix(".png")
     picture.save(result.recording.plot(shown.title, beside), drawn)
-    console.print(outcome.table(result))
-    plot.show(result, console)
+    text: list[RenderableType] = [outcome.table(result), *plot.shown(result, console)]
     if beside:
-        console.print(f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}")
-    for fact in outcome.facts(result):
-        console.print(fact)
+        text += [f"{shown.peer_name}: {', '.join(peer.errors.told()[1:])}"]
+    text += map(Text, outcome.facts(result))
     ends = {"bag": place, "figure": drawn, "page": f"lathe report {place}", "view": f"lathe view {place}"}
-    console.print("\n".join(f"{name + ':':8}{end}" for name, end in ends.items()), soft_wrap=True)
+    text += (f"{name + ':':8}{end}" for name, end in ends.items())
+    tables.show({}, text, as_json=False)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Result of a run as tables and lines for the terminal."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -87,34 +88,33 @@ def _margins(result: harness.Result) -> list[str]:
     return [f"{name}: {', '.join(each)}" for name, each in lines.items() if each]
 
 
-def show_budget(found: Budget) -> None:
-    """Print an error budget, one row per cause."""
-    lines = tables.table("cause", "share of the power [%]", "RMS [µm]", "maximum [µm]", left=1)
+def budget_told(found: Budget) -> Iterator[RenderableType]:
+    """Yield an error budget, one row per cause."""
     whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
-    for each in (*found.rows, whole):
-        lines.add_row(each.name, each.percent(), f"{each.rms * 1e6:.3g}", f"{each.largest * 1e6:.3g}")
-    console = tables.console(soft_wrap=False)
-    console.print(lines)
-    for name, why in found.left_out.items():
-        console.print(f"not switched off: {name}: {why}")
+    columns: dict[str, Callable[[Part], str]] = {
+        "cause": lambda each: each.name,
+        "share of the power [%]": Part.percent,
+        "RMS [µm]": lambda each: f"{each.rms * 1e6:.3g}",
+        "maximum [µm]": lambda each: f"{each.largest * 1e6:.3g}",
+    }
+    yield tables.of_rows((*found.rows, whole), columns, left=1)
+    yield from (Text(f"not switched off: {name}: {why}") for name, why in found.left_out.items())
 
 
-def show(result: harness.Result, further: Mapping[str, Path], *, note: str = "", budget: Budget | None = None) -> None:
-    """Print the result of a run: part, events, facts, budget and files; ``note``: an additional line."""
-    console = tables.console(soft_wrap=False)
+def told(
+    result: harness.Result, further: Mapping[str, Path], *, note: str = "", budget: Budget | None = None
+) -> Iterator[RenderableType]:
+    """Yield the result of a run: part, events, facts, budget and files; ``note``: an additional line."""
     if result.errors.rms.size:
-        console.print(table(result))
-        plot.show(result, console)
+        yield table(result)
+        yield from plot.shown(result, tables.console())
     for node, loop in result.loops.items():
         if loop.found.errors.rms.size:
-            console.print(_loop(node, loop))
+            yield _loop(node, loop)
     if result.event_log:
-        console.print(_events(result))
-    for fact in [*facts(result), *filter(None, [note])]:
-        console.print(fact)
+        yield _events(result)
+    yield from map(Text, [*facts(result), *filter(None, [note])])
     if budget is not None:
-        show_budget(budget)
+        yield from budget_told(budget)
     files = [("bag", result.bag), *(("snapshot", path) for path in result.snapshots), *further.items()]
-    for name, path in files:
-        if path:
-            console.print(f"{name}: {path}", soft_wrap=True)
+    yield from (f"{name}: {path}" for name, path in files if path)

@@ -2,6 +2,7 @@
 """Terminal plot of the form error by revolution."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from rich.console import Console
@@ -17,11 +18,11 @@ _POINTS = 4  # points of a curve per character of width
 _STYLES = {"gray+": "white", "cyan+": "bright_cyan", "orange+": "bright_yellow"}  # styles of rich, by plotext's colours
 
 
-def show(result: harness.Result, console: Console) -> None:
-    """Print the plot if the output is a terminal that can display it, not a pipe or a file."""
+def shown(result: harness.Result, console: Console) -> Iterator[Text]:
+    """Yield the plot if the output is a terminal that can display it, not a pipe or a file."""
     seen = console.file.isatty() and not console.is_dumb_terminal and console.width >= _NARROWEST
     if seen and (text := drawn(result, console.width)):
-        console.print(text)
+        yield text
 
 
 def drawn(result: harness.Result, width: int) -> Text | None:

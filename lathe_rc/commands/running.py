@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execution of ``lathe run`` after its arguments are parsed and its modules imported."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-import click
 from rich.console import Console
 
 from lathe_rc import harness
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.commands import outcome, picture
+from lathe_rc.commands import outcome, picture, tables
 from lathe_rc.commands import scenario as scenarios
 from lathe_rc.commands.progress import Watch, watched_budget
 from lathe_rc.errors import InputError, LatheError
@@ -86,14 +84,15 @@ def run(
     if figure:
         picture.save(result.plot(), figure)
     found = watched_budget(loaded) if budget else None
-    if as_json:
-        click.echo(json.dumps(result.summary() | ({"budget": found.summary()} if found else {})))
-    else:
-        asks_for_snapshots = loaded.recorder[1].mode != "continuous"
-        note = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
-        files = [(name, path) for name, path in (("profile", profile), ("figure", figure)) if path]
-        files += [(f"checkpoint at {when}", path) for when, path in checkpoints]
-        outcome.show(result, dict(files), note=note, budget=found)
+    asks_for_snapshots = loaded.recorder[1].mode != "continuous"
+    note = _NO_SNAPSHOTS if asks_for_snapshots and not bag else ""
+    files = [(name, path) for name, path in (("profile", profile), ("figure", figure)) if path]
+    files += [(f"checkpoint at {when}", path) for when, path in checkpoints]
+    tables.show(
+        lambda: result.summary() | ({"budget": found.summary()} if found else {}),
+        outcome.told(result, dict(files), note=note, budget=found),
+        as_json=as_json,
+    )
     if require_tolerance:
         alike = " with the same --set" if overrides else ""
         _require_tolerance(result, "" if found else f"; lathe budget {scenario}{alike} tells why")

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and text lines for the terminal."""
+"""Results of commands: as one JSON object, or as tables and text lines for the terminal."""
 
+import json
 import os
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
+import click
 import numpy as np
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
+
+Row = TypeVar("Row")
 
 _HEADING = 13  # characters of a line of a broken heading
 _UNBOUNDED = 10_000  # [characters] width of an output that is no terminal
@@ -27,6 +31,24 @@ def console(*, soft_wrap: bool = True) -> Console:
     if not out.file.isatty() and "COLUMNS" not in os.environ:
         out.width = _UNBOUNDED
     return out
+
+
+def show(
+    data: Mapping[str, object] | Callable[[], Mapping[str, object]], text: Iterable[RenderableType], *, as_json: bool
+) -> None:
+    """Print a result.
+
+    Args:
+        data: content for JSON, or a function that computes it.
+        text: content for people: tables and `Text`, fitted to the terminal, and strings, whose lines are not broken.
+        as_json: whether to print ``data`` or ``text``.
+    """
+    if as_json:
+        click.echo(json.dumps(data() if callable(data) else data))
+        return
+    out = console()
+    for each in text:
+        out.print(each, soft_wrap=isinstance(each, str))
 
 
 def spread(whole: int) -> list[int]:
@@ -61,4 +83,12 @@ def table(*columns: str, title: str | None = None, left: int = 0, **options: Any
     made = Table(title=title, title_justify="left", show_edge=False, header_style="bold")
     for place, column in enumerate(columns):
         made.add_column(Text(column), justify="left" if place < left else "right", **options)
+    return made
+
+
+def of_rows(rows: Iterable[Row], columns: Mapping[str, Callable[[Row], str]], **options: Any) -> Table:
+    """Return a table of rows; ``columns``: the text of a row's cell by heading; ``options``: see `table`."""
+    made = table(*columns, **options)
+    for row in rows:
+        made.add_row(*(text(row) for text in columns.values()))
     return made

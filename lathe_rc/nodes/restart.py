@@ -140,8 +140,7 @@ class Restart:
         for topic, (end, past) in state["past"].items():
             role.inputs.buffers[topic].restart(end, past)
         for action, place in state["events"]:
-            schedule = role.stage.schedule if isinstance(place, int) else role.stage.schedule_at_revolution
-            schedule(action, place)
+            role.stage.schedule(action, place, "sample" if isinstance(place, int) else "revolution")
         assert protocol.master is not None, "it has announced all members"
         sources = {topic: name for name in protocol.master.members for topic in protocol.members[name].publishes}
         for topic, queue in role.inputs.queues.items():

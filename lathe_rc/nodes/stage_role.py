@@ -240,7 +240,7 @@ class StageRole(Role):
             raise InputError(f"{node.full_name} is not ready yet; ask again")
         for action in actions:
             self.stage.check_action(action)
-        if protocol.master is None or not any(action.startswith(f"{events.SET} ") for action in actions):
+        if protocol.master is None or not any(events.parse(action).verb == events.SET for action in actions):
             return
         tuned = self.stage.tuned(*actions)
         cell = Cell(*node.announced(protocol.master.members))
@@ -276,7 +276,7 @@ class StageRole(Role):
         cycle = int(getattr(self.stage.parameters, "cycle_revolutions", 1))
         revolution = float((self.angle // (2.0 * np.pi * cycle) + 1) * cycle)
         for action in actions:
-            self.stage.schedule_at_revolution(action, revolution)
+            self.stage.schedule(action, revolution, "revolution")
             self._keep_event(action, revolution)
         return f"from revolution {revolution:g} on, as an event on {node.full_name}/events"
 

@@ -117,17 +117,6 @@ class Injection:
         """Return whether a fault is of a device of the stage, not of a port."""
         return KINDS[fault.kind].what in self._devices
 
-    def check_event(self, verb: str, rest: str) -> None:
-        """Check the event of a fault or a repair.
-
-        Raises:
-            InputError: there is no such fault or target.
-        """
-        if verb == "fault" or " " in rest:
-            self.check(self.parse(rest, verb))
-        else:
-            self.check_target(rest)
-
     def check(self, fault: Fault) -> None:
         """Check that a fault is possible for its target.
 

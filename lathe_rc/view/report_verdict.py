@@ -12,7 +12,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.budget import Budget
-from lathe_rc.cell.events import LIMITED
+from lathe_rc.cell.events import LIMITED, parse
 from lathe_rc.judge.causes import changing
 from lathe_rc.view.form_limits import WARN, Finding, form_limits, varying_speed
 from lathe_rc.view.report_figures import um
@@ -57,7 +57,7 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
         text = f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power."
         limits.append(Finding(text))
     for kind in data.curves.kinds.values():
-        if kind.text.startswith(LIMITED):
+        if parse(kind.text).verb == LIMITED:
             node = kind.topic.strip("/").removesuffix("/events")
             limits.append(Finding(f"{node} came to the limits of its command, {_when(data, kind)}.", WARN))
     if form and not incidents and not growth:  # otherwise incidents or growth determine the form error

@@ -230,12 +230,12 @@ class LearningController(Learner):
         if action in _FILE_ACTIONS and not self.parameters.memory_file:
             raise InputError(f"{self.name}.memory_file is empty; name the file for the event {action!r}")
 
-    def schedule(self, action: str, index: int) -> None:
+    def schedule(self, action: str, at: float, kind: str = "sample") -> None:
         """Schedule an event; a memory that cannot be loaded is rejected now, instead of in mid-run."""
         self.check_action(action)
         if action == "load":
             self._read_memory()
-        super().schedule(action, index)
+        super().schedule(action, at, kind)
 
     def _read_memory(self) -> np.ndarray:
         parameters = self.parameters
