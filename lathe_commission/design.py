@@ -26,10 +26,11 @@ from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch
-from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Values
+from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Values, judged
 from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
+from lathe_rc.judge.part import strictest
 from lathe_rc.messages import Signals
 from lathe_rc.signals.form_errors import FormErrors
 from lathe_rc.stages.learning.learner import Learner, Loop, lag
@@ -351,9 +352,8 @@ class Design:
         if len(commanded) != 1:
             raise InputError(f"design of {scenario.name}: {self.node} commands {len(commanded)} drives; allowed: one")
         drive = learned[0][1]
-        self._tolerance = max(
-            getattr(scenario.nodes[name], "tolerance", 0.0) for name in [*scenario.of_kind("tool"), self.node]
-        )
+        declared = judged({name: scenario.nodes[name] for name in [*scenario.of_kind("tool"), self.node]})
+        self._tolerance = strictest(declared)
         if not self._tolerance:
             raise InputError(f"design of {scenario.name}: no tolerance; allowed: tool.tolerance above 0")
         self._limits = {

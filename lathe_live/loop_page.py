@@ -189,5 +189,8 @@ def _errors(loop: VariedLoop, errors: FormErrors) -> list[Row]:
         (f"form error, largest {over}", f"{largest * 1e6:.4g} µm", repr(largest)),
         ("form error, RMS of the last revolution", f"{rms * 1e6:.4g} µm", repr(rms)),
     ]
-    allowed = next(iter(part.tolerances(judged(loop.scenario.nodes)).values()), 0.0)
+    declared = judged(loop.scenario.nodes)
+    if part.zones(declared):
+        return [*found, ("verdict", "not here, since the tolerance differs by zone: lathe run tells it", "")]
+    allowed = next(iter(part.tolerances(declared).values()), 0.0)
     return found + ([("verdict", judge(errors.largest, allowed).told(), "")] if allowed else [])

@@ -198,7 +198,7 @@ def drive_curves(cell: Cell) -> list[DriveCurve]:
         for response, drive in stage.learned(cell.stages.values()):
             measured = isinstance(response, MeasuredDrive)
             at = response.frequency if isinstance(response, MeasuredDrive) else frequency
-            label = f"{drive.name}, {'measured' if measured else 'simulated'}"
+            label = f"{drive.name}, {'measured' if measured else getattr(response, 'state', 'simulated')}"
             found.append(DriveCurve(stage.name, label, at, np.asarray(response(at)), measured=measured))
         own = [getattr(stage.shared, f"model_{name}", 0.0) for name in ("natural_frequency", "damping", "delay")]
         if own[0]:

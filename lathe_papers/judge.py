@@ -12,21 +12,34 @@ from lathe_rc.arrays import Array
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
+from lathe_rc.signals.zones import zone_at
 
 _TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Evaluated run: largest error by revolution [µm], RMS error of the last revolutions [µm], RMS current [A]."""
+    """Evaluated run.
+
+    Attributes:
+        largest: largest error by revolution [µm].
+        rms: RMS error of the last revolutions [µm].
+        effort: RMS current [A].
+        share: largest error over the tolerance at its place, by revolution, where zones have their own; None without.
+    """
 
     largest: Array
     rms: float
     effort: float
+    share: Array | None = None
+
+    def excess(self, tolerance: float) -> Array:
+        """Return the largest error over the tolerance [µm], by revolution."""
+        return self.largest / tolerance if self.share is None else self.share
 
     def settled(self, tolerance: float) -> float:
         """Return the revolution, counted from 1, from which the error stays in tolerance [µm]; inf if it never does."""
-        return float(judge(self.largest, tolerance).since or np.inf)
+        return float(judge(self.excess(tolerance), 1.0).since or np.inf)
 
 
 class Judge:
@@ -43,6 +56,8 @@ class Judge:
         drive: Any = cell.stages["loaded_drive"].shared
         self._gaps = list(zip(drive.cut_gap_start, drive.cut_gap_width, strict=True))
         self._angle, self._error, self._current = np.empty((3, samples))
+        tool: Any = cell.stages["tool"].shared
+        self._zones, self._allowed = tool.zones, np.array([tool.tolerance, *tool.zone_tolerance]) * 1e6
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Store angle, error and current of a chunk."""
@@ -60,10 +75,13 @@ class Judge:
         starts = np.searchsorted(revolution, np.arange(revolution[-1] + 1))
         # The run ends within a revolution, whose start only marks the end of the previous one.
         largest = np.maximum.reduceat(error[: starts[-1]], starts[:-1])
-        last = error[starts[-1 - LAST] : starts[-1]]
+        last, share = error[starts[-1 - LAST] : starts[-1]], None
+        if self._zones:
+            allowed = self._allowed[zone_at(self._zones, self._angle, np.zeros_like(self._angle))]
+            share = np.maximum.reduceat((error / np.where(allowed > 0.0, allowed, np.inf))[: starts[-1]], starts[:-1])
         with np.errstate(over="ignore"):  # a law that diverges
             rms, effort = np.sqrt(np.mean(last[last > 0.0] ** 2)), np.sqrt(np.mean(self._current**2))
-        return Judged(largest, float(rms), float(effort))
+        return Judged(largest, float(rms), float(effort), share)
 
 
 def worst_of(values: Array) -> Array:

@@ -42,8 +42,11 @@ def law(tmp_path_factory):
 
 @pytest.mark.system
 def test_a_whole_cell_has_the_bits_of_the_engine(tmp_path):
-    """Feedback, noise, a set point and a cut within the library."""
-    cell = load("full_cell", ["electrodynamic_actuator.noise_rms=1e-8"])
+    """Feedback, noise, jitter, a set point, a cut, a drift and an error motion within the library."""
+    drive = {"noise_rms": 1e-8, "sampling_jitter": 1e-6, "gain_drift": 0.1, "mode_drift": 0.3, "drift_time": 0.05}
+    drive |= {"mode_frequency": [5655.0], "mode_damping": [0.02], "mode_participation": [1e-4]}
+    motion = ["tool.error_motion_order=[3]", "tool.error_motion_amplitude=[1e-6]"]
+    cell = load("full_cell", [*(f"electrodynamic_actuator.{name}={value}" for name, value in drive.items()), *motion])
     exported = export_nodes(cell, place=tmp_path / "cell", samples=5000)
     assert len(exported.library.parts) == 12
     same, told = same_bits(exported)

@@ -24,7 +24,7 @@ from lathe_rc.harness.result import Mode
 LONG = ["spindle_encoder.revolutions=5"]
 SCENARIOS = (
     *("piston", "full_cell", "supervised_two_channel", "periodic", "robust", "gauged", "loaded_cutting", "vibration"),
-    *("supervised_turning", "series"),
+    *("supervised_turning", "series", "oval3000_hard"),
 )
 
 

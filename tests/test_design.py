@@ -309,7 +309,7 @@ def test_points_of_several_states_all_count(tmp_path, monkeypatch):
     made = lathe_rc.load(tmp_path / "piston-designed.yaml")
     assert made.nodes["electrodynamic_actuator"].response_file == str(tmp_path / "piston-designed.states.csv")
     drive = Cell(made.nodes).stages["electrodynamic_actuator"]
-    states = drive.measured()["coarse/command"]
+    states = drive.states()["coarse/command"]
     assert [state.frequency.size for state in states] == [MANY.size] * 2
     assert np.abs(states[0].value - states[1].value).max() > 0.1
 

@@ -43,7 +43,7 @@ def test_scores_of_the_second_set_are_those_of_its_seed():
     assert np.all(np.diff(other.seeded) != 0.0)
     # A law that leads the memory alone errs by what the speed varies within a revolution.
     assert np.all(same.largest[:, :, 1] < same.largest[:, :, 0])
-    assert np.all(same.margin[:, 1] > 0.3)
+    assert np.all(same.margin[:, :, 1] > 0.3)
 
 
 def test_a_fresh_seed_is_drawn_and_told(monkeypatch):
@@ -73,6 +73,17 @@ def test_drives_fill_their_ranges():
     stiffness = mass * frequency**2
     assert 1.4 < stiffness.max() / stiffness.min() < 1.5
     assert len({each["seed"] for each in drawn}) == len(drawn)
+
+
+def test_a_gauge_corrects_what_no_sensor_of_the_harder_cell_measures():
+    """The study judges each zone by its tolerance, as the verdict of a run does."""
+    length = {"spindle_encoder": {"revolutions": 40.0}}
+    made = [cells.load("oval3000_hard", **length, **other) for other in ({}, {"controller": {"remap": []}})]
+    gauge, sensors = (each.excess(2.0)[:40][-10:].max() for each in cells.kept(made, Judge, untracked))
+    zones = cells.run("oval3000_hard", **length).verdict.zones
+    assert gauge == pytest.approx(max(zone.largest / zone.tolerance for zone in zones))
+    assert gauge < 0.5
+    assert sensors > 0.9
 
 
 def test_a_law_enters_from_the_current_folder_with_its_parameters(tmp_path, monkeypatch):

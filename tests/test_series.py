@@ -57,7 +57,7 @@ def drive(machine, command, set_point, noise=None, lengths=None):
     noise = np.zeros_like(command) if noise is None else noise
 
     def block(first, command, set_point, noise, *motion):
-        move(machine.table, first, command, set_point, noise, motion)
+        move(machine.table, first, command, set_point, noise, np.empty(0), motion)
 
     return run(block, 7, command, set_point, noise, lengths=lengths)
 
@@ -216,7 +216,7 @@ def test_feedback_that_would_oscillate_is_refused():
     late, size = np.zeros(1), np.empty(30_000)
     for first in range(size.size):
         motion = np.empty((7, 1))
-        move(machine.table, first, np.full(1, 1e-6 * (first < 100)), -late, still, tuple(motion))
+        move(machine.table, first, np.full(1, 1e-6 * (first < 100)), -late, still, np.empty(0), tuple(motion))
         late, size[first] = motion[0], abs(motion[0, 0])
     assert size[-6400:].max() > 1.5 * size[6400:12_800].max()
 

@@ -11,11 +11,13 @@ from cells import config, scenario
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lathe_explore.sweep import row
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.bag import provenance
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
+from lathe_rc.signals.zones import Zone
 
 errors = st.lists(st.sampled_from([0.5, 1.0, 1.5, 3.0]), max_size=30)
 SHORT = ("run", "piston", "--revolutions", "5")
@@ -217,3 +219,71 @@ def test_a_node_declares_its_tolerance_by_the_topic_after_remapping(tmp_path):
     scenario = config("piston", "tool.tolerance=1e-6", "tool.remap=['tool:=part']")
     declared = provenance.judged(provenance.tell(scenario, []))
     assert part.tolerances(declared) == {"part": 1e-6}
+
+
+# --- zones
+
+
+ZONES = [
+    "tool.zone_start=[0.0, 6.0, 1.0]", "tool.zone_width=[0.5, 0.4, 0.5]", "tool.zone_tolerance=[1e-6, 5e-6, 0.0]"
+]  # fmt: skip
+
+
+def by_hand(recording, tolerances):
+    """First revolution in tolerance in each zone by its samples; the zones of `ZONES`, the rest first."""
+    angle, error = recording.dense["/encoder"]["angle_true"], abs(recording.dense["/tool"]["error"])
+    place = np.degrees(angle) % 360.0
+    first = place < np.degrees(0.5)
+    second = (place >= np.degrees(6.0)) | (place < np.degrees(0.4 + 6.0) - 360.0)
+    third = (place >= np.degrees(1.0)) & (place < np.degrees(1.5))
+    found = []
+    for inside, allowed in zip((~(first | second | third), first, second & ~first), tolerances, strict=True):
+        late = np.flatnonzero(inside & (error > allowed))
+        found.append(int(angle[late[-1]] / (2.0 * np.pi)) + 2 if late.size else 1)
+    return found
+
+
+def test_zones_are_judged_each_by_its_tolerance(tmp_path):
+    """Result, JSON, report and row of a sweep agree with the samples; a zone without a tolerance is named."""
+    changes = ["spindle_encoder.revolutions=8", "tool.tolerance=2e-6", *ZONES]
+    result = harness.run(config("piston", *changes), bag=tmp_path / "bag")
+    found = result.verdict
+    wanted = by_hand(result.recording, np.array([2e-6, 1e-6, 5e-6]) - found.doubt)
+    assert [each.since for each in found.zones] == wanted
+    assert len(set(wanted)) > 1
+    assert (found.since, found.in_tolerance) == (max(wanted), True)
+    assert found.spare == min(each.spare for each in found.zones)
+    told = result.summary()["tolerance_um"]
+    assert [each["place"] for each in told["zones"]] == ["elsewhere", "0° to 28.65°", "343.8° to 6.693°"]
+    assert told["not_judged"] == ["57.3° to 85.94°"]
+    assert found.told() in page_of(tmp_path / "bag").replace("In tolerance", "in tolerance")
+    assert row.compute(config("piston", *changes), {}, [], [])["tool.in_tolerance_from"] == found.since
+
+
+def test_a_zone_out_of_tolerance_is_named_and_fails_the_run():
+    strict = [word for each in (*ZONES[:2], "tool.zone_tolerance=[0.1e-6, 5e-6, 0.0]") for word in ("--set", each)]
+    done = lathe(*SHORT, "--set", "tool.tolerance=2e-6", *strict, "--require-tolerance")
+    assert done.exit_code == 1
+    assert "piston is not in tolerance (±0.1 µm, 0° to 28.65°): " in done.output
+    assert "; in tolerance in the other zones, to spare: " in done.output
+
+
+def test_zones_have_heights():
+    below, above = np.array([0.0, 0.4e-3]), np.array([0.5e-3, 1e-3])
+    zone = Zone(0.0, 2.0 * np.pi, 1e-6, 0.0, 0.45e-3)
+    assert zone.covers(np.zeros(2), below).all()
+    assert not zone.covers(np.zeros(2), above).any()
+    assert zone.name == "0° to 0°, 0 to 0.45 mm"
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"zone_start": [0.0]}, "zone_start, zone_width, zone_tolerance: lengths [1, 0, 0]; allowed: as many of each"),
+        ({"zone_start": [0.0], "zone_width": [1.0], "zone_tolerance": [1e-6]}, "tolerance = 0 with zones; allowed"),
+        ({"zone_bottom": [0.0], "zone_top": [1e-3]}, "zone_bottom: 1 values; allowed: none, or as many as of zone_st"),
+    ],
+)
+def test_zones_that_do_not_fit_together_are_refused(values, told):
+    with pytest.raises(InputError, match=re.escape(told)):
+        scenario(tool=values)

@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
-from cells import encoder, run
-from numpy.testing import assert_allclose
+from cells import config, encoder, run
+from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import messages
+from lathe_rc import harness, messages
 from lathe_rc.signals.profile import Piston
 
 TURN = 2 * np.pi
@@ -51,3 +51,26 @@ def test_measured_error_is_that_of_the_measured_angle_and_position(rough):
 def test_ideal_sensors_measure_the_error():
     tool = run(tool=PISTON).recording.of_type(messages.TOOL)
     assert np.array_equal(tool["measured_error"], tool["error"])
+
+
+def test_an_error_motion_is_in_the_part_and_in_no_sensor():
+    without, found = (
+        harness.run(config("oval3000", "spindle_encoder.revolutions=4", *changes)).recording
+        for changes in (
+            [],
+            [
+                "tool.error_motion_order=[2, 5]",
+                "tool.error_motion_amplitude=[1e-6, 0.5e-6]",
+                "tool.error_motion_phase=[0.0, 1.0]",
+            ],
+        )
+    )
+    angle = found.dense["/encoder"]["angle_true"]
+    motion = 1e-6 * np.sin(2.0 * angle) + 0.5e-6 * np.sin(5.0 * angle + 1.0)
+    assert_allclose(found.dense["/tool"]["error"] - without.dense["/tool"]["error"], motion, atol=1e-15)
+    for topic, field in (
+        ("/tool", "measured_error"),
+        ("/tool", "displacement"),
+        ("/coarse/state", "measured_position"),
+    ):
+        assert_array_equal(found.dense[topic][field], without.dense[topic][field])

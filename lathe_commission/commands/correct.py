@@ -222,7 +222,7 @@ def _hidden(made: Correction, lowest: int, guard: float, scenario: Scenario) -> 
         LatheError: in addition, nothing is corrected.
     """
     most = guard * float(made.noise[lowest:].max())
-    allowed = min(part.tolerances(judged(scenario.nodes)).values(), default=0.0)
+    allowed = part.strictest(judged(scenario.nodes))
     if most <= allowed:
         return ""
     told = f"tolerance: ±{allowed * 1e6:.4g} µm" if allowed else "no tolerance"

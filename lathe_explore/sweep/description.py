@@ -61,7 +61,8 @@ def describe(scenario: Scenario, targets: Iterable[str], measures: Sequence[Meas
     """Return the description of a scenario, its varied parameters and its measures."""
     of_loops = (each.name for each in measures if each.node and each.statistic == "max_error")
     forms = [each for each in judged(scenario.nodes).values() if each.quantity == "form"]
-    tolerances = {GOAL: forms[0].tolerance} if forms else {}
+    # With zones the largest error alone does not decide.
+    tolerances = {GOAL: forms[0].tolerance} if forms and not forms[0].zones else {}
     tolerances |= {f"{loop.node}.max_error": loop.tolerance for loop in loops(judged(scenario.nodes))}
     rows = {target: scenario.parameter(target) for target in targets}
     return Description(

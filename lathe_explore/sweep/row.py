@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
-from lathe_rc.analysis.tolerance import judge
+from lathe_rc.analysis.tolerance import judge, judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
 from lathe_rc.cell.events import LIMITED, OUT_OF_REACH, parse
@@ -54,6 +54,7 @@ from lathe_rc.judge.loops import FIGURES, loops, watches
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
+from lathe_rc.signals.zones import ZoneErrors
 
 if TYPE_CHECKING:
     from lathe_explore.sweep.description import Target
@@ -230,6 +231,9 @@ class _Keeper(Errors):
         forms = [each for each in judged(parameters).values() if each.quantity == "form"]
         self._tolerance = forms[0].tolerance if forms else 0.0
         self._doubt = form_doubt(parameters) if self._tolerance else 0.0
+        self._zones = forms[0].zones if forms else ()
+        self._by_zone: ZoneErrors | None = None
+        self.heard = [*self.heard, *([f"{self._tool}.height"] if self._zones else [])]
         self._measures = measures
         # The digest of a cell without a tool is that of what is measured.
         self._signals = {
@@ -248,6 +252,8 @@ class _Keeper(Errors):
                 self._limited.add(topic.removesuffix("/events"))
         if self._tool:
             self._hash.update(_bytes(dense[self._tool]["error"]))
+            if self._zones:
+                self._add_zones(dense, self.soundness.sound(first, samples, sparse))
         elif self._measures and self._encoder:
             angle = dense[self._encoder]["angle_true"]
             if first == self._first > 0:
@@ -257,6 +263,14 @@ class _Keeper(Errors):
             kept[first - self._first :][:samples] = dense[topic][field]
         for watch in self._loops:
             watch.chunk(first, samples, dense, sparse)
+
+    def _add_zones(self, dense: Mapping[str, Signals], sound: int) -> None:
+        """Add the first ``sound`` samples of a chunk to the errors by zone."""
+        assert self._encoder, "a tool needs one"
+        assert self._tool, "as before"
+        self._by_zone = self._by_zone or ZoneErrors(self._zones, self._before)
+        tool, angle = dense[self._tool], dense[self._encoder]["angle_true"]
+        self._by_zone.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
         """Return the result columns of a completed run.
@@ -288,9 +302,13 @@ class _Keeper(Errors):
                 if not math.isfinite(value):
                     raise LatheError(f"{name} is {value}; allowed: a finite number")
         if self._tolerance and not self.soundness.why:
-            found["tool.in_tolerance_from"] = (
-                judge(errors.largest, self._tolerance, self._before, doubt=self._doubt).since or None
+            before, doubt = self._before, self._doubt
+            verdict = (
+                judge_zones(self._by_zone.largest(), self._tolerance, self._zones, before, doubt=doubt)
+                if self._by_zone
+                else judge(errors.largest, self._tolerance, before, doubt=doubt)
             )
+            found["tool.in_tolerance_from"] = verdict.since or None
         return found
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured frequency response of a drive as a response for the checks of the loop."""
+"""States of a drive as responses for the checks of the loop: as measured, and after a drift."""
 
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ class MeasuredDrive:
     frequency: Array
     value: Complex
     model: Response
+    state: ClassVar = "as measured"
 
     @property
     def poles(self) -> Complex:
@@ -51,6 +53,35 @@ class MeasuredDrive:
                 f"measured response of the drive from {low:.4g} Hz on; allowed: points up to {most:.4g} Hz"
             )
         return np.asarray(waves[waves <= highest])
+
+
+@dataclass(frozen=True, eq=False)
+class DriftedDrive:
+    """Drive after some time of its drift.
+
+    Attributes:
+        response: response of the position to the command with the modes of that time and the gain of the start.
+        gain: gain over that of the start.
+        time: [s].
+    """
+
+    response: Response
+    gain: float
+    time: float
+
+    @property
+    def state(self) -> str:
+        """Name of the state."""
+        return f"after {self.time:g} s of its drift"
+
+    @property
+    def poles(self) -> Complex:
+        """Poles of the drive [rad/s]."""
+        return poles_of(self.response)
+
+    def __call__(self, frequency: Array) -> Complex:
+        """Return the response at frequencies [rad/s], shape (n,)."""
+        return np.asarray(self.gain * self.response(frequency))
 
 
 def read_points(path: Path) -> list[tuple[Array, Complex]]:

@@ -13,11 +13,13 @@ accelerates, as in an unstable learning loop; wear and drift cause growth propor
 fault or by a change of form along the part, is not growth.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lathe_rc.arrays import Array
+from lathe_rc.signals.zones import Zone
 
 LAST = 10  #: largest number of revolutions at the end of a run that margin and budget cover
 DOUBTED = 0.1  #: part of the tolerance from which the doubt of a form is told
@@ -66,6 +68,10 @@ class Verdict:
         unjudged: reason why the end of the run cannot be judged; empty if it can.
         doubt: how far the desired form may be off between the points of its table [m]
             (`lathe_rc.signals.interpolation_doubt`); a revolution is in tolerance if error and doubt together are.
+        place: part of the surface that the figures are of; empty: all of it.
+        zones: verdicts on the parts of the surface, if they have tolerances of their own: the part is in tolerance if
+            each is, and the other figures are those of the part with the least to spare.
+        left: parts of the surface that are not judged.
     """
 
     tolerance: float
@@ -76,6 +82,9 @@ class Verdict:
     quantity: Quantity = FORM
     unjudged: str = ""
     doubt: float = 0.0
+    place: str = ""
+    zones: "tuple[Verdict, ...]" = ()
+    left: tuple[str, ...] = ()
 
     @property
     def in_tolerance(self) -> bool:
@@ -89,8 +98,10 @@ class Verdict:
 
     def told(self) -> str:
         """Describe the result as text."""
+        if self.zones:
+            return self._by_zone()
         told = self.quantity.told
-        allowed = f"±{told(self.tolerance)}"
+        allowed = f"±{told(self.tolerance)}" + (f", {self.place}" if self.place else "")
         if self.unjudged:
             return f"not judged ({allowed}): {self.unjudged}"
         if not self.revolutions:
@@ -106,6 +117,15 @@ class Verdict:
         spare = told(self.spare, 3)
         return f"in tolerance ({allowed}) from revolution {self.since} on, {spare} to spare in {over}{known}"
 
+    def _by_zone(self) -> str:
+        told, inside = self.quantity.told, [each for each in self.zones if each.in_tolerance]
+        outside = [each.told() for each in self.zones if not each.in_tolerance]
+        spare = [f"{told(each.spare, 3)} of ±{told(each.tolerance)} ({each.place})" for each in inside]
+        where = "the other zones" if outside else f"all zones from revolution {self.since} on"
+        kept = [f"in tolerance in {where}, to spare: {', '.join(spare)}"] if spare else []
+        left = [f"not judged: {', '.join(self.left)}"] if self.left else []
+        return "; ".join([*outside, *kept, *left])
+
     def summary(self) -> dict[str, object]:
         """Return the result for JSON, in the quantity's unit."""
         scale = self.quantity.scale
@@ -120,6 +140,8 @@ class Verdict:
             "spare": self.spare * scale if self.revolutions else None,
             "over_revolutions": list(self.over) if self.revolutions else None,
             **({"form_doubt": self.doubt * scale} if self.doubt else {}),
+            **({"place": self.place} if self.place else {}),
+            **({"zones": [each.summary() for each in self.zones], "not_judged": list(self.left)} if self.zones else {}),
         }
 
 
@@ -181,6 +203,40 @@ def judge(
     since = inside + 1 + before if inside < count else 0
     over = (start + 1 + before, count + before)
     return Verdict(tolerance, count, since, over, float(largest[start:].max()), quantity, unjudged, doubt)
+
+
+def judge_zones(
+    largest: Sequence[Array],
+    tolerance: float,
+    zones: Sequence[Zone],
+    before: int = 0,
+    *,
+    unjudged: str = "",
+    doubt: float = 0.0,
+) -> Verdict:
+    """Judge whether a part is in tolerance, by zones of its surface.
+
+    Args:
+        largest: largest errors outside of all zones and in each, see `ZoneErrors.largest`.
+        tolerance: allowed error to each side outside of the zones [m].
+        zones: the zones.
+        before: see `judge`.
+        unjudged: see `judge`.
+        doubt: see `judge`.
+    """
+    if unjudged:
+        return judge(largest[0], tolerance, before, unjudged=unjudged, doubt=doubt)
+    named = [(tolerance, "elsewhere"), *((zone.tolerance, zone.name) for zone in zones)]
+    parts = [
+        replace(judge(errors, allowed, before, doubt=doubt), place=place)
+        for errors, (allowed, place) in zip(largest, named, strict=True)
+        if allowed
+    ]
+    worst = min(parts, key=lambda each: each.spare if each.spare == each.spare else -np.inf)
+    since = min(each.since for each in parts) and max(each.since for each in parts)
+    return replace(
+        worst, since=since, zones=tuple(parts), left=tuple(zone.name for zone in zones if not zone.tolerance)
+    )
 
 
 def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth | None:

@@ -9,6 +9,7 @@ from annotated_types import Ge
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from lathe_rc.errors import InputError
+from lathe_rc.signals.zones import Zone
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Judged:
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
         delay: age of the measurement in the error of a loop [sample].
         limit: command of a loop from which on it is saturated.
+        zones: parts of the surface with tolerances of their own.
     """
 
     __pydantic_config__: ClassVar = ConfigDict(allow_inf_nan=False, extra="forbid")
@@ -34,6 +36,12 @@ class Judged:
     nose_radius: Annotated[float, Ge(0)] = 0.0
     delay: Annotated[int, Ge(0)] = 0
     limit: Annotated[float, Ge(0)] = 0.0
+    zones: tuple[Zone, ...] = ()
+
+    @property
+    def tolerances(self) -> list[float]:
+        """Tolerance outside of the zones, then those of the zones; 0: not judged."""
+        return [self.tolerance, *(zone.tolerance for zone in self.zones)]
 
 
 _BY_NODE = TypeAdapter(dict[str, Judged])

@@ -42,7 +42,7 @@ def drawn(result: harness.Result, width: int) -> Text | None:
     groups = np.array_split(np.arange(rms.size), min(rms.size, _POINTS * width))
     revolution = [first + int(group[-1]) for group in groups]
     curves = [("largest", "gray+", largest), ("RMS", "cyan+", rms)]
-    if result.verdict:
+    if result.verdict and not result.verdict.zones:
         limit = result.verdict.tolerance * 1e6
         curves.insert(0, (f"tolerance {limit:.4g} µm", "orange+", np.full(rms.size, limit)))
     plotext.clear_figure()  # the figure is global

@@ -10,7 +10,10 @@ PREFIXES = ("", "coarse_", "fine_", "cut_")  #: parameter prefixes of stages com
 #: causes that the same values switch off in every node that has these parameters; `NodeParameters.causes` has others
 EVERYWHERE: Mapping[str, Values] = {
     "force": {"deflects": False, "cross_slide": False, "radial_ratio": 0.0},
+    "error motion": {"error_motion_order": [], "error_motion_amplitude": [], "error_motion_phase": []},
+    "drift": {"gain_drift": 0.0, "mode_drift": 0.0},
     "noise": {"noise_rms": 0.0},
+    "jitter": {"sampling_jitter": 0.0},
     "quantisation": {"counts_per_revolution": 0, "resolution": 0.0, "adc_step": 0.0, "dac_step": 0.0},
     "hysteresis": {"hysteresis": "none", "linearisation": "none", "creep_per_decade": 0.0},
     "backlash": {"backlash": 0.0},
@@ -19,10 +22,15 @@ EVERYWHERE: Mapping[str, Values] = {
     | {"slew_rate": 0.0},
     "faults": {"faults": []},
 }
-ORDER = ("force", "load", "vibration", "noise", "quantisation", "hysteresis", "backlash", "limits", "faults")
+ORDER = (
+    "force", "load", "vibration", "error motion", "drift", "noise", "jitter", "quantisation", "hysteresis", "backlash",
+    "limits", "faults",
+)  # fmt: skip
 #: causes that make one revolution differ from the next
 _CHANGING: Mapping[str, Values] = {
+    "drift": EVERYWHERE["drift"],
     "noise": EVERYWHERE["noise"],
+    "jitter": EVERYWHERE["jitter"],
     "quantisation": EVERYWHERE["quantisation"],
     "vibration": {"random_rms": 0.0, "line_amplitude": []},
 }

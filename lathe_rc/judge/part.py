@@ -10,7 +10,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge
+from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge, judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
@@ -20,6 +20,7 @@ from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Signals, full
 from lathe_rc.signals.form_errors import RunningErrors, that_count, turns_before
+from lathe_rc.signals.zones import Zone, ZoneErrors
 
 _CUTOFF = 50.0  # cutoff of the roundness and roughness filters [undulations per revolution]
 _TOGETHER = 16  # number of revolutions evaluated together
@@ -55,6 +56,17 @@ def tolerances(declared: Mapping[str, Judged]) -> dict[str, float]:
     return {each.topic: each.tolerance for each in forms if each.tolerance}
 
 
+def zones(declared: Mapping[str, Judged]) -> dict[str, tuple[Zone, ...]]:
+    """Return the zones with tolerances of their own of each tool that declares some, by relative topic."""
+    return {each.topic: each.zones for each in declared.values() if each.zones}
+
+
+def strictest(declared: Mapping[str, Judged]) -> float:
+    """Return the smallest tolerance of the forms and their zones [m]; 0 if there is none."""
+    allowed = [limit for each in declared.values() if each.quantity == "form" for limit in each.tolerances if limit]
+    return min(allowed, default=0.0)
+
+
 def nose_radius(declared: Mapping[str, Judged]) -> float:
     """Return the nose radius of the tool [m] that nodes declare; 0 if none does."""
     return next((each.nose_radius for each in declared.values() if each.nose_radius), 0.0)
@@ -65,8 +77,13 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     for of, allowed in tolerances(judged(scenario.nodes)).items():
         if topic.endswith(f"/{of}"):
-            why, doubt = recording.sound_form[1], form_doubt(scenario.nodes)
-            return judge(recording.errors.largest, allowed, _turns_before(recording), unjudged=why, doubt=doubt)
+            (sound, why), doubt, before = recording.sound_form, form_doubt(scenario.nodes), _turns_before(recording)
+            if by_zone := zones(judged(scenario.nodes)).get(of):
+                errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
+                angle = recording.of_type(messages.ENCODER)["angle_true"]
+                errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
+                return judge_zones(errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
+            return judge(recording.errors.largest, allowed, before, unjudged=why, doubt=doubt)
     return None
 
 

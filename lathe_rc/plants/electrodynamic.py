@@ -5,7 +5,8 @@
 
 Source: papers 000 and 001; parameters identified from the table of 001. The coil current follows from the acceleration
 of the carriage, i = m·x''/k. The gain g of the papers is 1. Further resonances are those of
-`lathe_rc.plants.modes`.
+`lathe_rc.plants.modes`, a slow change of gain and modes that of `lathe_rc.plants.drift`. The sensor may sample at the
+time t + δ in place of t: it then reads x(t) + δ·x'(t), which is off by x''·δ²/2, 0.5 nm for 1 µs at 1000 m/s².
 """
 
 from typing import NamedTuple
@@ -14,6 +15,8 @@ import numpy as np
 
 from lathe_rc.arrays import Array, put
 from lathe_rc.jit import inlined, kernel
+from lathe_rc.plants.drift import NONE as NO_DRIFT
+from lathe_rc.plants.drift import Drift, DriftTable, due, gained, move
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, discretise
 from lathe_rc.plants.modes import NONE, Modes, carriage
 
@@ -43,6 +46,7 @@ class CoarseTable(NamedTuple):
         edge: index of the position of the edge in the state.
         state: position and velocity of the sensor, then of the modes, shape (m,).
         line: delayed commands from before the next block, the oldest first.
+        drift: drift of gain and modes.
     """
 
     transition: Array
@@ -56,15 +60,31 @@ class CoarseTable(NamedTuple):
     edge: int
     state: Array
     line: Array
+    drift: DriftTable
 
 
 @kernel
 def advance(
-    drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array, sensed: Array
+    drive: CoarseTable,
+    first: int,
+    command: Array,
+    jitter: Array,
+    position: Array,
+    velocity: Array,
+    current: Array,
+    sensed: Array,
 ) -> None:
-    """Step an electrodynamic drive through a block (implements `ElectrodynamicDrive.block`)."""
+    """Step an electrodynamic drive through a block (implements `ElectrodynamicDrive.block`).
+
+    The sensor, ``sensed`` [m], samples ``jitter`` [s] late, shape (n,), or in time if that is empty.
+    """
+    if drive.drift.gain != 0.0:
+        own = np.empty(command.size)
+        for k in range(command.size):
+            own[k] = gained(drive.drift, first + k, command[k])
+        command = own
     if drive.state.size > 2:
-        _advance_modes(drive, command, position, velocity, current, sensed)
+        _advance_modes(drive, first, command, jitter, position, velocity, current, sensed)
         return
     state, line, part, stroke = drive.state, drive.line, drive.part, drive.stroke
     gain, spring, damper, force_per_current = drive.gain, drive.spring, drive.damper, drive.force_per_current
@@ -86,11 +106,20 @@ def advance(
     state[0], state[1] = x, v
     put(line, sent[command.size :])
     put(sensed, position)
+    for k in range(jitter.size):
+        sensed[k] += jitter[k] * velocity[k]
 
 
 @kernel
 def _advance_modes(
-    drive: CoarseTable, command: Array, position: Array, velocity: Array, current: Array, sensed: Array
+    drive: CoarseTable,
+    first: int,
+    command: Array,
+    jitter: Array,
+    position: Array,
+    velocity: Array,
+    current: Array,
+    sensed: Array,
 ) -> None:
     """Step a drive with modes through a block (see `advance`)."""
     state, part, transition, weights = drive.state, drive.part, drive.transition, drive.weights
@@ -98,6 +127,9 @@ def _advance_modes(
     moved = np.empty(order)
     sent = np.concatenate((drive.line, command))
     for k in range(command.size):
+        if due(drive.drift, first, k):
+            move(drive.drift, first + k, 0, transition)
+            move(drive.drift, first + k, order, weights)
         u0, u1, u2 = sent[k + 2], sent[k + 1], sent[k]
         for i in range(order):
             moved[i] = weights[i, 0] * u0 + weights[i, 1] * u1 + weights[i, 2] * u2
@@ -107,6 +139,8 @@ def _advance_modes(
         state[0], state[1] = between_stops(state[0], state[1], drive.stroke)
         delayed = (1.0 - part) * u0 + part * u1
         position[k], velocity[k], sensed[k] = state[drive.edge], state[drive.edge + 1], state[0]
+        if jitter.size > 0:
+            sensed[k] += jitter[k] * state[1]
         current[k] = (
             drive.spring * (drive.gain * delayed - state[0]) - drive.damper * state[1]
         ) * drive.force_per_current
@@ -127,6 +161,7 @@ class ElectrodynamicDrive:
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
         gain: g, static gain from the command to the position, of either sign.
         modes: further resonances.
+        drift: drift of gain and modes.
 
     Attributes:
         plant: the difference equation, with the sensor's position as first state.
@@ -146,12 +181,18 @@ class ElectrodynamicDrive:
         method: Discretisation,
         gain: float = 1.0,
         modes: Modes = NONE,
+        drift: Drift = NO_DRIFT,
     ) -> None:
-        a, b, _, edge = carriage(natural_frequency, damping, modes)
-        self.plant: DiscretePlant = discretise(a, gain * b, delay, step, method)
+        _, b, _, edge = carriage(natural_frequency, damping, modes)
+        plants = []
+        for state in drift.states():
+            a, command, *_ = carriage(natural_frequency, damping, modes.moved(state.modes))
+            plants.append(discretise(a, gain * command, delay, step, method))
+        self.plant: DiscretePlant = plants[0]
         self.table = CoarseTable(
-            transition=self.plant.transition,
-            weights=self.plant.weights,
+            # Copies, which a drift changes: cells share the plant.
+            transition=self.plant.transition.copy(),
+            weights=self.plant.weights.copy(),
             part=self.plant.fraction,
             gain=gain,
             spring=natural_frequency**2,
@@ -161,12 +202,13 @@ class ElectrodynamicDrive:
             edge=edge,
             state=np.zeros(b.size),
             line=np.zeros(self.plant.delay + 2),
+            drift=drift.table([np.hstack((each.transition, each.weights)) for each in plants], step),
         )
 
-    def block(self, command: Array, position: Array, velocity: Array, current: Array) -> None:
+    def block(self, command: Array, position: Array, velocity: Array, current: Array, first: int = 0) -> None:
         """Step the drive through a block: fill position [m], velocity [m/s] and current [A] for a command [m].
 
         All arrays have the shape (n,); position and velocity are those of the edge. The drive is at rest at 0 before
-        the first block.
+        sample 0. ``first`` is the index of the first sample, by which the drive drifts.
         """
-        advance(self.table, command, position, velocity, current, np.empty_like(command))
+        advance(self.table, first, command, np.empty(0), position, velocity, current, np.empty_like(command))

@@ -23,7 +23,7 @@ force does not follow from its response to the command.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -73,6 +73,10 @@ class Modes:
     def normal(self) -> bool:
         """Whether the modes are those of a structure alone, with real residues and no further lags."""
         return not any(self.velocity) and not self.lag_time
+
+    def moved(self, factor: float) -> "Modes":
+        """Return the modes with frequencies multiplied by a factor; damping ratios and participations stay."""
+        return self if factor == 1.0 else replace(self, frequency=tuple(factor * each for each in self.frequency))
 
     def model(self, natural_frequency: float, damping: float) -> tuple[float, float]:
         """Return ω [rad/s] and ζ of the second-order drive that moves as this one at low frequencies.

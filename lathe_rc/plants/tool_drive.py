@@ -46,8 +46,10 @@ from lathe_rc.errors import InputError
 from lathe_rc.plants.chip import DONE
 from lathe_rc.plants.coil import Coil, coil_table
 from lathe_rc.plants.cutting import MADE, CuttingProcess
+from lathe_rc.plants.drift import NONE as NO_DRIFT
+from lathe_rc.plants.drift import Drift
 from lathe_rc.plants.linear import DiscretePlant, Discretisation, continuous_poles, discretise
-from lathe_rc.plants.modes import NONE, Modes, carriage
+from lathe_rc.plants.modes import NONE, Carriage, Modes, carriage
 from lathe_rc.plants.piezo import Stack, StackTable
 from lathe_rc.plants.tool_motion import GIVEN, MotionTable, Weights, advance_loaded, failure
 
@@ -154,6 +156,7 @@ class ToolDrive:
         resolution: of the carriage's position sensor [m]; 0 for none.
         gain: static gain of the position loop, of either sign.
         modes: further resonances of the carriage, at whose edge the tool or the piezo sits.
+        drift: drift of gain and modes.
         step: sampling step [s].
         method: discretisation, see `lathe_rc.plants.linear.discretise`.
         kept: length of the history of limited samples of the current loop, a power of two.
@@ -182,6 +185,7 @@ class ToolDrive:
         resolution: float = 0.0,
         gain: float = 1.0,
         modes: Modes = NONE,
+        drift: Drift = NO_DRIFT,
         step: float,
         method: Discretisation,
         kept: int = 1,
@@ -206,35 +210,43 @@ class ToolDrive:
             base, tool, mass_of_tool = int(place[mass.edge]), _TOOL, piezo.mass_ratio * moving_mass
             stiff, loss = piezo.natural_frequency**2, 2.0 * piezo.damping * piezo.natural_frequency
             count += 2
-        servo, order = _joined(mass.a, mass.force, place, piezo, base), count + (coil is not None)
-        a, drives, extends, loads = servo, *np.zeros((3, order))
-        drives[place] = gain * mass.command
-        if piezo:
-            extends[place] = -piezo.mass_ratio * stiff * mass.force
-            extends[_TOOL + 1] = stiff
-        if radial and piezo:
-            loads[_TOOL + 1] = 1.0 / mass_of_tool
-        elif radial:
-            loads[place] = mass.force / moving_mass
-        if coil:  # the coil moves the carriage, in place of the servo
-            a = np.zeros((order, order))
-            a[:-1, :-1] = _joined(np.array([[0.0, 1.0], [0.0, 0.0]]), mass.force, place, piezo, base)
-            a[1, -1] = force_constant / moving_mass
-            a[-1, -1] = -coil.resistance / coil.inductance
-            a[-1, 1] = -force_constant / coil.inductance if coil.back_emf else 0.0
-            drives[1], drives[-1] = 0.0, 1.0 / coil.inductance
-        self._coarse = discretise(a, drives, delay, step, method)
-        self._fine = discretise(a, extends, 0.0, step, method)
-        load = discretise(a, loads, 0.0, step, method)
-        weights = self._coarse.weights
-        if coil:  # the voltage is held through a step
-            weights = np.zeros((order, 3))
-            weights[:, 0] = discretise(a, drives, 0.0, step, method).weights.sum(axis=1)
+        order = count + (coil is not None)
+
+        def plants(mass: Carriage) -> tuple[Array, Array, DiscretePlant, DiscretePlant, Weights]:
+            servo = _joined(mass.a, mass.force, place, piezo, base)
+            a, drives, extends, loads = servo, *np.zeros((3, order))
+            drives[place] = gain * mass.command
+            if piezo:
+                extends[place] = -piezo.mass_ratio * stiff * mass.force
+                extends[_TOOL + 1] = stiff
+            if radial and piezo:
+                loads[_TOOL + 1] = 1.0 / mass_of_tool
+            elif radial:
+                loads[place] = mass.force / moving_mass
+            if coil:  # the coil moves the carriage, in place of the servo
+                a = np.zeros((order, order))
+                a[:-1, :-1] = _joined(np.array([[0.0, 1.0], [0.0, 0.0]]), mass.force, place, piezo, base)
+                a[1, -1] = force_constant / moving_mass
+                a[-1, -1] = -coil.resistance / coil.inductance
+                a[-1, 1] = -force_constant / coil.inductance if coil.back_emf else 0.0
+                drives[1], drives[-1] = 0.0, 1.0 / coil.inductance
+            coarse = discretise(a, drives, delay, step, method)
+            fine = discretise(a, extends, 0.0, step, method)
+            weights = coarse.weights.copy()
+            if coil:  # the voltage is held through a step
+                weights = np.zeros((order, 3))
+                weights[:, 0] = discretise(a, drives, 0.0, step, method).weights.sum(axis=1)
+            # Copies, which a drift changes: cells share the plants.
+            load = discretise(a, loads, 0.0, step, method).weights.copy()
+            return servo, extends, coarse, fine, Weights(coarse.transition.copy(), weights, fine.weights.copy(), load)
+
+        servo, extends, self._coarse, self._fine, weights = plants(mass)
+        along = [plants(carriage(natural_frequency, damping, modes.moved(state.modes)))[-1] for state in drift.states()]
         self.step, self._piezo = step, piezo
         stack = piezo.stack if piezo else Stack(stroke=1.0, step=step, method="foh")  # not stepped without one
         self.table = MotionTable(
             series=piezo is not None,
-            weights=Weights(self._coarse.transition, weights, self._fine.weights, load.weights),
+            weights=weights,
             tool=tool,
             base=base,
             delay=self._coarse.delay,
@@ -258,6 +270,7 @@ class ToolDrive:
             before=np.zeros(2),
             reading=np.zeros(1),
             line=np.zeros(self._coarse.delay + 3),
+            drift=drift.table([np.hstack(each) for each in along], step),
         )
         if coil:
             self._check(coil)
@@ -272,8 +285,9 @@ class ToolDrive:
             first: index of the first sample.
             given: arrays by name, of shape (n,): ``command`` [m], ``angle`` [rad], ``speed`` [rad/s] and
                 ``feed_velocity`` [m/s]; optional, with a default of 0: ``set_point`` of the piezo [m], ``noise`` of the
-                carriage's sensor [m], ``met``, the present form of the blank [m], and ``height``, ``cross_position``
-                and ``allowance`` as in `lathe_rc.plants.cutting.CuttingProcess.block`.
+                carriage's sensor [m] and its ``jitter`` [s], ``met``, the present form of the blank [m], and
+                ``height``, ``cross_position`` and ``allowance`` as in
+                `lathe_rc.plants.cutting.CuttingProcess.block`.
 
         Returns:
             Arrays by name: ``position``, ``velocity``, ``current`` and ``measured`` of the carriage, ``extension``,

@@ -26,6 +26,7 @@ from lathe_rc.plants.chip import (
 from lathe_rc.plants.chip import STOPS as CUT_STOPS
 from lathe_rc.plants.chip import failure as failure_of_cut
 from lathe_rc.plants.coil import CoilTable, applied
+from lathe_rc.plants.drift import DriftTable, due, gained, move
 from lathe_rc.plants.electrodynamic import between_stops
 from lathe_rc.plants.piezo import VOLTAGE, StackTable, extend
 from lathe_rc.signals.noise import quantise
@@ -75,6 +76,7 @@ class MotionTable(NamedTuple):
         before: e [m] and radial force [N] of the last sample.
         reading: reading of the carriage's sensor in the last sample [m], shape (1,).
         line: ring of past commands: sample n is at index n modulo its length.
+        drift: drift of gain and modes.
     """
 
     series: bool
@@ -102,6 +104,17 @@ class MotionTable(NamedTuple):
     before: Array
     reading: Array
     line: Array
+    drift: DriftTable
+
+
+@inlined
+def _move(drive: MotionTable, n: int) -> None:
+    """Change the matrices of sample ``n`` as the modes drift."""
+    weights, order = drive.weights, drive.state.size
+    move(drive.drift, n, 0, weights.transition)
+    move(drive.drift, n, order, weights.coarse)
+    move(drive.drift, n, order + 3, weights.fine)
+    move(drive.drift, n, order + 6, weights.load)
 
 
 @inlined
@@ -110,7 +123,7 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
     line, weights, state = drive.line, drive.weights, drive.state
     transition, coarse, fine, load = weights.transition, weights.coarse, weights.fine, weights.load
     size, delay, part = line.size, drive.delay, drive.part
-    line[n % size] = command
+    line[n % size] = gained(drive.drift, n, command)
     u0, u1, u2 = line[(n - delay) % size], line[(n - delay - 1) % size], line[(n - delay - 2) % size]
     d0, d1, d2 = u0, u1, u2
     if drive.coil.on:
@@ -130,6 +143,13 @@ def _begin(drive: MotionTable, n: int, command: float, free: Array) -> float:
             free[i] = free[i] + coarse[i, 0] * d0 + coarse[i, 1] * d1 + coarse[i, 2] * d2
         free[i] += load[i, 1] * drive.before[1]
     return float((1.0 - part) * u0 + part * u1)
+
+
+@inlined
+def _off(noise: Array, jitter: Array, k: int, free: Array) -> float:
+    """Return noise and jitter of the carriage's sensor as one error of its reading [m]."""
+    # The velocity without extension and force of this sample, which change it by less than 1e-3 of itself.
+    return float(noise[k] + jitter[k] * free[1]) if jitter.size > 0 else float(noise[k])
 
 
 @inlined
@@ -236,7 +256,13 @@ def _motion(drive: MotionTable, delayed: float) -> tuple[float, float, float, fl
 
 @kernel
 def advance(
-    drive: MotionTable, first: int, command: Array, set_point: Array, noise: Array, motion: tuple[Array, ...]
+    drive: MotionTable,
+    first: int,
+    command: Array,
+    set_point: Array,
+    noise: Array,
+    jitter: Array,
+    motion: tuple[Array, ...],
 ) -> None:
     """Step tool drives in air through a block.
 
@@ -246,6 +272,7 @@ def advance(
         command: set point of the carriage [m], shape (n,), as of all following arrays.
         set_point: of the piezo, before direct compensation [m].
         noise: of the carriage's position sensor [m].
+        jitter: delay of the instants at which that sensor samples [s], or empty.
         motion: output arrays: true position [m] and velocity [m/s] of the carriage where the tool sits, current of the
             coil [A], position reading of the carriage's sensor [m]; extension of the piezo (tool relative to carriage)
             [m], its velocity [m/s], voltage at the piezo [V].
@@ -253,16 +280,20 @@ def advance(
     position, velocity, current, measured, extension, rate, voltage = motion
     free, trial, nowhere = np.empty(drive.state.size), np.empty(drive.memory.size), (0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(command.size):
+        if due(drive.drift, first, k):
+            _move(drive, first + k)
         delayed = _begin(drive, first + k, command[k], free)
-        e, _ = _solve(drive, None, free, trial, set_point[k], noise[k], nowhere, 0.0, 0.0)
-        _settle(drive, free, e, 0.0, noise[k])
+        read = _off(noise, jitter, k, free)
+        e, _ = _solve(drive, None, free, trial, set_point[k], read, nowhere, 0.0, 0.0)
+        _settle(drive, free, e, 0.0, read)
         now = _motion(drive, delayed)
         position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
 
 
 #: input arrays of a block for `advance_loaded`, in its order
 GIVEN = (
-    "command", "set_point", "noise", "met", "angle", "speed", "height", "cross_position", "feed_velocity", "allowance",
+    "command", "set_point", "noise", "jitter", "met", "angle", "speed", "height", "cross_position", "feed_velocity",
+    "allowance",
 )  # fmt: skip
 
 
@@ -288,7 +319,7 @@ def advance_loaded(
     Returns:
         Index of the sample where the kernel stopped, and the reason.
     """
-    command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance = given
+    command, set_point, noise, jitter, met, angle, speed, height, cross_position, feed_velocity, allowance = given
     position, velocity, current, measured, extension, rate, voltage = motion
     force, deflection, depth_of_cut, feed, wear = of_cut
     per_radian = cut.process.grid / _TURN
@@ -299,14 +330,17 @@ def advance_loaded(
         if reason != DONE:
             return k, reason
         wear[k] = cut.state[WEAR]
+        if due(drive.drift, first, k):
+            _move(drive, first + k)
         delayed = _begin(drive, first + k, command[k], free)
+        read = _off(noise, jitter, k, free)
         here = (place, angle[k], cross_position[k], met[k], allowance[k])
-        e, chip = _solve(drive, cut, free, trial, set_point[k], noise[k], here, stiffness, c)
+        e, chip = _solve(drive, cut, free, trial, set_point[k], read, here, stiffness, c)
         if np.isnan(chip):
             return k, DRAWN_IN
         depth_of_cut[k] = chip = max(chip, 0.0)
         force[k], deflection[k] = press(cut, chip, stiffness, c, speed[k], 0.0, 0.0)
-        _settle(drive, free, e, drive.radial * force[k], noise[k])
+        _settle(drive, free, e, drive.radial * force[k], read)
         now = _motion(drive, delayed)
         position[k], velocity[k], current[k], measured[k], extension[k], rate[k], voltage[k] = now
         moved = position[k]

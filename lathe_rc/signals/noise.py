@@ -111,6 +111,14 @@ def measure(sensor: SensorTable, true: Array, measured: Array) -> None:
             measured[k] = quantise(measured[k], sensor.resolution)
 
 
+@kernel
+def drawn(sensor: SensorTable, numbers: int) -> Array:
+    """Return the noise of ``numbers`` samples, shape (n,); empty without noise."""
+    found = np.zeros(numbers if sensor.rms > 0.0 else 0)
+    measure(sensor, found, found)
+    return found
+
+
 class Sensor:
     """Sensor that adds white noise and rounds to a resolution; 0 disables either.
 

@@ -3,7 +3,7 @@
 
 from array import array
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge
+from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge, judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.form_errors import that_count
+from lathe_rc.signals.zones import Zone, ZoneErrors
 from lathe_rc.view.report_series import Envelope, MeanRows
 
 ACROSS = 512  #: number of angles in the map
@@ -54,9 +55,10 @@ class Form:
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
         types: message types of the bag by topic, for the signals that the form error is made of.
         doubt: how far the desired form may be off between the points of its table [m].
+        zones: parts of the surface with tolerances of their own.
 
     Attributes:
-        tool, tolerance: see the arguments.
+        tool, tolerance, zones: see the arguments.
         first, last, best: first, last and best (by RMS) revolution; None until one is measured.
         rms, largest: envelopes over the revolutions [m].
         map: radius deviation [m], by revolution and angle.
@@ -73,6 +75,7 @@ class Form:
         nose_radius: float = 0.0,
         doubt: float = 0.0,
         types: Mapping[str, str] = MappingProxyType({}),
+        zones: Sequence[Zone] = (),
     ) -> None:
         self._soundness = Soundness.of_form(types)
         self._encoder, self.tool, self.tolerance, self._doubt = encoder, tool, tolerance, doubt
@@ -82,6 +85,7 @@ class Form:
         self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
+        self.zones, self._by_zone = zones, ZoneErrors(zones)
         self._done = 0  # revolutions measured
         self.first: Revolution | None = None
         self.last: Revolution | None = None
@@ -103,6 +107,9 @@ class Form:
         tool = {name: array[:sound] for name, array in dense[self.tool].items()}
         if first and not self._held.size and not self._done:  # a snapshot begins in the middle of a revolution
             self._done = self._before = int(np.ceil(angle[0] / _TURN))
+            self._by_zone = ZoneErrors(self.zones, self._before)
+        if self.zones:
+            self._by_zone.add(angle, tool["height"], tool["error"])
         height = tool["height"] if self._nose_radius else np.zeros(sound)
         new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
         self._held = np.concatenate([self._held, new], axis=1)
@@ -115,6 +122,8 @@ class Form:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
         if not self.tolerance or self.refused:
             return None
+        if self.zones:
+            return judge_zones(self._by_zone.largest(), self.tolerance, self.zones, self._before, doubt=self._doubt)
         return judge(np.array(self._largest), self.tolerance, self._before, doubt=self._doubt)
 
     @property

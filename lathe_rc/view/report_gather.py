@@ -221,7 +221,7 @@ def gather(path: Path) -> Gathered:
             declared = provenance.judged(source.about)
         except InputError as error:
             unjudged = str(error)
-        allowed, nose = part.tolerances(declared), part.nose_radius(declared)
+        allowed, nose, by_zone = part.tolerances(declared), part.nose_radius(declared), part.zones(declared)
         doubt = provenance.doubt_of(source.about)
         forms = [
             Form(
@@ -231,6 +231,7 @@ def gather(path: Path) -> Gathered:
                 nose,
                 doubt,
                 types,
+                next((zones for name, zones in by_zone.items() if tool.endswith(f"/{name}")), ()),
             )
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)

@@ -122,7 +122,7 @@ def _form(data: Gathered, form: Form) -> Iterator[Finding]:
     speeds = (series.extremes for (_, name), series in data.curves.signals.items() if name == "speed_true")
     yield from form_limits(
         um(np.array(form.newest)),
-        excess=form.verdict.largest / form.tolerance if form.verdict else 0.0,
+        excess=form.verdict.largest / form.verdict.tolerance if form.verdict else 0.0,
         learning=data.has(messages.LEARNING),
         causes=[
             *changing(data.nodes),

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lathe_rc.analysis.learning import Response
-from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, Positive, parameter
@@ -93,8 +92,8 @@ class Drive(Stage):
     def responses(self) -> Mapping[str, Response]:
         """Response of the displacement to each command that a controller may learn, by topic before remapping."""
 
-    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
-        """Response of the displacement to a command as measured in each state, by topic; empty: not measured."""
+    def states(self) -> Mapping[str, Sequence[Response]]:
+        """Responses of the displacement to a command in further states, by topic: as measured, and along a drift."""
         return {}
 
     def limits(self) -> Mapping[str, Limits]:

@@ -3,25 +3,27 @@
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from annotated_types import Ge, Le
 
 from lathe_rc import resources
 from lathe_rc.analysis.learning import Response
-from lathe_rc.analysis.measured_drive import MeasuredDrive, read_points
+from lathe_rc.analysis.measured_drive import DriftedDrive, MeasuredDrive, read_points
 from lathe_rc.analysis.modal_drive import OPTIONAL, ModalDrive
 from lathe_rc.analysis.rational_model import of_modal_drive
-from lathe_rc.cell.parameters import Positive, about, parameter
+from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.plants.drift import Drift
 from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
 from lathe_rc.plants.linear import Discretisation
 from lathe_rc.plants.modes import Modes
-from lathe_rc.signals.noise import measure
+from lathe_rc.signals.noise import Sensor, SensorTable, drawn, measure
 from lathe_rc.stages.common.command_limits import limited
 from lathe_rc.stages.common.tables import made_of
 from lathe_rc.stages.drive.drive import OwnRetraction, followed
@@ -49,6 +51,14 @@ class ElectrodynamicActuatorParameters(PlantParameters):
     )
     lag_time: list[Positive] = parameter([], "further first-order lags (real poles): time constant of each", "s")
     lag_participation: list[float] = parameter([], "their parts in the motion, as of modes", "1")
+    gain_drift: float = parameter(0.0, "relative change of the gain per time, up to drift_time; 0: none", "1/s")
+    mode_drift: float = parameter(
+        0.0, "relative change of the frequencies of the modes per time, up to drift_time; 0: none", "1/s"
+    )
+    drift_time: NonNegative = parameter(0.0, "time from the start of the run at which a drift ends", "s")
+    sampling_jitter: NonNegative = parameter(
+        0.0, "jitter of the instants at which the position sensor samples, RMS; 0: none", "s"
+    )
     response_file: str = parameter(
         "",
         "measured frequency response of the drive, CSV as of lathe fit drive: checks and drive margin then hold for "
@@ -56,22 +66,61 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         path=True,
     )
 
-    def measured(self, node: str, model: Response, prefix: str = "") -> Mapping[str, Sequence[MeasuredDrive]]:
-        """Return the response measured in each state by topic; ``prefix`` precedes the parameter in a composed table.
+    def _measured(self, node: str, model: Response, prefix: str) -> list[Response]:
+        if not self.response_file:
+            return []
+        with about(node, f"{prefix}response_file"):
+            states = read_points(resources.find(Path(self.response_file)))
+        return [MeasuredDrive(*points, model) for points in states]
+
+    def states(
+        self, node: str, model: Response, drifted: Callable[[Modes], Response], prefix: str = ""
+    ) -> Mapping[str, Sequence[Response]]:
+        """Return the responses in the states beside that of the start, by topic: as measured, and along the drift.
 
         Args:
             node: name of the node.
-            model: response outside of the measured range.
+            model: response at the start.
+            drifted: makes the response with modes that have moved.
             prefix: prefix of the parameters.
 
         Raises:
-            InputError: the file cannot be used.
+            InputError: a file cannot be used.
         """
-        if not self.response_file:
-            return {}
-        with about(node, f"{prefix}response_file"):
-            states = read_points(resources.find(Path(self.response_file)))
-        return {"coarse/command": [MeasuredDrive(*points, model) for points in states]}
+        modes, along = self._modes(), self.drift(node, prefix).states()[1:]
+        drifts = [DriftedDrive(drifted(modes.moved(each.modes)), each.gain, each.time) for each in along]
+        return {"coarse/command": [*self._measured(node, model, prefix), *drifts]}
+
+    def drift(self, node: str, prefix: str = "") -> Drift:
+        """Return the drift of a node; ``prefix`` precedes its parameters in a composed table.
+
+        Raises:
+            InputError: it cannot be, or the jitter of the sensor is not below a sample.
+        """
+        if self.sampling_jitter >= self.step:
+            raise InputError(
+                f"{node}.{prefix}sampling_jitter = {self.sampling_jitter:g} s; allowed: below a sample, {self.step:g} s"
+            )
+        with about(node, f"{prefix}gain_drift", f"{prefix}mode_drift", f"{prefix}drift_time"):
+            drift = Drift(self.gain_drift, self.mode_drift, self.drift_time)
+        if not self.mode_drift:
+            return drift
+        if not self.mode_frequency or not self._modes().normal:
+            raise InputError(
+                f"{node}.{prefix}mode_drift = {self.mode_drift:g} 1/s; allowed: 0, or with {prefix}mode_frequency, and "
+                f"without {prefix}mode_velocity and {prefix}lag_time"
+            )
+        highest, nyquist = max(self.mode_frequency) * drift.states()[-1].modes, math.pi / self.step
+        if highest >= nyquist:
+            raise InputError(
+                f"{node}.{prefix}mode_drift = {self.mode_drift:g} 1/s: a mode at {highest:g} rad/s; allowed: below "
+                f"half the sample rate, {nyquist:.6g} rad/s"
+            )
+        return drift
+
+    def jitter(self, whose: str) -> Sensor:
+        """Return the jitter of the sampling instants of a sensor, by its name."""
+        return Sensor(self.sampling_jitter, 0.0, self.seed, f"{whose}/jitter")
 
     def modes(self, node: str, prefix: str = "") -> Modes:
         """Return the modes and lags of a node; ``prefix`` precedes its parameters in a composed table.
@@ -119,12 +168,20 @@ class ElectrodynamicActuatorParameters(PlantParameters):
         return ModalDrive(self.natural_frequency, self.damping, self.delay, gain=self.gain, **lists)
 
 
+class Machine(NamedTuple):
+    """Drive, and the jitter of its sensor [s]."""
+
+    drive: CoarseTable
+    jitter: SensorTable
+
+
 @kernel
 def step(memory: PlantMemory, first: int, start: int, inputs: Fields, flags: Fields, outputs: Fields) -> Reached:
     """Move the drive through one block, within its limits."""
     command, (position, velocity, effort, measured_position) = inputs[0], outputs
-    given = limited(memory.limits, first, followed(memory.retraction, command))
-    advance(memory.plant, given, position, velocity, effort, measured_position)
+    given, machine = limited(memory.limits, first, followed(memory.retraction, command)), memory.plant
+    jitter = drawn(machine.jitter, command.size)
+    advance(machine.drive, first, given, jitter, position, velocity, effort, measured_position)
     measure(memory.sensor, measured_position, measured_position)
     return command.size, DONE
 
@@ -142,21 +199,23 @@ class ElectrodynamicActuator(SingleDrive):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
-        self.drive = made_of(
-            ElectrodynamicDrive, parameters, method=parameters.discretisation, modes=parameters.modes(name)
-        )
+        self._make = partial(made_of, ElectrodynamicDrive, parameters, method=parameters.discretisation)
+        self.drive = self._make(modes=parameters.modes(name), drift=parameters.drift(name))
         super().__init__(name, parameters)
+        self._sensors = [*self._sensors, parameters.jitter(name)]
         self._retraction = OwnRetraction(parameters, parameters.stroke, parameters.gain)
 
     @property
-    def machine(self) -> CoarseTable:
+    def machine(self) -> Machine:
         """Parameter and state table of the machine, used by the step."""
-        return self.drive.table
+        return Machine(self.drive.table, self._sensors[1].table)
 
     def responses(self) -> Mapping[str, Response]:
         """Response of the sensor's position to the command, by topic."""
         return {"coarse/command": self.drive.plant.response}
 
-    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
-        """Response of the sensor's position to the command as measured in each state, by topic."""
-        return self.parameters.measured(self.name, self.drive.plant.response)
+    def states(self) -> Mapping[str, Sequence[Response]]:
+        """Responses of the sensor's position to the command in states beside that of the start, by topic."""
+        return self.parameters.states(
+            self.name, self.drive.plant.response, lambda modes: self._make(modes=modes).plant.response
+        )

@@ -2,6 +2,7 @@
 """Tool drives under the cutting force: drives and cut as one stage, since they are coupled within a block."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from lathe_rc.plants.coil import Coil
 from lathe_rc.plants.tool_drive import ToolDrive
 from lathe_rc.plants.tool_motion import STOPS, MotionTable, advance_loaded, failure
 from lathe_rc.signals.allowance import AllowanceTable, allow
-from lathe_rc.signals.noise import SensorTable, measure
+from lathe_rc.signals.noise import SensorTable, drawn, measure
 from lathe_rc.stages.common.command_limits import Clipping, limited
 from lathe_rc.stages.common.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.stages.cut.cutting_process import READ, TURNS, CutStage, CuttingProcessParameters
@@ -165,6 +166,7 @@ class Memory(NamedTuple):
         signs: signs of the terms of the fine set point.
         drive, cut: the machine.
         noise, sensor: noise of the carriage sensor, which is quantised by the machine, and sensor of the piezo.
+        jitter: jitter of the sampling instants of the carriage sensor [s].
         allowance: machining allowance of the blank.
         force_sensor: sensor of the force.
         cross, longitudinal: number of the first input of each slide; -1 if it does not move the edge.
@@ -181,6 +183,7 @@ class Memory(NamedTuple):
     cut: CutTable
     noise: SensorTable
     sensor: SensorTable
+    jitter: SensorTable
     allowance: AllowanceTable
     force_sensor: SensorTable
     cross: int
@@ -216,7 +219,8 @@ def _advance(
     measure(memory.noise, still, noise)
     command = limited(memory.limits, first, followed(memory.retraction, command))
     set_point = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, _MORE, n))
-    given = (command, set_point, noise, met, angle, speed, height, cross_position, feed_velocity, allowance)
+    jitter = drawn(memory.jitter, n)
+    given = (command, set_point, noise, jitter, met, angle, speed, height, cross_position, feed_velocity, allowance)
     made = (force, deflection, depth_of_cut, feed, wear)
     reached, reason = advance_loaded(memory.drive, memory.cut, first, given, motion, made)
     if reason != DONE:
@@ -261,16 +265,17 @@ class LoadedDriveStage(CutStage, CoupledDrive):
             piezo = piezo_on_carriage(name, fine, parameters.mass_ratio, fine.preload or np.inf)
         self._equip(coarse, fine)
         with about(name, *(("coarse_loop", "coarse_bandwidth") if coil else ("mass_ratio",)), "sample_rate"):
-            self.drive = made_of(
+            make = partial(
+                made_of,
                 ToolDrive,
                 coarse,
                 method=parameters.discretisation,
                 radial=parameters.radial_ratio,
                 coil=coil,
                 piezo=piezo,
-                modes=coarse.modes(name, "coarse_"),
                 kept=messages.MAX_BLOCK if coil else 1,
             )
+            self._build(make, coarse)
         if coil:
             self._clippings = [Clipping(name, parameters, _COIL, self.drive.table.coil.limited)]
         inputs = [TURNS, _REFERENCE, Input("coarse/command", messages.COMMAND, ("position",))]
@@ -298,6 +303,7 @@ class LoadedDriveStage(CutStage, CoupledDrive):
             cut=self.cut.table,
             noise=self._sensors[0].table,
             sensor=self._sensors[1].table,
+            jitter=self._sensors[2].table,
             allowance=self._allowance.table,
             force_sensor=self._force_sensor.table,
             **self._slides,

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Piezo and tool on the coarse carriage: both drives as one stage, since they are coupled within a block."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ from pydantic import create_model
 
 from lathe_rc import messages
 from lathe_rc.analysis.learning import Response
-from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
@@ -20,7 +20,7 @@ from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.plants.tool_motion import MotionTable, advance
-from lathe_rc.signals.noise import Sensor, SensorTable, measure
+from lathe_rc.signals.noise import Sensor, SensorTable, drawn, measure
 from lathe_rc.stages.common.command_limits import LimitedCommand, limited
 from lathe_rc.stages.common.tables import ComposedParameters, made_of, prefixed
 from lathe_rc.stages.drive.drive import Drive, Limits, OwnRetraction, followed
@@ -74,6 +74,7 @@ class Memory(NamedTuple):
     drive: MotionTable
     noise: SensorTable
     sensor: SensorTable
+    jitter: SensorTable
 
 
 @kernel
@@ -84,7 +85,7 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
     measure(memory.noise, np.zeros(command.size), noise)
     given = limited(memory.limits, first, followed(memory.retraction, command))
     wanted = limited(memory.limits_fine, first, sum_up(memory.signs, inputs, 1, command.size))
-    advance(memory.drive, first, given, wanted, noise, outputs[:7])
+    advance(memory.drive, first, given, wanted, noise, drawn(memory.jitter, command.size), outputs[:7])
     measure(memory.sensor, outputs[4], outputs[7])
     return command.size, DONE
 
@@ -113,6 +114,12 @@ class CoupledDrive(Drive):
     _retraction: OwnRetraction
     _set_point: SetPoint | None = None  # of the piezo drive
     _coarse: ElectrodynamicActuatorParameters
+    _make: Callable[..., ToolDrive]
+
+    def _build(self, make: Callable[..., ToolDrive], coarse: ElectrodynamicActuatorParameters) -> None:
+        """Build the machine by a function of its modes and their drift."""
+        self._make = make
+        self.drive = make(modes=coarse.modes(self.name, "coarse_"), drift=coarse.drift(self.name, "coarse_"))
 
     def _equip(self, coarse: ElectrodynamicActuatorParameters, fine: PiezoActuatorParameters | None) -> None:
         """Set limits, retraction, commands and sensors from the tables of the drives."""
@@ -122,6 +129,7 @@ class CoupledDrive(Drive):
         self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor only adds noise.
         self._sensors = [Sensor(coarse.noise_rms, 0.0, seed, f"{name}/coarse"), Sensor(0.0, 0.0, seed, f"{name}/fine")]
+        self._sensors.append(coarse.jitter(f"{name}/coarse"))
         if fine:
             self._set_point = SetPoint(name, fine, inside=(COARSE,), prefix=FINE)
             self._commands.append(LimitedCommand(name, fine, "fine"))
@@ -132,9 +140,11 @@ class CoupledDrive(Drive):
         coarse = {"coarse/command": self.drive.coarse_response}
         return {**coarse, "fine/command": self.drive.fine_response} if self._set_point else coarse
 
-    def measured(self) -> Mapping[str, Sequence[MeasuredDrive]]:
-        """Response of the carriage to its command as measured in each state."""
-        return self._coarse.measured(self.name, self.drive.coarse_response, "coarse_")
+    def states(self) -> Mapping[str, Sequence[Response]]:
+        """Responses of the carriage to its command in states beside that of the start."""
+        return self._coarse.states(
+            self.name, self.drive.coarse_response, lambda modes: self._make(modes=modes).coarse_response, "coarse_"
+        )
 
 
 class SeriesDriveStage(CoupledDrive):
@@ -151,8 +161,7 @@ class SeriesDriveStage(CoupledDrive):
         coarse, fine = parameters.coarse, parameters.fine
         piezo = piezo_on_carriage(name, fine, parameters.mass_ratio)
         with about(name, "mass_ratio", "sample_rate"):
-            method, modes = parameters.discretisation, coarse.modes(name, "coarse_")
-            self.drive = made_of(ToolDrive, coarse, method=method, piezo=piezo, modes=modes)
+            self._build(partial(made_of, ToolDrive, coarse, method=parameters.discretisation, piezo=piezo), coarse)
         self._equip(coarse, fine)
         self.declare(
             inputs=[Input("coarse/command", messages.COMMAND, ("position",)), *self._set_point.inputs],

@@ -241,7 +241,7 @@ class Learner(Obedient):
         cell.warnings += self.encoder_warnings(low, high, encoder.counts_per_revolution, encoder.edge_resolution)
 
     def learned(self, stages: Iterable[Stage]) -> list[tuple[Response, Drive]]:
-        """Return the commanded drives and their responses: of a measured drive, the model and that of each state."""
+        """Return the commanded drives and their responses: that of the model, and those of further states."""
         commands = {remapped(self.shared, output.topic) for output in self.outputs}
         found: list[tuple[Response, Drive]] = []
         for drive in stages:
@@ -250,7 +250,7 @@ class Learner(Obedient):
             for topic, model in drive.responses().items():
                 if remapped(drive.shared, topic) in commands and any(port.topic == topic for port in drive.inputs):
                     found.append((model, drive))
-                    found += [(measured, drive) for measured in drive.measured().get(topic, ())]
+                    found += [(state, drive) for state in drive.states().get(topic, ())]
         return found
 
     def checked_loop(self, cell: WiredCell) -> "Loop":
@@ -297,7 +297,7 @@ class Learner(Obedient):
         cell.loops.setdefault(self.name, []).append(loop)
         for response, drive in learned:
             self._check_reach(drive)
-            name = f"{drive.name} as measured" if isinstance(response, MeasuredDrive) else drive.name
+            name = f"{drive.name} {getattr(response, 'state', '')}".rstrip()
             told = [(worst, speed) for speed in dict.fromkeys(speeds) if (worst := self.worst(response, speed))]
             if broken := next(((worst, speed) for worst, speed in told if math.isnan(worst[0])), None):
                 (_, waves), speed = broken

@@ -2,10 +2,11 @@
 """Tool and part: desired form, displacement, form error."""
 
 from collections.abc import Mapping
+from itertools import repeat
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le, MinLen
+from annotated_types import Ge, Gt, Le, MinLen
 
 from lathe_rc import messages
 from lathe_rc.arrays import put
@@ -16,10 +17,16 @@ from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
+from lathe_rc.signals.error_motion import add_motion
 from lathe_rc.signals.profile_table import Demand
 from lathe_rc.signals.tip_path import steepest_fall
+from lathe_rc.signals.zones import Zone
 from lathe_rc.stages.drive.drive import Drive, Limits
 from lathe_rc.stages.tool.form import Form, FormParameters, FormTable, ProfileStage, evaluate
+
+_TURN = 2.0 * np.pi
+_ZONE = ("zone_start", "zone_width", "zone_tolerance", "zone_bottom", "zone_top")
+_MOTION = ("error_motion_order", "error_motion_amplitude", "error_motion_phase")
 
 
 class ToolParameters(FormParameters):
@@ -46,11 +53,46 @@ class ToolParameters(FormParameters):
         "deflects: delay of the feedback edge from the cut, at least a block; 0 where the cut does not read the tool",
         "sample",
     )
+    error_motion_order: list[Annotated[int, Ge(2), Le(2000)]] = parameter(
+        [], "error motion of the spindle against the tool, which no sensor sees: waves per revolution"
+    )
+    error_motion_amplitude: list[float] = parameter([], "their amplitudes, positive towards the tool", "m")
+    error_motion_phase: list[float] = parameter([], "their phases at angle 0; empty: all 0", "rad")
     tolerance: NonNegative = parameter(
         0.0, "form error that is allowed to each side, for the verdict on a run; 0: none is given", "m"
     )
+    zone_start: list[float] = parameter([], "zones with tolerances of their own: angle where each begins", "rad")
+    zone_width: list[Annotated[float, Gt(0), Le(_TURN)]] = parameter([], "their widths", "rad")
+    zone_tolerance: list[NonNegative] = parameter(
+        [], "form error that is allowed in each, the first of several at a place; 0: not judged", "m"
+    )
+    zone_bottom: list[float] = parameter([], "height along the part where each begins; empty: every height", "m")
+    zone_top: list[float] = parameter([], "height where each ends", "m")
 
-    judging = frozenset({"tolerance"})
+    judging = frozenset({"tolerance", *_ZONE})
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Reject zones and error motions whose lists do not fit together, and zones without a tolerance elsewhere."""
+        super().model_post_init(context)
+        for names in (_ZONE[:3], _ZONE[3:], _MOTION[:2]):
+            lengths = [len(getattr(self, name)) for name in names]
+            if len(set(lengths)) > 1:
+                raise InputError(f"{', '.join(names)}: lengths {lengths}; allowed: as many of each")
+        for name, of in ((_ZONE[3], _ZONE[0]), (_MOTION[2], _MOTION[0])):
+            if getattr(self, name) and len(getattr(self, name)) != len(getattr(self, of)):
+                raise InputError(f"{name}: {len(getattr(self, name))} values; allowed: none, or as many as of {of}")
+        for bottom, top in zip(self.zone_bottom, self.zone_top, strict=True):
+            if not top > bottom:
+                raise InputError(f"zone_top = {top:g} m with zone_bottom = {bottom:g} m; allowed: above it")
+        if self.zone_start and not self.tolerance:
+            raise InputError("tolerance = 0 with zones; allowed: above 0, for the surface outside of them")
+
+    @property
+    def zones(self) -> tuple[Zone, ...]:
+        """Zones with tolerances of their own."""
+        found = zip(self.zone_start, self.zone_width, self.zone_tolerance, strict=True)
+        heights = zip(self.zone_bottom, self.zone_top, strict=True) if self.zone_bottom else repeat((0.0, 0.0))
+        return tuple(Zone(*of, *span) for of, span in zip(found, heights, strict=False))
 
     def known(self) -> Mapping[str, Value]:
         """Form of the part for control laws, unless a profile node provides it."""
@@ -58,7 +100,7 @@ class ToolParameters(FormParameters):
 
     def judged(self) -> Judged:
         """Form error of the tool."""
-        return Judged(remapped(self, "tool"), "form", self.step, self.tolerance, self.nose_radius)
+        return Judged(remapped(self, "tool"), "form", self.step, self.tolerance, self.nose_radius, zones=self.zones)
 
     def shown(self) -> Mapping[str, Any]:
         """Part, tolerance and feed of the tool."""
@@ -79,6 +121,8 @@ class Memory(NamedTuple):
         begin: index of the first input of the drives.
         drives: number of drives, each with a true and a measured position.
         cross_slide, deflects: whether inputs of the cross slide and the edge's deflection follow those of the drives.
+        error_motion: waves, amplitudes and phases of the spindle's error motion, shape (3, n); the true angle is the
+            last input if there are any.
     """
 
     form: FormTable
@@ -86,6 +130,7 @@ class Memory(NamedTuple):
     drives: int
     cross_slide: bool
     deflects: bool
+    error_motion: Samples
 
 
 @kernel
@@ -133,6 +178,9 @@ def step(memory: Memory, first: int, start: int, inputs: Fields, flags: Fields, 
         deflection = inputs[place]
         for k in range(error.size):
             error[k] -= deflection[k]
+        place += 1
+    if memory.error_motion.shape[1]:
+        add_motion(memory.error_motion, inputs[place], error)
     return error.size, DONE
 
 
@@ -176,6 +224,11 @@ class Tool(Stage):
             inputs.append(Input("cross/state", messages.STATE, ("position",)))
         if parameters.deflects:
             inputs.append(Input("cut", messages.CUT, ("deflection",), parameters.deflection_delay))
+        orders = parameters.error_motion_order
+        phases = parameters.error_motion_phase or [0.0] * len(orders)
+        self._error_motion = np.array([orders, parameters.error_motion_amplitude, phases], dtype=float).reshape(3, -1)
+        if orders:
+            inputs.append(Input("encoder", messages.ENCODER, ("angle_true",)))
         self.declare(inputs=inputs, outputs=[Output("tool", messages.TOOL, Joint("displacement"))])
 
     def warnings(self, seconds: float) -> list[str]:
@@ -218,7 +271,8 @@ class Tool(Stage):
         form = self.form.table if self.form else _ELSEWHERE
         # Each input of a form has two fields; that of a profile node has three.
         begin = 3 if self.form is None else 2 * len(self.form.inputs)
-        return Memory(form, begin, len(parameters.drives), parameters.cross_slide, parameters.deflects)
+        drives = len(parameters.drives)
+        return Memory(form, begin, drives, parameters.cross_slide, parameters.deflects, self._error_motion)
 
 
 def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed: float) -> None:
