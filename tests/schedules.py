@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from simulation import RESTART_TIME, SIZE, SPOILED, STEP_NS, Design, Member, Simulation, safe_value
+from simulation import RESTART_TIME, SIZE, STEP_NS, Design, Member, Simulation, safe_value
 
 from lathe_rc import messages
 from lathe_rc.blocks.wire import Encoder
@@ -62,11 +62,13 @@ class Schedule:
         groups = draw_groups(draw, designs)
         loops = any(delay for design in designs for _, delay in design.inputs)  # a lost block would stop a loop
         free = {"block_time": 0.005, "loses": draw.choice((0.0, 0.02)) * (not loops)} if not window else {}
+        free |= {"devices": draw.random() < 0.5} if not window else {}
         drawn: dict[str, Any] = {
             "block_time": draw.choice((0.0, 0.0, 0.0, 0.002, 0.01)),
             "groups": groups,
             "away": draw.sample(range(len(groups)), draw.choice((0, 0, 0, min(1, len(groups) - 1)))),
             "rest": draw.choice((0, 0, 1, 3)),
+            "encodes": draw.random() < 0.3,
             "safe_samples": draw.choice((3 * SIZE, SIZE, 3 * SIZE + 1)),
         } | free
         stalls = draw.choice(("wait", "wait", "safe"))
@@ -146,7 +148,7 @@ class Schedule:
         if member and not held and self._running():
             self._blame(member)
             self.cell.spoiled = True
-            member.spoils = list(SPOILED)[int(seconds * 1e6) % len(SPOILED)]
+            member.spoils = 1 + int(seconds * 1e6)
 
     def _dawdle(self, design: Design, seconds: float, other: Design) -> None:
         """Let the begin of the safe state take its time: the cell has to wait for it."""

@@ -58,6 +58,8 @@ SPOILED = {  #: what may be wrong with a block
     "stamp": lambda block: replace(block, log_ns=block.log_ns + 1),
     "last": lambda block: replace(block, last=not block.last),
     "another source": lambda block: replace(block, source="/ghost"),
+    "number": lambda block: replace(block, signals={"position": np.full(SIZE, np.nan)}),  # in bytes alone
+    "no block": lambda block: replace(block, samples=0),  # in bytes alone
 }
 
 
@@ -134,7 +136,7 @@ class Network:
 
     def _send(self, writer: str, reader: str, topic: str, message: object) -> None:
         cell, channel = self._cell, (writer, reader, topic)
-        inner = isinstance(message, Block) and message.first_index > cell.first and not message.last
+        inner = isinstance(message, Block) and not message.last and (message.first_index > cell.first or cell.devices)
         if inner and cell.loses and cell.random.random() < cell.loses:
             return
         begin = max(cell.now, self._cut.get(frozenset((writer, reader)), 0.0))
@@ -277,7 +279,7 @@ class Member(MemberHost):
         self.full_name, self.exchange = design.name, process.exchange
         self.identity = f"{design.name} {process.pid}"
         self.dawdles = 0.0  # time that the begin of the safe state takes [s]
-        self.spoils = ""  # what is wrong with the next block
+        self.spoils = 0  # place of what is wrong with the next block; 0: nothing is
         self.strangers = 0
         self.namesake = False  # a second node with this name
         self.configure()
@@ -286,7 +288,9 @@ class Member(MemberHost):
         """Reset the node to the state before the first activation, and configure it."""
         self._forget()
         cell, design = self.cell, self.design
-        self.table = table_of(cell.run_id, cell.window).model_copy(update={"restart_file": "x" * design.restarts})
+        devices = [each.name for each in cell.designs] if cell.devices else []
+        update = {"restart_file": "x" * design.restarts, "volatile_inputs": devices}
+        self.table = table_of(cell.run_id, cell.window).model_copy(update=update)
         self.callbacks: dict[str, list[Callable[[Any, str], None]]] = defaultdict(list)  # by topic
         is_master = design.name == cell.master
         self.role = (Spindle if is_master else Recorder if design.records else Stage)(self)
@@ -343,7 +347,8 @@ class Member(MemberHost):
             self.exchange.listen(queue.topic, self.full_name, self.guarded(self.in_turn(queue.take)))
             return
         self.inlets[queue.topic] = queue
-        self.subscribe(queue.topic, self.in_turn(queue.accept))
+        take = self.in_turn(lambda data, sender: (queue.add if isinstance(data, bytes) else queue.accept)(data, sender))
+        self.subscribe(queue.topic, take)
         self.cell.discover(self)
 
     def take(self, topic: str, message: object, sender: str) -> None:
@@ -496,10 +501,22 @@ class Stage(StageRun):
             signals = {"position": np.repeat(np.array(self.values[begin:], float), SIZE)[:samples]}
             run = Run(self._encoder.block(first, signals, None, last=last, companions=0), [0] * count)
             for block in run.blocks(SIZE):
-                spoiled, node.spoils = SPOILED.get(node.spoils), ""
-                self.sim.network.publish(node.identity, self.name, spoiled(block) if spoiled else block)
+                spoils, node.spoils = node.spoils, 0
+                self.sim.network.publish(node.identity, self.name, self._message(block, spoils))
             node.exchange.hand_over(self.name, run)
         self.computed(count, samples, last=last)
+
+    def _message(self, block: Block, spoils: int) -> Block | bytes:
+        """Return a block as it is published: spoiled if that is wanted, and in bytes if the cell encodes."""
+        encodes = self.sim.encodes and self.name != self.sim.master
+        faults = list(SPOILED.values())[: None if encodes else -2]
+        block = faults[spoils % len(faults)](block) if spoils else block
+        if not encodes:
+            return block
+        encoder = Encoder(messages.COMMAND, block.run_id, block.source, block.step_ns)
+        signals = {name: array[: block.samples] for name, array in block.signals.items()}
+        first, last = abs(block.first_index), block.last  # no message has negative ones
+        return encoder.encode(first, signals, last=last, companions=0)[1] if block.samples else bytes(7)
 
     @property
     def held(self) -> dict[str, int]:
@@ -570,6 +587,8 @@ class Simulation:
         away: places of the processes in ``groups`` that run on a second machine.
         block_time: wall time per block [s]; 0: no pace.
         loses: fraction of the blocks that are lost, in a free-running cell.
+        devices: its members read devices that keep no messages, so that the first blocks may be lost.
+        encodes: members publish bytes.
         rest: number of samples that the last block lacks.
         safe_samples: length of the safe state.
     """
@@ -586,6 +605,8 @@ class Simulation:
         away: Sequence[int] = (),
         block_time: float = 0.0,
         loses: float = 0.0,
+        devices: bool = False,
+        encodes: bool = False,
         rest: int = 0,
         safe_samples: int = 3 * SIZE,
     ) -> None:
@@ -594,6 +615,7 @@ class Simulation:
         self.designs, self.window, self.length, self.stalls = designs, window, length, stalls
         self.groups = groups or [(design,) for design in designs]
         self.away, self.block_time, self.loses, self.safe_samples = away, block_time, loses, safe_samples
+        self.devices, self.encodes = devices, encodes
         self.end = self.first + length * SIZE - rest
         self.master, self.run_id = designs[0].name, "run"
         self.now = 0.0

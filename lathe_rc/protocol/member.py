@@ -486,6 +486,8 @@ class MemberProtocol:
             self._leave_with_the_cell()
         elif self.phase == Phase.ENDED and self.over and not self.done:
             self.leave()
+        elif self.phase == Phase.ENDED and not self.ready:
+            self.fail(LatheError(f"{self.own.name}: the run has ended without it"), cause="abandoned")
         elif self.phase == Phase.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
         elif self.phase == Phase.SAFE:
