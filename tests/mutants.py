@@ -17,6 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
+
 PROTOCOL = Path(__file__).parents[1] / "lathe_rc" / "protocol"
 LONGEST = 2.0  # [s] of computing time for one schedule, after which it hangs
 _OTHER = {
@@ -123,8 +125,8 @@ def _hangs(*_: object) -> None:
 
 
 def find(mutant: Mutant, schedules: int) -> str:
-    """Return the first schedule that finds a mutant, and the broken promise; empty if none does."""
-    ours = ("schedules", "simulation", "lathe_rc.protocol")
+    """Return what finds a mutant: the first schedule, with the broken promise, or else a rule; empty if none does."""
+    ours = ("schedules", "simulation", "test_protocol", "lathe_rc.protocol")
     for name in [name for name in sys.modules if name.startswith(ours)]:
         del sys.modules[name]
     sys.meta_path.insert(0, finder := _Finder(mutant))
@@ -135,12 +137,15 @@ def find(mutant: Mutant, schedules: int) -> str:
             signal.setitimer(signal.ITIMER_VIRTUAL, LONGEST)
             if broken := fresh.play(seed)[1]:
                 return f"schedule {seed}: {broken[0]}"
+        signal.setitimer(signal.ITIMER_VIRTUAL, 30.0 * LONGEST)
+        rules = str(Path(__file__).with_name("test_protocol.py"))
+        passes = pytest.main(["-qx", "-n0", "-pno:cacheprovider", "-knot random_schedules", rules]) == 0
     except Exception as error:  # noqa: BLE001 - that is found as well
         return repr(error)
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         sys.meta_path.remove(finder)
-    return ""
+    return "" if passes else "a rule of test_protocol.py"
 
 
 def tried(seed: int, count: int, schedules: int, processes: int = 1) -> Iterator[tuple[str, str]]:
@@ -149,17 +154,6 @@ def tried(seed: int, count: int, schedules: int, processes: int = 1) -> Iterator
     with ProcessPoolExecutor(processes) as pool:
         found = pool.map(partial(find, schedules=schedules), mutants)
         yield from zip((mutant.name for mutant in mutants), found, strict=True)
-
-
-def judged() -> dict[str, str]:
-    """Return why no schedule finds a mutant, by its name; in the file, the names follow their reason, indented."""
-    reasons, reason = dict[str, str](), ""
-    for line in Path(__file__).with_name("mutants.txt").read_text(encoding="utf-8").splitlines():
-        if line.startswith("    "):
-            reasons[line.strip()] = reason
-        elif line:
-            reason = line
-    return reasons
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from lathe_rc import messages
 from lathe_rc.blocks.wire import Encoder
 from lathe_rc.protocol import Announcement, CellState, Progress, TimeMasterProtocol
 
-PATIENCE = 20.0  # [s] after which an operator ends a cell that waits for a dead machine
+PATIENCE = 30.0  # [s] after which an operator ends a cell that waits for a dead machine
 
 
 def draw_designs(draw: random.Random) -> tuple[Design, ...]:
@@ -79,6 +79,8 @@ class Schedule:
         cell.plan.append(f"{'; '.join(map(str, designs))}; {drawn}")
         for group in groups:
             cell.at(draw.choice((0.0, 0.02, 0.3)) * draw.random(), partial(cell.start, *group))
+        if cell.away:
+            cell.at(PATIENCE, self._lose_patience)
         kinds = (*self._HARMLESS, *self._HARMFUL)
         for kind in draw.choices(kinds, k=draw.choice((0, 1, 1, 1, 2, 3))):
             design = draw.choice(designs)
@@ -223,6 +225,8 @@ class Schedule:
             member.take("cell_state", CellState("run", 3, 0, "of another start", session=7), self.cell.master)
             member.take("progress", Progress("run", other.name, 10**6, 10**7), "/ghost")
             member.take("progress", Progress("run", other.name, 10**6, 10**7, 7), other.name)
+            member.take(other.name, bytes(7), "/ghost")
+            member.take(other.name, bytes(7), "")
             for source, sender in (("/ghost", "/ghost"), (other.name, "/ghost")):
                 zeros = {"position": np.zeros(SIZE)}
                 encoder = Encoder(messages.COMMAND, "run", source, STEP_NS)
@@ -244,15 +248,15 @@ class Schedule:
             self._bring_back(member, seconds)
 
     def _bring_back(self, member: Member, seconds: float) -> None:
-        """Restart members: the harness, if the member can resume; an operator, any member before the run.
-
-        If a cell waits for a machine that does not answer, an operator ends it.
-        """
+        """Restart members: the harness, if the member can resume; an operator, any member before the run."""
         if member.design.restarts or not self._running():
             group = tuple(each.design for each in member.process.members)
             self.cell.at(self.cell.now + min(seconds, 0.5), partial(self._relaunch, group))
-        elif self.cell.away:
-            self.cell.at(self.cell.now + PATIENCE, self._ctrl_c)
+
+    def _lose_patience(self) -> None:
+        """End a cell that waits for a machine that does not answer, as an operator does."""
+        if self.cell.culprits or self.cell.killed:
+            self._ctrl_c()
 
     def _ctrl_c(self) -> None:
         """End all processes, the slow ones by a second signal."""
@@ -280,7 +284,7 @@ class Schedule:
             for each in member.process.members:
                 each.attempt(each.protocol.interrupt, "SIGTERM")
             self.cell.leave(member.process)
-            if not (self._running() and member.design.restarts):
+            if not self._running():
                 self._bring_back(member, seconds)
 
     def _shutdown(self, design: Design, seconds: float, other: Design) -> None:

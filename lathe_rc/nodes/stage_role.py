@@ -138,10 +138,7 @@ class StageRole(StageRun, Role):
     def tick(self, now: float) -> float:
         """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
-        queues = self.inputs.queues.values()
-        for queue in queues:
-            queue.end_with(queues, now)
-            self.node.due = self.node.due or queue.lossy
+        self.hold_quiet_inputs(now)
         return float("inf")
 
     def statistics(self) -> dict[str, object]:

@@ -484,14 +484,18 @@ class MemberProtocol:
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
         if self.failure:
             self._leave_with_the_cell()
-        elif self.phase == Phase.ENDED and self.over and not self.done:
-            self.leave()
-        elif self.phase == Phase.ENDED and not self.ready:
-            self.fail(LatheError(f"{self.own.name}: the run has ended without it"), cause="abandoned")
+        elif self.phase == Phase.ENDED:
+            self._leave_after_the_end()
         elif self.phase == Phase.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
         elif self.phase == Phase.SAFE:
             self.go_safe(state)
+
+    def _leave_after_the_end(self) -> None:
+        if self.over and not self.done:
+            self.leave()
+        elif not self.ready:
+            self.fail(LatheError(f"{self.own.name}: the run has ended without it"), cause="abandoned")
 
     def _hear_end(self, state: CellState) -> None:
         """Take the end of the run: the planned one, or one that has come nearer."""

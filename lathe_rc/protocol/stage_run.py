@@ -169,6 +169,13 @@ class StageRun(Work):
         """Return the largest number of blocks for one step: the step ends where the state has to be kept."""
         return self.together if self.restart is None else max(min(self.together, self.restart.keep_at - self.blocks), 1)
 
+    def hold_quiet_inputs(self, now: float) -> None:
+        """Hold inputs from devices that have lost the last block."""
+        queues = self.inputs.queues.values()
+        for queue in queues:
+            queue.end_with(queues, now)
+            self.node.due = self.node.due or queue.lossy
+
     def start(self, first: int) -> None:
         """Begin the computation at sample ``first``."""
         self.started, self.samples = True, first
