@@ -133,7 +133,7 @@ class Schedule:
     def _stop(self, design: Design, seconds: float, other: Design) -> None:
         if member := self._member(design):
             self.cell.stop(member, seconds)
-            if self.cell.stalls == "safe" and seconds > 0.3:
+            if (self.cell.stalls == "safe" or self.cell.devices) and seconds > 0.3:  # a quiet device counts as lost
                 self._blame(member)
 
     def _freeze(self, design: Design, seconds: float, other: Design) -> None:
@@ -161,7 +161,7 @@ class Schedule:
         one, another = self._member(design), self._member(other)
         if one and another and one.process is not another.process:
             self.cell.network.cut(one.identity, another.identity, self.cell.now + seconds)
-            if self.cell.stalls == "safe" and seconds > 0.3:
+            if (self.cell.stalls == "safe" or self.cell.devices) and seconds > 0.3:
                 self._blame(*self.cell.members.values())  # all wait for each other, and the first of them is lost
 
     def _slow(self, design: Design, seconds: float, other: Design) -> None:
@@ -239,6 +239,7 @@ class Schedule:
         if (member := self._member(design)) and self._running() and not other_master:
             if not design.restarts:  # it may compute what it receives before it hears of the cell
                 self._blame(member)
+                self.cell.spoiled = True
             self.cell.start(design).namesake = True
 
     def _kill(self, design: Design, seconds: float, other: Design) -> None:
