@@ -235,7 +235,7 @@ class Schedule:
 
     def _namesake(self, design: Design, seconds: float, other: Design) -> None:
         """Start a second node with a member's name."""
-        other_master = design.name == self.cell.master and self.cell.away  # members that wait cannot tell it apart
+        other_master = design.name == self.cell.master and self.cell.away  # members that wait would follow it
         if (member := self._member(design)) and self._running() and not other_master:
             if not design.restarts:  # it may compute what it receives before it hears of the cell
                 self._blame(member)
