@@ -13,10 +13,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from simulation import RESTART_TIME, SIZE, STEP_NS, Design, Member, Simulation, safe_value
+from simulation import RESTART_TIME, SIZE, STEP_NS, Design, Member, Simulation, encoder_of, safe_value
 
-from lathe_rc import messages
-from lathe_rc.blocks.wire import Encoder
 from lathe_rc.protocol import Announcement, CellState, Progress, TimeMasterProtocol
 
 PATIENCE = 30.0  # [s] after which an operator ends a cell that waits for a dead machine
@@ -229,8 +227,7 @@ class Schedule:
             member.take(other.name, bytes(7), "")
             for source, sender in (("/ghost", "/ghost"), (other.name, "/ghost")):
                 zeros = {"position": np.zeros(SIZE)}
-                encoder = Encoder(messages.COMMAND, "run", source, STEP_NS)
-                block = encoder.block(self.cell.first, zeros, None, last=False, companions=0)
+                block = encoder_of("run", source, STEP_NS).block(self.cell.first, zeros, None, last=False, companions=0)
                 member.take(other.name, block, sender)
 
     def _namesake(self, design: Design, seconds: float, other: Design) -> None:

@@ -73,6 +73,12 @@ def table_of(run_id: str, window: int) -> ToolParameters:
     return ToolParameters(run_id=run_id, window=window, block_size=SIZE)
 
 
+@cache
+def encoder_of(run_id: str, source: str, step_ns: int) -> Encoder:
+    """Return the encoder of a member's blocks."""
+    return Encoder(messages.COMMAND, run_id, source, step_ns)
+
+
 def mixed(*parts: object) -> int:
     """Return a number that depends on all parts, and that a sample can hold."""
     return hash(parts) & (2**52 - 1)
@@ -286,6 +292,7 @@ class Member(MemberHost):
     def configure(self) -> None:
         """Reset the node to the state before the first activation, and configure it."""
         self._forget()
+        self.announced = False  # to the other members
         cell, design = self.cell, self.design
         devices = [each.name for each in cell.designs[1:]] if cell.devices else []
         update = {"restart_file": "x" * design.restarts, "volatile_inputs": devices}
@@ -328,6 +335,7 @@ class Member(MemberHost):
             self.subscribe("members", self.hear_member)
             self.subscribe("cell_state", self.hear_cell_state, always=True)
             self.role.activate()
+            self.announced = True
             self.cell.discover(self)
         super().activate()
 
@@ -348,7 +356,8 @@ class Member(MemberHost):
         self.inlets[queue.topic] = queue
         take = self.in_turn(lambda data, sender: (queue.add if isinstance(data, bytes) else queue.accept)(data, sender))
         self.subscribe(queue.topic, take)
-        self.cell.discover(self)
+        if self.announced:  # a late subscription
+            self.cell.discover(self)
 
     def take(self, topic: str, message: object, sender: str) -> None:
         """Receive a message of a node."""
@@ -433,7 +442,7 @@ class Stage(StageRun):
         self.together = node.cell.random.choice((1, max(node.table.window // 2, 1)))
         ports = [(name, Input(name, messages.COMMAND, ("position",), delay * SIZE)) for name, delay in design.inputs]
         self.inputs = Inputs(ports, node.table, self.together)
-        self._encoder = Encoder(messages.COMMAND, node.cell.run_id, design.name, STEP_NS)
+        self._encoder = encoder_of(node.cell.run_id, design.name, STEP_NS)
         self.values: list[int] = []
         self.heard: dict[str, list[int]] = {name: [] for name, _ in design.inputs}  # values of the blocks read
         self.safe_from: int | None = None  # index of the first block in the safe state
@@ -513,7 +522,7 @@ class Stage(StageRun):
         block = faults[spoils % len(faults)](block) if spoils else block
         if not encodes:
             return block
-        encoder = Encoder(messages.COMMAND, block.run_id, block.source, block.step_ns)
+        encoder = encoder_of(block.run_id, block.source, block.step_ns)
         signals = {name: array[: block.samples] for name, array in block.signals.items()}
         first, last = abs(block.first_index), block.last  # no message has negative ones
         return encoder.encode(first, signals, last=last, companions=0)[1] if block.samples else bytes(7)
