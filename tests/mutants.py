@@ -35,28 +35,27 @@ class Mutant(NamedTuple):
     name: str
 
 
-def _changes(node: Any) -> Iterator[tuple[ast.AST, ast.AST, ast.AST]]:
-    """Yield what may be changed in a node: a part of it that is replaced, and by what; and the part to be shown."""
+def _changes(node: Any) -> Iterator[tuple[ast.AST, ast.AST]]:
+    """Yield what may be changed in a node: a part of it, and what replaces it."""
     match node:
         case ast.Compare(ops=[op]) if type(op) in _OTHER:
-            yield node, ast.Compare(node.left, [_OTHER[type(op)]()], node.comparators), node  # ops are shared
+            yield node, ast.Compare(node.left, [_OTHER[type(op)]()], node.comparators)  # ops are shared
         case ast.Constant(value=bool(value)):
-            yield node, ast.Constant(not value), node
+            yield node, ast.Constant(not value)
         case ast.Constant(value=int() | float()):
-            yield node, ast.Constant(node.value + 1), node
+            yield node, ast.Constant(node.value + 1)
         case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
-            yield test, ast.UnaryOp(ast.Not(), test), test
-            yield test, ast.Constant(value=isinstance(node, ast.If)), test
+            yield test, ast.UnaryOp(ast.Not(), test)
+            yield test, ast.Constant(value=isinstance(node, ast.If))
         case ast.BoolOp(values=values):
             for value in values:
-                neutral = ast.Constant(isinstance(node.op, ast.And))
-                yield value, neutral, node
+                yield value, ast.Constant(isinstance(node.op, ast.And))
         case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.BitOr()):
-            yield node, left, node
+            yield node, left
         case ast.Name(id="min" | "max" as name):
-            yield node, ast.Name("min" if name == "max" else "max", ast.Load()), node
+            yield node, ast.Name("min" if name == "max" else "max", ast.Load())
         case ast.Expr(value=ast.Call(func=ast.Attribute(attr=called))) if called != "_log":
-            yield node, ast.Pass(), node
+            yield node, ast.Pass()
 
 
 class _Swap(ast.NodeTransformer):
@@ -69,8 +68,9 @@ class _Swap(ast.NodeTransformer):
         return self._new if node is self._old else self.generic_visit(node)
 
 
-def _sites(tree: ast.Module) -> list[tuple[str, ast.AST, ast.AST, ast.AST]]:
-    """Return what may be changed, with its function: not annotations, and not the words of errors and log lines."""
+def _sites(module: str) -> tuple[ast.Module, list[tuple[str, ast.AST, ast.AST]]]:
+    """Return a module's tree, and what may be changed in it, with a name: not annotations, nor the words of errors."""
+    tree = ast.parse((PROTOCOL / f"{module}.py").read_text(encoding="utf-8"))
     skipped = set[int]()
     for node in ast.walk(tree):
         wordy = isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr) or (
@@ -79,31 +79,31 @@ def _sites(tree: ast.Module) -> list[tuple[str, ast.AST, ast.AST, ast.AST]]:
         skip = node if wordy else node.annotation if isinstance(node, ast.AnnAssign) else None
         skipped |= {id(part) for part in ast.walk(skip)} if skip else set()
     bodies = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    within = {part: body.name for body in bodies for statement in body.body for part in ast.walk(statement)}
+    within = {  # the innermost statement of each part
+        part: f"{module}.{body.name}, {ast.unparse(each).splitlines()[0].rstrip(':')}"
+        for body in bodies
+        for each in ast.walk(body)
+        if isinstance(each, ast.stmt) and not isinstance(each, ast.FunctionDef)
+        for part in ast.walk(each)
+    }
     parts = [(name, part) for part, name in within.items() if id(part) not in skipped]
-    return [(name, *change) for name, part in parts for change in _changes(part)]
+    changes = [(name, old, new) for name, part in parts for old, new in _changes(part)]
+    return tree, [(f"{name}: {ast.unparse(old)} -> {ast.unparse(new)}", old, new) for name, old, new in changes]
 
 
-def _tree(module: str) -> ast.Module:
-    return ast.parse((PROTOCOL / f"{module}.py").read_text(encoding="utf-8"))
-
-
-def mutated(module: str, number: int) -> tuple[ast.Module, str]:
-    """Return the tree of a module with one change, and the name of the change."""
-    tree = _tree(module)
-    function, old, new, shown = _sites(tree)[number]
-    before = ast.unparse(shown)
-    _Swap(old, new).visit(tree)
-    after = ast.unparse(ast.fix_missing_locations(ast.copy_location(new, shown)) if shown is old else shown)
-    return ast.fix_missing_locations(tree), f"{module}.{function}: {before} -> {after}"
+def mutated(module: str, number: int) -> ast.Module:
+    """Return the tree of a module with one change."""
+    tree, sites = _sites(module)
+    _, old, new = sites[number]
+    return ast.fix_missing_locations(_Swap(old, new).visit(tree))
 
 
 def drawn(seed: int, count: int) -> list[Mutant]:
     """Draw mutants of all modules of the protocol; fewer are the first of more."""
     modules = sorted(path.stem for path in PROTOCOL.glob("*.py"))
-    places = [(module, number) for module in modules for number in range(len(_sites(_tree(module))))]
-    random.Random(f"mutants {seed}").shuffle(places)  # noqa: S311 - the same each time
-    return [Mutant(*place, mutated(*place)[1]) for place in places[:count]]
+    found = [Mutant(module, place, name) for module in modules for place, (name, *_) in enumerate(_sites(module)[1])]
+    random.Random(f"mutants {seed}").shuffle(found)  # noqa: S311 - the same each time
+    return found[:count]
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -116,7 +116,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.util.spec_from_loader(name, self) if name == self._name else None
 
     def exec_module(self, module: Any) -> None:
-        tree = mutated(self._mutant.module, self._mutant.number)[0]
+        tree = mutated(self._mutant.module, self._mutant.number)
         exec(compile(tree, str(PROTOCOL / f"{self._mutant.module}.py"), "exec"), vars(module))  # noqa: S102 - our own
 
 
