@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The protocol under many schedules, and mutants of it that the schedules find."""
 
+import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -41,6 +42,6 @@ def _judged() -> dict[str, str]:
 @pytest.mark.timeout(0)
 def test_each_mutant_of_the_protocol_is_found_or_judged():
     """A promise that no fault can break would prove nothing."""
-    judged, tried = _judged(), mutants.tried(1, MUTANTS, WITHIN)
+    judged, tried = _judged(), mutants.tried(1, MUTANTS, WITHIN, os.cpu_count() or 1)
     left = [name for name, found in tried if not found and name not in judged]
     assert not left, f"no schedule finds, and mutants.txt does not judge: {left}"
