@@ -352,6 +352,12 @@ def unsafe(cell: Simulation) -> list[str]:
     if not lost <= to_blame:
         found.append(f"lost {sorted(lost)}; {sorted(to_blame)} are to blame")
     found += [f"{name} was not waited for" for name in _lost_too_early(cell)]
+    reacts = {time for time, _, event, _ in cell.reports if event in ("safe", "error")}
+    found += [
+        f"{values['member']} has died, and the cell waits"
+        for time, _, event, values in cell.reports
+        if event == "dead" and not values["restarts"] and time not in reacts
+    ]
     # A new process of a killed member may be too late for the end of the run.
     failed = [each for each in everyone if each.protocol.failure and each.full_name not in cell.killed]
     causes = [str(each.protocol.failure) for each in failed]
