@@ -336,7 +336,7 @@ def _outcome(cell: Simulation) -> tuple[list[Member], int, set[str]]:
     """Return all members that were not killed, the first block of the safe state, and the lost members."""
     reports = [values for _, _, event, values in cell.reports if event == "safe"]
     everyone = [member for member in (*cell.gone, *cell.members.values()) if not member.namesake]
-    safe = cell.block(reports[0]["sample"]) if reports else cell.length
+    safe = cell.block(reports[0]["sample"] if reports else cell.end)
     return everyone, safe, {name for values in reports for name in values["lost"]}
 
 
@@ -382,6 +382,11 @@ def _wrong_values(cell: Simulation, everyone: list[Member], safe: int) -> list[s
             found.append(f"{member.identity} has computed other values than offline")
         if protocol.safe and protocol.over and not protocol.failure:
             found += _not_at_rest(member, cell, safe)
+        if protocol.over and not protocol.failure:
+            if member.role.samples != _end_of_safe(cell, safe):
+                found.append(f"{member.identity} is done at sample {member.role.samples}")
+            if any(queue.lost for queue in member.role.inputs.queues.values()):
+                found.append(f"{member.identity} has lost blocks without a word")
         if len(values) > max(cell.length, cell.block(_end_of_safe(cell, safe))):
             found.append(f"{member.identity} ran beyond the end")
         words = ("missing", "twice", "heard before")
