@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mutants of the protocol: one comparison, constant, condition, operand or call changed, each found by a schedule.
+"""Mutants of the protocol: one comparison, constant, condition, operand or call is changed; a schedule has to find it.
 
 python mutants.py SEED COUNT SCHEDULES prints the drawn mutants, each with the schedule that has found it; mutants.txt
 judges those that none has found.
