@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,7 +152,7 @@ def find(mutant: Mutant, schedules: int) -> str:
 def tried(seed: int, count: int, schedules: int, processes: int = 1) -> Iterator[tuple[str, str]]:
     """Yield the name of each drawn mutant, and how it was found (see `find`)."""
     mutants = drawn(seed, count)
-    with ProcessPoolExecutor(processes) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:  # a child of pytest cannot run it again
         found = pool.map(partial(find, schedules=schedules), mutants)
         yield from zip((mutant.name for mutant in mutants), found, strict=True)
 
