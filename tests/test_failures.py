@@ -257,7 +257,7 @@ def test_the_nodes_themselves_refuse_a_cell_that_cannot_work(domain, tmp_path):
         spindle.trigger_activate()
         for name in NODES[1:]:
             spindle.protocol.hear_member(nodes[name].protocol.own, 0.0)
-        spindle.attempt(spindle.role._check_cell)
+        spindle.attempt(spindle.role.check_cell)
         nodes["recorder"].role.clean_up()
         for node in nodes.values():
             node.destroy_node()

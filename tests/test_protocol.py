@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from deliberate_faults import FAULTS, faulty
-from simulation import Design, Simulation, play, violations
+import simulation
+from schedules import play, violations
+from simulation import Design, Simulation
 
 from lathe_rc import messages
 from lathe_rc.errors import LatheError
@@ -26,6 +27,9 @@ from lathe_rc.protocol import (
     TimeMasterProtocol,
     actions,
 )
+from lathe_rc.protocol.leading_run import LeadingRun
+from lathe_rc.protocol.member_host import MemberHost
+from lathe_rc.protocol.stage_run import StageRun
 
 MASTERS = ("spindle_encoder",)
 SHARE = 300  # schedules of one test: the workers of the suite share them
@@ -86,7 +90,7 @@ def killed(cell: Simulation, name: str) -> None:
 
 
 def exit_codes(cell: Simulation) -> dict[str, int]:
-    return {process.design.name: process.protocol.exit_code for process in cell.gone}
+    return {member.full_name: member.protocol.exit_code for member in cell.gone}
 
 
 def test_a_member_that_stalls_is_lost_if_the_cell_shall_not_wait():
@@ -143,9 +147,9 @@ def test_a_member_that_is_ended_in_the_middle_of_a_run_is_lost_and_named(event):
 
     def end(cell):
         cell.culprits.add("/tool")
-        protocol = cell.process_of("/tool").protocol
-        protocol.shut_down(cell.now) if event == "shut_down" else protocol.interrupt("SIGTERM")
-        cell.process_of("/tool")._step()
+        tool = cell.process_of("/tool")
+        tool.attempt(getattr(tool.protocol, event), cell.now if event == "shut_down" else "SIGTERM")
+        tool.process.turn()
 
     ((_, safe),) = told(piston(end), "safe")
     how = "/tool was shut down" if event == "shut_down" else "/tool was ended by SIGTERM"
@@ -345,8 +349,8 @@ def test_a_run_that_is_held_goes_on_with_the_same_values_and_nobody_was_silent(s
         spindle = cell.process_of("/spindle")
 
         def to(blocks):
-            spindle.protocol.hold(blocks, cell.now)
-            spindle.wake()
+            spindle.attempt(spindle.protocol.hold, blocks, cell.now)
+            spindle.process.turn()
 
         to(8)
         cell.at(cell.now + 20.0, lambda: to(12))
@@ -497,7 +501,14 @@ def test_blocks_come_in_order_whatever_is_repeated():
         order.missing("/a", 808, 4)
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.mistake)
-def test_a_deliberate_fault_has_its_place_in_the_protocol(fault):
-    """`./lathe test --system` plays schedules with each of them; here it only has to fit the code as it is."""
-    compile(faulty(fault), fault.module, "exec")
+def test_the_simulation_has_no_second_version_of_what_ships():
+    """Hosts, roles and restart of simulated members are the shipped ones, extended by what the simulation records."""
+    for simulated, shipped, extended in (
+        (simulation.Member, MemberHost, {"activate"}),
+        (simulation.Stage, StageRun, {"lose"}),
+        (simulation.Recorder, StageRun, {"members_changed"}),
+        (simulation.Spindle, LeadingRun, {"perform"}),
+    ):
+        hooks = {name for name, value in vars(shipped).items() if getattr(value, "__isabstractmethod__", False)}
+        again = {name for name in vars(simulated).keys() & vars(shipped).keys() - hooks if name[:2] != "__"}
+        assert {name for name in again - {"become_safe"} if callable(vars(shipped)[name])} == extended

@@ -3,6 +3,7 @@
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,9 @@ from lathe_rc.cell.scenario import load, new_stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import sample_fields
-from lathe_rc.nodes.restart import Restart
+from lathe_rc.nodes.stage_role import StageRole
+from lathe_rc.nodes.state_file import StateFile
+from lathe_rc.protocol.restart import Restart
 
 CONFIG = Path(__file__).parents[1] / "config"
 BLOCK = 64
@@ -168,25 +171,39 @@ def role(run_id="piston"):
     master = SimpleNamespace(host="here", pid=1, members=[])
     protocol = SimpleNamespace(master=master, resumed=print, members={})
     node = SimpleNamespace(table=table, full_name=f"/{OWN}", protocol=protocol, **quiet)
-    inputs = SimpleNamespace(buffers={}, queues={}, wire=print)
+    inputs = SimpleNamespace(state=dict, go_on=lambda *_: None)
     outputs = SimpleNamespace(framer=SimpleNamespace(companions=0))
-    stage = Cell(cell.nodes).stages[OWN]
-    return SimpleNamespace(node=node, stage=stage, inputs=inputs, outputs=outputs, blocks=0, samples=0, started=True)
+    stage, start = (Cell(cell.nodes).stages[OWN] for _ in range(2))
+    return SimpleNamespace(
+        node=node,
+        stage=stage,
+        inputs=inputs,
+        outputs=outputs,
+        _start=start,
+        blocks=0,
+        samples=0,
+        started=True,
+    )
+
+
+def kept(role, path):
+    own = {name: partial(getattr(StageRole, name), role) for name in ("feedback_delays", "state", "restore")}
+    return Restart(role, SimpleNamespace(**own), StateFile(str(path)))
 
 
 @pytest.fixture
 def state(tmp_path):
     """A state file of a controller with two events."""
-    kept = Restart(role(), str(tmp_path / "state"))
-    kept.begin(joins=False)
-    kept.keep_event("set learning_gain 0.5", 3.0)
-    kept.keep_event("freeze", 1234567)
+    restart = kept(role(), tmp_path / "state")
+    restart.begin(joins=False)
+    restart.keep_event("set learning_gain 0.5", 3.0)
+    restart.keep_event("freeze", 1234567)
     return tmp_path / "state"
 
 
 def resumed(state, **about):
     found = role(**about)
-    Restart(found, str(state)).begin(joins=True)
+    kept(found, state).begin(joins=True)
     return found
 
 

@@ -43,8 +43,9 @@ from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
-from lathe_rc.protocol import Announcement, BadBlock, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
 from lathe_rc.protocol.exchange import Exchange
+from lathe_rc.protocol.member_host import MOST_DEFERRED, MemberHost, Work
 
 _TICK = 0.02  # [s] between polls of the graph while members join
 _BRIEF = 0.05  # [s] for an acknowledgement, after another reader of the process's messages has used up the patience
@@ -54,12 +55,11 @@ _LATCHED_DEPTH = 256
 _PROGRESS = f"{messages.PACKAGE}/msg/Progress"
 _NAMELESS = 10.0  # [s] for the ROS graph to name the node of a publisher
 _MOST_SENDERS = 4096  # publishers that are remembered by name
-_MOST_DEFERRED = 8  # times the blocks in flight of each topic, until a node is ready and active
 
 T = TypeVar("T")
 
 
-class Role(Protocol):
+class Role(Work, Protocol):
     """Work of one kind of cell node; created when the node is configured, destroyed when it is cleaned up.
 
     Roles derive from it, and leave out what they do not do.
@@ -97,26 +97,8 @@ class Role(Protocol):
     def activate(self) -> None:
         """Create the publishers, subscriptions and services of the node."""
 
-    def members_changed(self) -> None:
-        """Take in a new announcement of a member."""
-
-    def begin(self, *, joins: bool) -> None:
-        """Prepare the node for block 0 once every topic is matched; ``joins``: the cell is running already."""
-
-    def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        """Continue without lost members (handles `actions.Lose`)."""
-
-    def perform(self, action: actions.Action) -> None:
-        """Perform a time master's action: check the cell, start, release blocks or publish the simulated time."""
-
-    def work(self) -> None:
-        """Compute as far as the messages received since the last call allow."""
-
     def tick(self, now: float) -> float:
         """Do the work that is due by wall time; return the monotonic time of the next call [s]."""
-
-    def failed(self) -> None:
-        """React to the failure of the node."""
 
     def finish(self) -> None:
         """Write the remaining data and close the files."""
@@ -128,7 +110,7 @@ class Role(Protocol):
         """Return the figures of the role for the diagnostics."""
 
 
-class CellNode(LifecycleNode):
+class CellNode(LifecycleNode, MemberHost):
     """ROS 2 lifecycle node of a cell member, or of a node that runs without a cell.
 
     Args:
@@ -142,11 +124,11 @@ class CellNode(LifecycleNode):
         table: parameters; set when the node is configured.
         protocol: protocol object of this member.
         role: role of the node; None unless configured.
-        outlets, inlets: publisher and subscription of each signal topic, by fully qualified name.
-        due: messages have arrived since the last call of `work`.
+        outlets: publisher of each signal topic, by fully qualified name.
         refused_messages: counter of rejected messages from outside the cell.
-        next_tick: monotonic time of the next call of `tick` [s].
     """
+
+    role: Role | None
 
     def __init__(
         self, name: str, kind: str, role: Callable[["CellNode"], Role], reporter: Reporter, exchange: Exchange
@@ -164,7 +146,6 @@ class CellNode(LifecycleNode):
         self.reporter = reporter
         self.exchange = exchange
         self.next_tick = time.monotonic()
-        self.due = False
         self.full_name = self.get_fully_qualified_name()
         self.namespace = self.get_namespace().rstrip("/") + "/"
         self.refused_messages = RefusedMessages(self._report_refused)
@@ -175,17 +156,14 @@ class CellNode(LifecycleNode):
         self._forget()
 
     def _forget(self) -> None:
-        """Reset the node to its state before the first activation."""
-        self.role: Role | None = None
+        """Reset the node to its state before the first activation (extends `MemberHost`)."""
+        super()._forget()
         self.protocol = MemberProtocol(Announcement("", self.full_name, self.kind), 0)
-        self._performs = False
-        self._deferred: deque[tuple[Callable[..., object], Any]] = deque()  # signals received too early
         self._senders: dict[bytes, str] = {}  # names of nodes by the identity of their publishers
         self._nameless: dict[tuple[str, bytes], deque[tuple[Callable[..., None], bytes, float]]] = {}
         self._read_elsewhere = True  # whether other nodes than the time master read the progress
         self._host: dict[str, Publisher] = {}
         self.outlets: dict[str, Publisher] = {}
-        self.inlets: dict[str, Subscription] = {}
         self._unknown: set[str] = set()  # members of unknown stages that have been reported
 
     # ---- lifecycle ----------------------------------------------------------------------------------
@@ -236,7 +214,7 @@ class CellNode(LifecycleNode):
             refuse(LatheError(f"{self.get_name()}: {type(error).__name__}: {shown(error)}"))
             return TransitionCallbackReturn.FAILURE
         self.get_logger().info(f"{state.label} -> {goal}")
-        self._perform_actions()
+        self.perform_actions()
         return TransitionCallbackReturn.SUCCESS
 
     def _refusing(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -291,14 +269,10 @@ class CellNode(LifecycleNode):
 
     def _activate(self) -> None:
         assert self.role is not None, "the node is configured"
-        self.due = True
         if not self._host:
             self._begin_to_exchange()
             self.role.activate()
-        self.protocol.activate(time.monotonic())
-        if not self._is_early():
-            self._take_up()
-        self._perform_actions()
+        self.activate()
         self.reporter("active", self.get_name(), pid=os.getpid())
 
     def _begin_to_exchange(self) -> None:
@@ -315,14 +289,14 @@ class CellNode(LifecycleNode):
         self.subscribe(Member, "members", self._on_member, latched_qos(_LATCHED_DEPTH))
         self.subscribe(CellStateMessage, "cell_state", self._on_cell_state, latched_qos(), always=True)
         add(Empty, f"~/{messages.ALIVE}", liveliness())
-        self.watch = Watch(self)
+        self.watch, self.listens = Watch(self), True
 
     def _clean_up(self) -> None:
         assert self.role is not None, "the node is configured"
         self.role.clean_up()
         self.protocol.clean_up()
         if self._host:
-            self._perform_actions()
+            self.perform_actions()
             self._wait_for_acknowledgement([self._host["members"]], self.protocol.patience)
             self.watch.close()
         destroyers: list[Any] = [self.destroy_publisher, self.destroy_subscription, self.destroy_service]
@@ -344,7 +318,7 @@ class CellNode(LifecycleNode):
     def interrupt(self, signal: str) -> None:
         """Announce to the other members that this process ends at once, by a signal."""
         self.protocol.interrupt(signal)
-        self._perform_actions()
+        self.perform_actions()
         if self._host and self.protocol.failure:
             self._wait_for_acknowledgement([self._host["members"]], self.protocol.patience)
 
@@ -404,60 +378,27 @@ class CellNode(LifecycleNode):
 
     # ---- events of the protocol ---------------------------------------------------------------------
 
+    def now(self) -> float:
+        """Return the monotonic time [s] (implements `MemberHost`)."""
+        return time.monotonic()
+
+    def has_ended(self, member: Announcement) -> bool:
+        """Return True if the process of an announcement is known to have ended (implements `MemberHost`)."""
+        return has_ended(member)
+
+    def first_sample(self) -> int:
+        """Return the sample at which the run begins (implements `MemberHost`)."""
+        begun = self.begun()
+        return begun.sample if begun else 0
+
     def _on_member(self, data: bytes, sender: str) -> None:
-        member = from_ros("members", data, Member, Announcement)
-        known = self.protocol.members.get(member.name)
-        if known and known.process != member.process:
-            self._look()  # the previous process may have ended
-        if member.name == self.protocol.own.name and has_ended(member):
-            return  # the last announcement of this member's previous process is no namesake
-        self.protocol.hear_member(member, time.monotonic(), sender)
+        self.hear_member(from_ros("members", data, Member, Announcement), sender)
 
     def _on_cell_state(self, data: bytes, sender: str) -> None:
-        state = from_ros("cell_state", data, CellStateMessage, CellState)
-        self.protocol.hear_cell_state(state, time.monotonic(), sender)
-        if self.protocol.active and not self._is_early():
-            self._take_up()
+        self.hear_cell_state(from_ros("cell_state", data, CellStateMessage, CellState), sender)
 
-    def completed(self, blocks: int, samples: int, *, last: bool) -> None:
-        """Report the total number of blocks and samples that the role has completed."""
-        self.protocol.computed(blocks, samples, time.monotonic(), last=last)
-        if self.protocol.actions:
-            self._perform_actions()
-
-    def complete_part(self) -> None:
-        """Report that the role has completed its last block."""
-        self.protocol.complete_part()
-        self._perform_actions()
-
-    def describe(self, **topics: tuple[object, ...]) -> None:
-        """Announce changed lists of topics (see `MemberProtocol.describe`)."""
-        self.protocol.describe(**topics)
-        self._perform_actions()
-
-    def fail(self, error: LatheError, *, cause: str = "error") -> None:
-        """Fail the node and announce the reason to all members (see `MemberProtocol.fail`)."""
-        first = self.protocol.failure is None
-        self.protocol.fail(error, cause=cause)
-        self._perform_actions()
-        if first and self.role is not None:
-            self.role.failed()
-
-    def attempt(self, step: Callable[..., object], *arguments: object) -> None:
-        """Run a step whose error fails the node, then perform the protocol's pending actions."""
-        try:
-            step(*arguments)
-        except ForeignMessage as refused:
-            self._refuse(refused)
-        except BadBlock as error:
-            self.protocol.reject(error, time.monotonic())
-        except LatheError as error:
-            self.fail(error)
-        if self.protocol.actions:
-            self._perform_actions()
-
-    def _look(self) -> None:
-        """Pass the time, the state of the other members and the ROS graph to the protocol."""
+    def look(self) -> None:
+        """Pass the time, the state of the other members and the ROS graph to the protocol (implements `MemberHost`)."""
         protocol = self.protocol
         self.watch.look()
         protocol.look(time.monotonic(), self.watch.silent, self.watch.ended())
@@ -466,7 +407,7 @@ class CellNode(LifecycleNode):
             protocol.matched(list(graph.unmatched(self, self.inlets, self.outlets, protocol, self.exchange)))
         elif protocol.master is None:
             protocol.unmatched = [topic for topic, inlet in self.inlets.items() if not inlet.get_publisher_count()]
-        self._perform_actions()
+        self.perform_actions()
 
     def tick(self, now: float) -> None:
         """Do the periodic work that is due by wall time; it touches no sample."""
@@ -475,7 +416,7 @@ class CellNode(LifecycleNode):
             return
         for topic, publisher in list(self._nameless):
             self._name(topic, publisher)
-        self._look()
+        self.look()
         self._read_elsewhere = self._host["progress"].get_subscription_count() > 1
         if self.role is not None:
             self.next_tick = min(self.next_tick, self.role.tick(now))
@@ -484,11 +425,6 @@ class CellNode(LifecycleNode):
             self._report_unfit()
             self._publish_diagnostics()
 
-    def work(self) -> None:
-        """Compute as far as the messages received since the last call allow."""
-        if self.role is not None and self.protocol.active and not self.protocol.failure:
-            self.attempt(self.role.work)
-
     def finish(self) -> None:
         """Write the remaining data and close the files."""
         if self.role is not None:
@@ -496,22 +432,8 @@ class CellNode(LifecycleNode):
 
     # ---- requests of the protocol -------------------------------------------------------------------
 
-    def _perform_actions(self) -> None:
-        """Perform the protocol's pending actions, including actions added meanwhile."""
-        if self._performs:
-            return
-        self._performs = True
-        try:
-            while self.protocol.actions:
-                action = self.protocol.actions.popleft()
-                try:
-                    self._perform(action)
-                except LatheError as error:
-                    self.fail(error)
-        finally:
-            self._performs = False
-
-    def _perform(self, action: actions.Action) -> None:
+    def send(self, action: actions.Action) -> None:
+        """Publish a message of the protocol, or perform another of its requests (implements `MemberHost`)."""
         match action:
             case actions.Announce(member):
                 if self._host:
@@ -528,8 +450,6 @@ class CellNode(LifecycleNode):
                 self.reporter(event, self.get_name(), **values)
             case actions.Leave(patience):
                 self._leave(patience)
-            case _ if self.role is not None:
-                self._perform_by_role(self.role, action)
 
     def _log(self, level: str, text: str) -> None:
         if level == "error":  # rclpy rejects different levels from one line
@@ -545,19 +465,6 @@ class CellNode(LifecycleNode):
             self._wait_for_acknowledgement([*self.outlets.values(), *publishers], patience)
         self.protocol.left()
         self.reporter("done", self.get_name(), cpu_s=time.process_time())
-
-    def _perform_by_role(self, role: Role, action: actions.Action) -> None:
-        match action:
-            case actions.MembersChanged():
-                role.members_changed()
-            case actions.Begin(joins):
-                role.begin(joins=joins)
-                self.protocol.begun(time.monotonic())
-                self._take_up()
-            case actions.Lose(lost, first, end, again):
-                role.lose(lost, first, end, again=again)
-            case _:
-                role.perform(action)
 
     def _tell(self, progress: Progress) -> None:
         if self.exchange.master:
@@ -579,21 +486,6 @@ class CellNode(LifecycleNode):
     def topic(self, relative: str) -> str:
         """Return the fully qualified name of a relative topic after all remapping."""
         return str(self.resolve_topic_name(remapped(self.table, relative)))
-
-    def guarded(self, callback: Callable[..., object], *, always: bool = False) -> Callable[..., None]:
-        """Wrap a callback so that its error fails the node with a one-line message instead of a traceback.
-
-        Args:
-            callback: function of a message.
-            always: call it also after the node has failed.
-        """
-
-        def call(*message: Any) -> None:
-            self.due = True
-            if self._host and (always or not self.protocol.failure):
-                self.attempt(callback, *message)
-
-        return call
 
     def subscribe(
         self,
@@ -620,7 +512,7 @@ class CellNode(LifecycleNode):
             if (sender := self._senders.get(publisher)) is not None:
                 named(data, sender)
                 return
-            most = _MOST_DEFERRED * signal_depth(self.table.window)
+            most = MOST_DEFERRED * signal_depth(self.table.window)
             waiting = self._nameless.setdefault((full, publisher), deque(maxlen=most))
             waiting.append((named, data, time.monotonic()))
             self._name(full, publisher)
@@ -637,40 +529,9 @@ class CellNode(LifecycleNode):
             named(data, sender)
         if waiting and time.monotonic() > waiting[0][2] + _NAMELESS:
             waiting.clear()
-            self._refuse(ForeignMessage(topic, "", "", "the ROS graph names no node for its publisher"))
+            self.refuse(ForeignMessage(topic, "", "", "the ROS graph names no node for its publisher"))
         if not waiting:
             self._nameless.pop((topic, publisher), None)
-
-    def _in_turn(self, callback: Callable[..., object]) -> Callable[..., None]:
-        """Wrap a signal callback so that messages are deferred while the node is deactivated or not yet ready.
-
-        So no message is lost, and blocks from before a node joined do not count as missing. In a free-running cell
-        the signals of a deactivated node are dropped instead, and counted like any missing blocks.
-        """
-
-        def call(*message: Any) -> None:
-            if self.protocol.active and not self._is_early():
-                self._take_up()
-                callback(*message)
-            elif self.protocol.active or self.table.window:
-                self._deferred.append((callback, message))
-                if len(self._deferred) > _MOST_DEFERRED * signal_depth(self.table.window) * (len(self.inlets) + 1):
-                    if self.protocol.ready:
-                        raise LatheError(f"{self.full_name}: {len(self._deferred)} messages wait until it is active")
-                    self._deferred.popleft()  # a flood of foreign messages
-
-        return call
-
-    def _is_early(self) -> bool:
-        """Return True while signals have to be deferred: the node is not ready, or its first sample is not known."""
-        if self.protocol.master is not None:
-            return not self.protocol.ready
-        return bool(getattr(self.table, "restart_file", "")) and not self.protocol.alone
-
-    def _take_up(self) -> None:
-        while self._deferred:
-            callback, message = self._deferred.popleft()
-            self.guarded(callback)(*message)
 
     def listen(
         self, topic: str, msgtype: str, callback: Callable[[bytes, str], object], inside: Callable[[Any], object]
@@ -684,10 +545,10 @@ class CellNode(LifecycleNode):
             inside: called instead with the `lathe_rc.protocol.exchange.Delivery` of a node of this process.
         """
         if self.exchange.has(topic):
-            self.exchange.listen(topic, self.full_name, self.guarded(self._in_turn(inside)))
+            self.exchange.listen(topic, self.full_name, self.guarded(self.in_turn(inside)))
             return
         qos = signal_qos(self.table, topic)
-        self.inlets[topic] = self.subscribe(message_class(msgtype), topic, self._in_turn(callback), qos)
+        self.inlets[topic] = self.subscribe(message_class(msgtype), topic, self.in_turn(callback), qos)
 
     def begun(self) -> Checkpoint | None:
         """Return the checkpoint that the time master announces; None: the run begins at sample 0.
@@ -712,8 +573,8 @@ class CellNode(LifecycleNode):
 
     # ---- diagnostics --------------------------------------------------------------------------------
 
-    def _refuse(self, message: ForeignMessage) -> None:
-        """Count a rejected message from outside the cell, under the protocol's relative topic name if it has one."""
+    def refuse(self, message: ForeignMessage) -> None:
+        """Count a rejected message under the protocol's relative topic name if it has one (implements `MemberHost`)."""
         self.refused_messages.refuse(message.on(self.resolve_topic_name(message.topic)))
 
     def _report_unfit(self) -> None:
@@ -727,7 +588,7 @@ class CellNode(LifecycleNode):
                 f"a publisher offers a quality of service that does not fit ({why}); if it is a device that keeps no "
                 f"messages, add {topic} to {self.get_name()}.volatile_inputs; if it is best effort, with window: 0"
             )
-            self._refuse(ForeignMessage(topic, name, "", told))
+            self.refuse(ForeignMessage(topic, name, "", told))
 
     def _subscribe_anew(self, topic: str) -> None:
         """Replace the subscription to a device by one with the quality of service that its publishers offer."""

@@ -2,7 +2,6 @@
 """Time master role of the spindle: checks the cell, releases blocks by window and pace, publishes simulated time."""
 
 import time
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, cast
@@ -24,10 +23,9 @@ from lathe_rc.nodes.ports import latched_qos
 from lathe_rc.nodes.simulation_services import SimulationServices
 from lathe_rc.nodes.stage_role import StageRole
 from lathe_rc.protocol import Announcement, Pace, Progress, Reactions, TimeMasterProtocol, actions
+from lathe_rc.protocol.leading_run import LeadingRun
 
-_LOOK = 0.02  # [s] between checks of the members
-_BURST = 64  # blocks released before other work gets its turn
-_JUDGED, _MOST_LAG = 1.0, 0.05  # simulated time after which the pace is evaluated [s], and its largest loss
+_JUDGED = 1.0  # simulated time after which the pace is evaluated [s]
 
 
 def _per_block(table: TimeMasterParameters) -> float:
@@ -35,12 +33,8 @@ def _per_block(table: TimeMasterParameters) -> float:
     return table.block_size * table.step / table.speed_factor if table.speed_factor else 0.0
 
 
-class SpindleRole(StageRole):
-    """Role of the time master; its stage is the spindle and its encoder.
-
-    Attributes:
-        pace: schedule of the run.
-    """
+class SpindleRole(LeadingRun, StageRole):
+    """Role of the time master; its stage is the spindle and its encoder."""
 
     stage: TimeMaster
 
@@ -50,11 +44,9 @@ class SpindleRole(StageRole):
         self._check_pace(table)
         if table.start_from and not table.members:
             raise InputError(f"{node.get_name()}.start_from of a spindle that runs alone; allowed: with members")
-        self.go_on()
+        self.prepare()
         block = table.block_size * table.step
         self.pace = Pace(_per_block(table), table.window, round(_JUDGED / block))
-        self._reported: deque[Progress] = deque()  # of members in this process
-        self._cell: Cell | None = None
         self._simulation: SimulationServices | None = None
 
     def _check_pace(self, table: TimeMasterParameters) -> None:
@@ -87,11 +79,6 @@ class SpindleRole(StageRole):
         self.node.next_tick = time.monotonic()
         return f"from block {self.blocks} on"
 
-    @property
-    def leads(self) -> TimeMasterProtocol:
-        """Return the node's protocol object as a time master's."""
-        return cast("TimeMasterProtocol", self.node.protocol)
-
     def protocol(self, own: Announcement) -> TimeMasterProtocol:
         """Create and return the time master's protocol object (implements `Role`)."""
         table = self.table
@@ -121,7 +108,6 @@ class SpindleRole(StageRole):
         node = self.node
         self._clock_publisher = node.create_publisher(Clock, "/clock", QoSProfile(depth=10))
         node.subscribe(ProgressMessage, "progress", self._on_progress, latched_qos())
-        node.exchange.master = node.guarded(self._reported.append)
         node.create_service(Trigger, "~/end", self._on_end)
         if self.table.simulation_services:
             self._simulation = SimulationServices(node, self.leads, self.pace)
@@ -161,12 +147,6 @@ class SpindleRole(StageRole):
     def perform(self, action: actions.Action) -> None:
         """Perform an action of the time master's protocol (implements `Role`)."""
         match action:
-            case actions.CheckCell():
-                self._check_cell()
-            case actions.Start():
-                self.start_run()
-            case actions.Release():
-                self.release()
             case actions.TellTime(samples):
                 stamp = messages.header(max(samples - 1, 0), self.table.step_ns).stamp
                 clock = Clock()
@@ -177,6 +157,8 @@ class SpindleRole(StageRole):
                     self.node.reporter("pace", self.node.get_name(), **asdict(figures))
                     for line in () if self.node.reporter.attached else figures.lines():  # a harness prints them itself
                         self.node.get_logger().info(line)
+            case _:
+                super().perform(action)
         if self._simulation is not None:
             self._simulation.look()
 
@@ -186,80 +168,19 @@ class SpindleRole(StageRole):
         if self._simulation is not None:
             self._simulation.look()
 
-    def _check_cell(self) -> None:
-        """Check the cell as before an offline run, with the actual parameters of the members, and start the run."""
-        if names := self.leads.own.members:
-            cell = Cell(*self.node.announced(names))
-            cell.check()
-            for left_out in cell.unchecked:
-                self.node.get_logger().warning(f"not checked: {left_out}")
-            for warning in cell.warnings:
-                self.node.get_logger().warning(warning)
-            self._cell = cell
-        self.leads.start(time.monotonic())
+    def check_cell(self) -> Cell:
+        """Check the cell as before an offline run, with the members' actual parameters (implements `LeadingRun`)."""
+        cell = Cell(*self.node.announced(self.leads.own.members))
+        cell.check()
+        for left_out in cell.unchecked:
+            self.node.get_logger().warning(f"not checked: {left_out}")
+        for warning in cell.warnings:
+            self.node.get_logger().warning(warning)
+        return cell
 
-    def start_run(self) -> None:
-        """Start the run: begin the schedule and form chains."""
-        self.pace.schedule = time.monotonic()
-        self.node.exchange.form(self, self._cell)
-        if self.chain is None and self.inputs.ports:
-            self.start(self.samples)
+    # ---- pace ---------------------------------------------------------------------------------------
 
-    def become_safe(self, first: int) -> None:
-        """Keep the spindle turning in the safe state; the newest samples of lost members are held (see `StageRole`)."""
-
-    # ---- blocks -------------------------------------------------------------------------------------
-
-    def blocks_at_once(self) -> int:
-        """Return the largest number of blocks to release in one step."""
-        return 1 if self.table.speed_factor else min(self.leads.credit, self.together)
-
-    def possible(self) -> int:
-        """Return the number of samples to release in one step; 0 while the spindle or its chain waits for an input."""
-        samples = self.table.block_size * self.blocks_at_once()
-        if self.chain is None and not self.inputs.ports:
-            return samples
-        ready = self.chain.ready() if self.chain is not None else self.ready()
-        self.leads.starved = not ready
-        return min(samples, ready[0]) if ready else 0
-
-    def release(self) -> None:
-        """Release every block that credit and pace allow."""
-        leads, size = self.leads, self.table.block_size
-        begun = time.monotonic()
-        for _ in range(_BURST):
-            if not leads.may_release or self.blocks == leads.blocks_in_run or leads.credit <= 0:
-                return
-            if time.monotonic() - begun > _LOOK:
-                break  # a window may hold many blocks: deaths must be noticed meanwhile
-            if not (samples := self.possible()):
-                return
-            if self.pace.block and not leads.ends_early and not self._is_due(-(-samples // size)):
-                return
-            last = leads.end is not None and leads.end - self.samples <= samples
-            if last:
-                samples = cast("int", leads.end) - self.samples
-            leads.release(-(-samples // size), time.monotonic())
-            if self.chain is not None:
-                self.chain.compute(samples, last=last)
-            else:
-                self.compute(samples, last=last)
-        self.node.next_tick = time.monotonic()
-
-    def _is_due(self, blocks: int) -> bool:
-        """Return True if the next blocks are due; count their lateness."""
-        now, due = time.monotonic(), self.pace.due(self.blocks)
-        if now < due:
-            self.node.next_tick = min(self.node.next_tick, due)
-            return False
-        self.pace.count(now - due, blocks)
-        if now - due > self.pace.most_late:
-            self.fall_behind(now - due)
-        if (lag := self.pace.lag()) > _MOST_LAG:
-            self._tell_lag(lag)
-        return self.leads.may_release
-
-    def _tell_lag(self, lag: float) -> None:
+    def lags(self, lag: float) -> None:
         """Warn early that the members cannot hold the pace, and suggest a cheaper grouping with fewer processes."""
         text = f"the cell holds {1.0 - lag:.0%} of its pace; {self._remedy()}"
         self.node.get_logger().warning(text)
@@ -289,26 +210,12 @@ class SpindleRole(StageRole):
                 f"{self.node.get_name()}.strict_pace: block {self.blocks} is {late * 1e3:.3g} ms late; allowed: half a "
                 f"window, {self.pace.most_late * 1e3:.3g} ms; {self._remedy()}"
             )
-        self.pace.slip(late)
-
-    def lead(self) -> None:
-        """Release blocks as far as credit and pace allow (extends `StageRole`)."""
-        self.node.attempt(self.release)
-
-    def work(self) -> None:
-        """Process the progress of members in this process, deferred because the reported block may be in progress."""
-        for _ in range(len(self._reported)):  # reports on blocks released here are processed later
-            report = self._reported.popleft()
-            self.node.due = self.node.due or bool(self._reported)  # after an error the rest follows in the next turn
-            self.node.attempt(self.leads.hear_progress, report, time.monotonic())
-        if self.inputs.ports and self.chain is None:
-            self.release()  # feedback blocks may allow further releases
+        super().fall_behind(late)
 
     def tick(self, now: float) -> float:
         """Release blocks that are due; return the time of the next call (implements `Role`)."""
         super().tick(now)
-        if self.leads.running:
-            self.node.attempt(self.release)
+        due = self.release_due(now)
         if self._simulation is not None:
             self._simulation.tick(now)
-        return min(now + _LOOK, self.node.next_tick)
+        return min(due, self.node.next_tick)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Role of a node with a stage: reads blocks in order, computes alone or in a chain, and publishes."""
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from lathe_rc_msgs.srv import Schedule
@@ -11,27 +11,28 @@ from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import events
 from lathe_rc.cell.ahead import uncompiled
+from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.checkpoint import Checkpoint
 from lathe_rc.cell.kinds import MASTERS, STAGES
-from lathe_rc.cell.parameters import Value, explain_overflow
+from lathe_rc.cell.parameters import Value, explain_overflow, remapped
+from lathe_rc.cell.scenario import new_stage
 from lathe_rc.cell.stage import Stage, compile_kernels
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError, LossyRunError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.outputs import Memory, Outputs
-from lathe_rc.nodes.restart import Restart
+from lathe_rc.nodes.state_file import StateFile
 from lathe_rc.protocol import Announcement, MemberProtocol
-from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
+from lathe_rc.protocol.block_queue import BlockQueue
 from lathe_rc.protocol.inputs import Inputs
-
-if TYPE_CHECKING:
-    from lathe_rc.nodes.chain import Chain
+from lathe_rc.protocol.restart import Restart
+from lathe_rc.protocol.stage_run import StageRun
 
 _TOGETHER = 2  # steps per window, so that members still work in parallel
 
 
-class StageRole(Role):
+class StageRole(StageRun, Role):
     """Role of a cell node that computes a stage.
 
     Args:
@@ -41,13 +42,10 @@ class StageRole(Role):
         node: see the arguments.
         stage: stage that the role computes.
         begun: checkpoint from which the stage goes on; None: it has not begun, or begins at sample 0.
-        blocks, samples: number computed so far, samples including those before the checkpoint.
-        together: largest number of blocks computed in one step.
-        started: the first sample is known.
-        chain: chain of the stage; None if it computes alone.
         angle: measured spindle angle of the newest sample [rad], of a stage with tunable parameters.
     """
 
+    node: CellNode
     stage: Stage
 
     def __init__(self, node: CellNode) -> None:
@@ -56,15 +54,18 @@ class StageRole(Role):
             self.stage = STAGES[node.kind](node.get_name(), node.table)
         self._compile()
         self.begun: Checkpoint | None = None
-        self.blocks = self.samples = 0
-        self.started, self.angle = False, 0.0
-        self.chain: Chain | None = None
+        self.angle = 0.0
         self._shown = self.stage.parameters
         self.together = max(min(node.table.window // _TOGETHER, messages.MAX_BLOCK // node.table.block_size), 1)
         self.inputs = Inputs([(node.topic(port.topic), port) for port in self.stage.inputs], node.table, self.together)
         self.outputs = Outputs(node, self.stage)
-        file = getattr(node.table, "restart_file", "")
-        self.restart = Restart(self, file) if file else None
+        self.restart = None
+        if file := getattr(node.table, "restart_file", ""):
+            if not node.table.window:
+                name = f"{node.get_name()}.restart_file"
+                raise InputError(f"{name} with window = 0: nobody waits for a restart; allowed: ''")
+            self._start = new_stage(node.get_name(), node.table)
+            self.restart = Restart(self, self, StateFile(file))
 
     # ---- membership ---------------------------------------------------------------------------------
 
@@ -87,54 +88,14 @@ class StageRole(Role):
     def activate(self) -> None:
         """Create publishers, subscriptions and the service that schedules events (implements `Role`)."""
         self.outputs.activate()
-        for topic, queue in self.inputs.queues.items():
-            queue.inside = self.node.exchange.has(topic)
-            queue.run_end = lambda: self.node.protocol.end
-            self.node.listen(topic, queue.type, queue.add, queue.take)
-        self.inputs.share()
-        self.node.exchange.stages.append(self)
+        self.listen_to_inputs()
         self.node.create_service(Schedule, "~/schedule", self._on_schedule)
 
-    def members_changed(self) -> None:
-        """Set the expected source of each input from the members' announcements, before its first block."""
-        protocol = self.node.protocol
-        peers = protocol.names
-        for name in peers:
-            member = protocol.members.get(name)
-            for topic in member.publishes if member else ():
-                queue = self.inputs.queues.get(topic)
-                if queue and (queue.open or queue.source not in peers):
-                    self._expect(queue, name)
+    def listen(self, queue: BlockQueue) -> None:
+        """Subscribe a queue to its topic, over DDS or inside this process (implements `StageRun`)."""
+        self.node.listen(queue.topic, queue.type, queue.add, queue.take)
 
-    def _expect(self, queue: BlockQueue, source: str) -> None:
-        """Set a queue's source: in a cell from block 0 on; without a cell, from the first block that arrives."""
-        if self.node.protocol.master is None:
-            if self.node.table.run_id and not queue.source:
-                queue.expect(source, None)
-            return
-        if self.started:
-            raise LatheError(f"{queue.topic}: {queue.source} was heard before the cell of {source}; start anew")
-        begun = self.node.begun()
-        queue.expect(source, begun.sample if begun else 0)
-        queue.repeats = self.node.protocol.restarts(source)
-
-    def begin(self, *, joins: bool) -> None:
-        """Prepare for block 0, or resume from a kept state in a running cell (implements `Role`).
-
-        Raises:
-            LatheError: the cell is running, and the node has no kept state to resume from; or the checkpoint is not one
-                of this node.
-        """
-        if not joins:
-            self.go_on()
-        if self.restart is not None:
-            self.restart.begin(joins=joins)
-        elif joins:
-            raise LatheError(
-                f"{self.node.full_name}: the cell is running already, and this node cannot go on in mid-run"
-            )
-
-    def go_on(self) -> None:
+    def prepare(self) -> None:
         """Take the state of the stage from the checkpoint, if the run goes on from one.
 
         Raises:
@@ -160,33 +121,13 @@ class StageRole(Role):
         return {f"{self.node.namespace}{topic}": signals for topic, signals in past.items()}
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        """Continue without lost members: the newest samples of their topics are held (implements `Role`)."""
+        """Continue without lost members; results of cycles are unsound from now on (extends `StageRun`)."""
         self.outputs.unsound = True
-        if self.chain is not None:
-            self.chain.leave()
-        unlimited = self.inputs.lose(lost, end)
-        if not again:
-            self.become_safe(first)
-        if unlimited:
-            self._follow_the_master(first)
-        self.node.due = True
+        super().lose(lost, first, end, again=again)
 
     def become_safe(self, first: int) -> None:
         """Switch the stage to its safe state, starting at sample ``first``."""
         self.stage.lose(first)
-
-    def _follow_the_master(self, first: int) -> None:
-        """Read the spindle's blocks, which limit the stage from sample ``first`` on."""
-        master = self.node.protocol.master
-        assert master is not None, "it has declared the safe state"
-        topic = next(topic for topic, sparse in zip(master.publishes, master.sparse, strict=True) if not sparse)
-        pace = self.inputs.follow(topic, master.name, first)
-        self.node.listen(topic, pace.type, pace.add, pace.take)
-
-    def failed(self) -> None:
-        """Dissolve the chain after a failure; its other stages go on alone (implements `Role`)."""
-        if self.chain is not None:
-            self.chain.leave()
 
     def clean_up(self) -> None:
         """Leave the chain and the exchange of the process (implements `Role`)."""
@@ -197,10 +138,7 @@ class StageRole(Role):
     def tick(self, now: float) -> float:
         """Check for readers in other processes, and hold inputs that lose the last block (implements `Role`)."""
         self.outputs.tick(now)
-        queues = self.inputs.queues.values()
-        for queue in queues:
-            queue.end_with(queues, now)
-            self.node.due = self.node.due or queue.lossy
+        self.hold_quiet_inputs(now)
         return float("inf")
 
     def statistics(self) -> dict[str, object]:
@@ -212,6 +150,27 @@ class StageRole(Role):
     def lost(self) -> int:
         """Return the number of blocks lost in a free-running cell."""
         return sum(queue.lost for queue in self.inputs.queues.values())
+
+    # ---- restart ------------------------------------------------------------------------------------
+
+    def feedback_delays(self) -> Iterable[int]:
+        """Return the delays of the readers of the stage's topics [block] (implements `Resumable`)."""
+        master, table = self.node.protocol.master, self.node.table
+        assert master is not None, "it has announced all members"
+        cell = Cell(*self.node.announced(master.members))
+        inputs = [port for out in self.stage.outputs for port in cell.inputs(remapped(table, out.topic))]
+        return [-(-port.delay // table.block_size) for port in inputs]
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of stage and outputs (implements `Resumable`)."""
+        return {"companions": self.outputs.framer.companions, "stage": changes(self.stage, self._start)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Resume from the `state` of another process (implements `Resumable`)."""
+        Restoring().restore(state["stage"], self.stage)
+        self.outputs.framer.companions = state["companions"]
+        for action, place in state["events"]:
+            self.stage.schedule(action, place, "sample" if isinstance(place, int) else "revolution")
 
     # ---- events -------------------------------------------------------------------------------------
 
@@ -282,45 +241,6 @@ class StageRole(Role):
 
     # ---- data ---------------------------------------------------------------------------------------
 
-    @property
-    def computes(self) -> bool:
-        """Return True if the node takes part in a running cell."""
-        protocol = self.node.protocol
-        return protocol.active and protocol.ready and not (protocol.failure or protocol.over)
-
-    def work(self) -> None:
-        """Compute every block whose inputs have arrived (implements `Role`)."""
-        if self.node.protocol.master is not None and not self.node.protocol.ready:
-            return  # blocks may wait in the queues until the node is ready
-        if not self.started and any(queue.blocks for queue in self.inputs.forward):
-            self.node.exchange.form(self, None)
-        if self.chain is not None:
-            self.chain.advance()
-            return
-        while not self.node.protocol.over and not self.node.protocol.failure and (ready := self.ready()):
-            samples, last = ready
-            self.compute(samples, last=last)
-
-    def ready(self) -> tuple[int, bool] | None:
-        """Return the number of computable samples and whether the run ends there; None while an input is missing."""
-        if not self.started:
-            # Alone, a node may join a stream that is under way; in a cell it begins at block 0.
-            first = self.inputs.first() if self.inputs.forward else None
-            if first is None:
-                return None
-            self.start(first)
-        in_cell = self.node.protocol.master is not None
-        return self.inputs.ready(self.samples, self.blocks, self.at_once(), in_cell=in_cell)
-
-    def at_once(self) -> int:
-        """Return the largest number of blocks for one step: the step ends where the state has to be kept."""
-        return self.together if self.restart is None else max(min(self.together, self.restart.keep_at - self.blocks), 1)
-
-    def start(self, first: int) -> None:
-        """Begin the computation at sample ``first``."""
-        self.started, self.samples = True, first
-        self.inputs.begin(first, self.past)
-
     def compute(self, samples: int, *, last: bool) -> None:
         """Compute and publish some blocks in one step; the last block of the run may be shorter."""
         memory = self.outputs.memory(samples)
@@ -331,49 +251,19 @@ class StageRole(Role):
         self._publish(said, memory, samples, last=last)
 
     def _publish(self, said: Sequence[Sparse], memory: Sequence[Memory], samples: int, *, last: bool) -> None:
-        self.blocks += self.outputs.publish(self.samples, said, memory, last=last)
-        self.samples += samples
+        blocks = self.outputs.publish(self.samples, said, memory, last=last)
         if self.stage.parameters is not self._shown:
             self._shown = self.stage.parameters
             self.node.show_parameters(self._shown, self.stage.tunable)
-        self.node.completed(self.blocks, self.samples, last=last)
-        if last:
-            self._complete()
-        elif self.restart is not None and self.blocks >= self.restart.keep_at:
-            self.restart.keep()
+        self.computed(blocks, samples, last=last)
 
-    def _complete(self) -> None:
-        """Finish after the last block: report events that were not reached, and lost blocks."""
+    def last_computed(self) -> None:
+        """Report events that were not reached."""
         if waiting := self.stage.waiting:
             self.node.get_logger().warning(f"not reached: {'; '.join(waiting)}")
             self.node.reporter("not_reached", self.node.get_name(), events=waiting)
-        self.node.complete_part()
-        if losses := explain_losses(self.node.full_name, self.inputs.queues.values()):
-            raise LossyRunError(losses)
 
     # ---- in a chain ---------------------------------------------------------------------------------
-
-    @property
-    def may_join(self) -> bool:
-        """Return True if the stage can still join a chain."""
-        return not self.started and self.restart is None and bool(self.node.table.window) and self.computes
-
-    @property
-    def cell(self) -> str:
-        """Return the name of the time master; empty as long as none is known."""
-        master = self.node.protocol.master
-        return master.name if master is not None else ""
-
-    def join(self, chain: "Chain", inside: Collection[str]) -> None:
-        """Join a chain before block 0; the stages of the chain publish the topics ``inside``."""
-        self.chain = chain
-        self.inputs.join_chain(inside)
-        self.start(self.samples)
-
-    def lead(self) -> None:
-        """As the first stage of a chain, let the chain compute as far as its inputs allow."""
-        while self.chain is not None and (ready := self.chain.ready()):
-            self.chain.compute(ready[0], last=ready[1])
 
     def publish_copies(self, sparse: list[Sparse], outputs: Sequence[Signals], *, last: bool) -> None:
         """Publish copies of the arrays that the chain has computed, since readers keep the published arrays."""
@@ -385,8 +275,3 @@ class StageRole(Role):
         copied = [copies for copies, _ in memory]
         sparse = self.stage.conclude(self.samples, self.samples + samples, sparse, copied, last=last)
         self._publish(sparse, memory, samples, last=last)
-
-    def part(self, inside: Collection[str]) -> None:
-        """Leave the chain and compute alone."""
-        self.chain, self.node.due = None, True
-        self.inputs.part(inside, self.samples)

@@ -25,7 +25,7 @@ class BlockOrder:
         ended: the last block has arrived.
         repeats: blocks may be repeated, since the source can be restarted in another process.
         held_from: sample from which the newest sample of a lost source is held; None: the source is not lost.
-        rejected: a block of the source was bad; all that follow are ignored.
+        rejected: further blocks are ignored: one was bad, or the source is lost.
         sender: node that has published the next block, as DDS knows it; empty: not known.
     """
 
@@ -44,11 +44,6 @@ class BlockOrder:
         self.source, self.open = source, first is None
         self.received = self.lost = 0
         self.end, self.ended, self.rejected = first or 0, False, False
-
-    @property
-    def ignores(self) -> bool:
-        """Return True if further blocks change nothing: the source is lost, or one of its blocks was bad."""
-        return self.held_from is not None or self.rejected
 
     def reject(self, source: str, why: str) -> BadBlock:
         """Ignore the source's blocks from now on; return the error that names it."""
@@ -76,7 +71,7 @@ class BlockOrder:
         Raises:
             BadBlock: a gap or repeat that is not allowed.
         """
-        if self.ignores:
+        if self.rejected:
             return None
         if self.open:
             self.source, self.end, self.open = source, first, False
@@ -99,7 +94,7 @@ class BlockOrder:
         """Hold the newest sample of a lost source up to sample ``end``, where the run ends."""
         self.held_from = self.end
         self.end = max(end, self.held_from)
-        self.open, self.ended = False, True
+        self.open, self.ended, self.rejected = False, True, True
 
     def resume(self, source: str, end: int, received: int, *, ended: bool) -> None:
         """Resume from the state of another process; earlier blocks count as repeats."""

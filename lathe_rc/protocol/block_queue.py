@@ -71,7 +71,7 @@ class BlockQueue(BlockOrder):
                 gap, repeat, wrong end of the run, or far more waiting blocks than the window allows.
             LatheError: far more waiting blocks in a free-running cell.
         """
-        if self.ignores:
+        if self.rejected:
             return None
         self.sender = sender
         try:
@@ -111,7 +111,7 @@ class BlockQueue(BlockOrder):
         return self._queue(block)
 
     def _queue(self, block: Block) -> Block | None:
-        if self.ignores:
+        if self.rejected:
             return None
         if why := self._fault(block):
             raise self.reject(block.source, f"{block.source} {why}")

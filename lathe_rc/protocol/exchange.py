@@ -60,6 +60,7 @@ class Exchange:
         self.waited = 0.0
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
+        self._newest: dict[str, Run] = {}  # by topic
 
     def join(self, published: Iterable[str]) -> None:
         """Register the topics that a configured node publishes, by fully qualified name."""
@@ -70,8 +71,13 @@ class Exchange:
         return topic in self._inside
 
     def listen(self, topic: str, member: str, callback: Callable[[Any], None]) -> None:
-        """Subscribe a node to a topic of this process (see `has`); its callback receives every `Delivery`."""
+        """Subscribe a node to a topic of this process (see `has`); its callback receives every `Delivery`.
+
+        A late reader, which begins to follow the time master, receives the newest blocks.
+        """
         self._readers[topic][member] = callback
+        if topic in self._newest:
+            callback(self._newest[topic])
 
     def read(self, topic: str) -> bool:
         """Return True if a node of this process reads a topic."""
@@ -83,5 +89,7 @@ class Exchange:
 
     def hand_over(self, topic: str, delivery: Delivery) -> None:
         """Pass a message on to the readers in this process."""
+        if isinstance(delivery, Run):
+            self._newest[topic] = delivery
         for callback in self._readers.get(topic, {}).values():
             callback(delivery)

@@ -3,7 +3,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lathe_rc import messages
 from lathe_rc.blocks.delay_buffer import DelayBuffer, longest_delays, past_of
@@ -155,12 +155,29 @@ class Inputs:
                 queue.hold_newest(end)
         return bool(self.forward) and all(queue.held_from is not None for queue in self.forward) and self.pace is None
 
-    def follow(self, topic: str, master: str, first: int) -> BlockQueue:
-        """Limit the stage to the time master's blocks from sample ``first`` on; return the queue that takes them."""
+    def follow(self, topic: str, master: str) -> BlockQueue:
+        """Limit the stage to the time master's blocks; return the queue that takes them, from the first that comes."""
         self.pace = BlockQueue(topic, messages.ENCODER, self._parameters, [])
-        self.pace.expect(master, first)
+        self.pace.expect(master, None)
         self.pace.repeats = True
         return self.pace
+
+    # ---- restart ------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of buffers and queues for a restart."""
+        return {
+            "past": {topic: (buffer.end, buffer.past()) for topic, buffer in self.buffers.items()},
+            "queues": {topic: queue.state() for topic, queue in self.queues.items()},
+        }
+
+    def go_on(self, sources: Mapping[str, str], state: Mapping[str, Any]) -> None:
+        """Resume from the `state` of another process; ``sources`` has the publisher of each topic."""
+        for topic, (end, past) in state["past"].items():
+            self.buffers[topic].restart(end, past)
+        for topic, queue in self.queues.items():
+            queue.go_on(sources[topic], state["queues"][topic])
+        self.wire()
 
     # ---- in a chain ---------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache
-from itertools import chain, repeat
+from itertools import chain, product, repeat
 from typing import Any
 
 from lathe_rc import messages
@@ -77,7 +77,7 @@ class MemberProtocol:
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
         self._former_peers: tuple[str, ...] = ()
-        self._newest_states: dict[str, CellState] = {}  # by sender, from time masters that are not announced yet
+        self._newest_states: dict[tuple[str, int], CellState] = {}  # by sender and session, of no announced time master
         self.phase: Phase | None = None
         self.active = self.ready = self.safe = self.over = self.done = False
         self.cut, self.left_early = "", False
@@ -235,8 +235,8 @@ class MemberProtocol:
         if self.master is not None and (master.name, master.session) != (self.master.name, self.master.session):
             self._forget_master()
         self.master = master
-        for sender in (master.name, ""):
-            if state := self._newest_states.pop(sender, None):
+        for sender, session in product((master.name, ""), (master.session, 0)):
+            if state := self._newest_states.pop((sender, session), None):
                 self.hear_cell_state(state, now, sender)
 
     def _forget_master(self) -> None:
@@ -278,11 +278,11 @@ class MemberProtocol:
             raise ForeignMessage("members", member.name, member.run_id, why)
 
     def _may_lead(self, other: Announcement) -> bool:
-        """Return True if a time master may replace the current one: before the run, if only it names this member."""
-        if self.master is None or other.name == self.master.name:
+        """Return True for the time master; before the run also for a new process of it, or if only it names this."""
+        if self.master is None or (other.name, other.session) == (self.master.name, self.master.session):
             return True
         names_this = self.own.name in other.members and self.own.name not in self.master.members
-        return names_this and self.phase in (None, Phase.WAITING)
+        return (names_this or other.name == self.master.name) and self.phase in (None, Phase.WAITING)
 
     def _lives(self, member: Announcement) -> bool:
         """Return True if a process of this machine is known to be alive; False for processes of other machines."""
@@ -433,9 +433,11 @@ class MemberProtocol:
             self._reported_blocks = blocks
             self.actions.append(do.Tell(Progress(self.own.run_id, self.own.name, blocks, samples, self._session)))
 
-    def resumed(self, blocks: int) -> None:
-        """Record that the node resumes in place of another process, after a number of blocks."""
+    def resumed(self, blocks: int, samples: int) -> None:
+        """Record that the node resumes in place of another process, after a number of blocks and samples."""
         self._reported_blocks = blocks
+        self._log("info", f"goes on from block {blocks}")
+        self._report("resumed", blocks=blocks, sample=samples)
 
     def reject(self, block: BadBlock, now: float) -> None:
         """Wait for the loss of a member that has sent a bad block; without a cell, nobody can declare it: fail."""
@@ -467,7 +469,9 @@ class MemberProtocol:
             raise ForeignMessage("cell_state", sender, state.run_id, f"state {state.state}; expected one of its states")
         led = self.master is not None and sender in ("", self.master.name)
         if self.master is None or not led or state.session not in (0, self.master.session):
-            self._newest_states[sender] = state  # from a process not announced yet, or from outside the cell
+            self._newest_states[sender, state.session] = (
+                state  # from a process not announced yet, or from outside the cell
+            )
             if len(self._newest_states) > _MOST_MEMBERS:
                 del self._newest_states[next(iter(self._newest_states))]
             if self.master is not None and not led:
@@ -480,12 +484,18 @@ class MemberProtocol:
             self._join_due = now if self.restarts(self.own.name) else now + _NAMESAKE
         if self.failure:
             self._leave_with_the_cell()
-        elif self.phase == Phase.ENDED and self.over and not self.done:
-            self.leave()
+        elif self.phase == Phase.ENDED:
+            self._leave_after_the_end()
         elif self.phase == Phase.FAILED:
             self.fail(LatheError(f"the cell failed: {state.message}"), cause="abandoned")
         elif self.phase == Phase.SAFE:
             self.go_safe(state)
+
+    def _leave_after_the_end(self) -> None:
+        if self.over and not self.done:
+            self.leave()
+        elif not self.ready:
+            self.fail(LatheError(f"{self.own.name}: the run has ended without it"), cause="abandoned")
 
     def _hear_end(self, state: CellState) -> None:
         """Take the end of the run: the planned one, or one that has come nearer."""
@@ -550,7 +560,7 @@ class MemberProtocol:
             return
         name = self.master.name
         self._name_a_silent_master(name, now)
-        waits = self.parameter(name, "stall_reaction") != "safe"
+        waits = self.parameter(name, "stall_reaction") != "safe" and not self._ended_by
         silent = 0.0 if waits else now - self.silent.get(name, math.inf)
         ended = name in self.ended
         if self.failure:
@@ -579,7 +589,7 @@ class MemberProtocol:
         """Report once that the time master stalls the cell, since it cannot report this itself."""
         silent = self.phase == Phase.RUNNING and name in self.silent
         if silent and not self._master_stalls:
-            if now - self._moved < SILENCE:  # blocks in flight are still being computed
+            if now < self._moved + SILENCE:  # blocks in flight are still being computed
                 self.look_due = self._moved + SILENCE
                 return
             self._tell_stall(name, self._reported_blocks, now)
