@@ -259,7 +259,7 @@ def _channel(cell: Cell, name: str) -> _Structure:
 
 
 def _coarse(cell: Cell) -> _Structure:
-    return _Coarse.of(_stage(cell, "electrodynamic_actuator", ElectrodynamicActuator).memory.plant, stopped=0)
+    return _Coarse.of(_stage(cell, "electrodynamic_actuator", ElectrodynamicActuator).memory.plant.drive, stopped=0)
 
 
 def _plays(table: Array) -> _Structure:

@@ -66,9 +66,8 @@ def tuned(path: Path, trials: int = 8) -> Folder:
     start = load().varied({LEAD: 1.8e-3})
     folder = Folder.begin(path, start, None, [], told)
     state = Study(folder)
-    with state.present() as me:
-        while asked := state.ask(me, trials):
-            state.compute(None, asked, ignore)
+    while asked := state.ask(trials):
+        state.compute(None, asked, ignore)
     return folder
 
 

@@ -173,7 +173,7 @@ class Table(BaseModel):
         try:
             return cls(**values)
         except InputError as error:  # from a `model_post_init`, whose messages begin with a parameter, or from a class
-            dot = "." if str(error).partition(" ")[0] in cls.model_fields else ": "
+            dot = "." if str(error).partition(" ")[0].rstrip(",:") in cls.model_fields else ": "
             raise InputError(f"{node}{dot}{error}") from None
         except ValidationError as error:
             first = error.errors()[0]

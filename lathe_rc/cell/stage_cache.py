@@ -83,6 +83,8 @@ class Start:
             self._back.append(partial(setattr, bits, "state", bits.state))
         elif isinstance(part, types.MethodType):
             parts = (part.__self__,)
+        elif type(part) is partial:
+            parts = (part.func, *part.args, *part.keywords.values())
         elif type(part).__basicsize__ == _Plain.__basicsize__ and hasattr(part, "__dict__"):
             attributes = {name: value for name, value in vars(part).items() if not _is_cache(part, name)}
             parts = attributes.values()

@@ -4,7 +4,6 @@
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -19,6 +18,7 @@ from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
+from lathe_rc.plants.drift import NONE as NO_DRIFT
 from lathe_rc.plants.drift import Drift
 from lathe_rc.plants.electrodynamic import CoarseTable, ElectrodynamicDrive, advance
 from lathe_rc.plants.linear import Discretisation
@@ -118,6 +118,10 @@ class ElectrodynamicActuatorParameters(PlantParameters):
             )
         return drift
 
+    def made(self, modes: Modes, drift: Drift = NO_DRIFT) -> ElectrodynamicDrive:
+        """Return the drive with these modes and drift."""
+        return made_of(ElectrodynamicDrive, self, method=self.discretisation, modes=modes, drift=drift)
+
     def jitter(self, whose: str) -> Sensor:
         """Return the jitter of the sampling instants of a sensor, by its name."""
         return Sensor(self.sampling_jitter, 0.0, self.seed, f"{whose}/jitter")
@@ -199,8 +203,7 @@ class ElectrodynamicActuator(SingleDrive):
     step = staticmethod(step)
 
     def __init__(self, name: str, parameters: ElectrodynamicActuatorParameters) -> None:
-        self._make = partial(made_of, ElectrodynamicDrive, parameters, method=parameters.discretisation)
-        self.drive = self._make(modes=parameters.modes(name), drift=parameters.drift(name))
+        self.drive = parameters.made(parameters.modes(name), parameters.drift(name))
         super().__init__(name, parameters)
         self._sensors = [*self._sensors, parameters.jitter(name)]
         self._retraction = OwnRetraction(parameters, parameters.stroke, parameters.gain)
@@ -216,6 +219,5 @@ class ElectrodynamicActuator(SingleDrive):
 
     def states(self) -> Mapping[str, Sequence[Response]]:
         """Responses of the sensor's position to the command in states beside that of the start, by topic."""
-        return self.parameters.states(
-            self.name, self.drive.plant.response, lambda modes: self._make(modes=modes).plant.response
-        )
+        parameters, model = self.parameters, self.drive.plant.response
+        return parameters.states(self.name, model, lambda modes: parameters.made(modes).plant.response)
