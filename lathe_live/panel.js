@@ -287,7 +287,7 @@ function drawMap() {
   label(pen, ABOUT.fed ? "height" : "revolution", 2, bottom + 14, soft);
   for (let x = 0; x < 160; x++) { pen.fillStyle = `rgb(${colour(x / 80 - 1)})`; pen.fillRect(left + x, bottom + 22, 1, 8); }
   for (const um of end > 24 * bend ? [-end, -8 * bend, 8 * bend, end] : [-end, 0, end]) label(pen, digits(um, 2), left + 80 + 80 * share(um), bottom + 42, soft, "center");
-  label(pen, ABOUT.tolerance ? `tolerance ±${digits(ABOUT.tolerance)} µm` : "no tolerance given", left + 185, bottom + 32, soft);
+  label(pen, ABOUT.tolerance ? `tolerance ±${digits(ABOUT.tolerance)} µm` : ABOUT.by_zone ? "tolerance by zone: see lathe run" : "no tolerance given", left + 185, bottom + 32, soft);
 }
 
 function drawWaterfall() {

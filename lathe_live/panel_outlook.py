@@ -35,6 +35,7 @@ def _outlook(name: str, step: float, rpm: float, shown: Mapping[str, Any]) -> di
         "step": step,
         "part": shown.get("part", False),
         "tolerance": shown.get("tolerance", 0.0),
+        "by_zone": shown.get("by_zone", False),
         "fed": shown.get("fed", False),
         "gaps": shown.get("gaps", []),
         "radius": shown.get("cut_radius", shown.get("radius", 50.0)),

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
-from lathe_rc.analysis.tolerance import judge, judge_zones
+from lathe_rc.analysis.tolerance import judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
 from lathe_rc.cell.events import LIMITED, OUT_OF_REACH, parse
@@ -302,11 +302,9 @@ class _Keeper(Errors):
                 if not math.isfinite(value):
                     raise LatheError(f"{name} is {value}; allowed: a finite number")
         if self._tolerance and not self.soundness.why:
-            before, doubt = self._before, self._doubt
-            verdict = (
-                judge_zones(self._by_zone.largest(), self._tolerance, self._zones, before, doubt=doubt)
-                if self._by_zone
-                else judge(errors.largest, self._tolerance, before, doubt=doubt)
+            by_zone = self._by_zone.largest() if self._by_zone else []
+            verdict = judge_zones(
+                errors.largest, by_zone, self._tolerance, self._zones, self._before, doubt=self._doubt
             )
             found["tool.in_tolerance_from"] = verdict.since or None
         return found

@@ -10,14 +10,12 @@ from rosbags.interfaces import Nodetype
 from lathe_export.tables.formats import Format
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
-from lathe_rc.blocks.columns import TEXT, Column
+from lathe_rc.blocks.columns import MOST_COLUMNS, TEXT, Column, flattened
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
 
 _TIMES = (Column("time", np.dtype(np.float64), "s"), Column("log_ns", np.dtype(np.int64), "ns"))  # by the log
 _STAMP = Column("stamp_ns", np.dtype(np.int64), "ns")  # in the header
-_OCTET = {"octet": "uint8", "char": "uint8", "byte": "uint8"}
-_MOST_COLUMNS = 1024
 _ROWS = 4096  # number of rows written together
 
 Cell = tuple[Any, np.dtype[Any]]
@@ -28,28 +26,14 @@ def is_known(msgtype: str) -> bool:
     return msgtype in messages.store().fielddefs
 
 
-def _element(kind: Nodetype, detail: Any, name: str, value: Any) -> Iterator[tuple[str, Cell]]:
-    """Yield the columns of a field, or of an element of a list."""
-    if kind == Nodetype.BASE:
-        yield name, (value, TEXT if "string" in detail[0] else np.dtype(_OCTET.get(detail[0], detail[0])))
-    elif kind == Nodetype.NAME:
-        for part, (inner, about) in messages.fields(detail):
-            yield from _element(inner, about, f"{name}.{part}" if name else part, getattr(value, part))
-    elif len(value) > _MOST_COLUMNS:
-        raise InputError(f"{name} has {len(value)} elements; allowed in a table: {_MOST_COLUMNS} columns")
-    else:
-        for place, each in enumerate(value):
-            yield from _element(detail[0][0], detail[0][1], f"{name}[{place}]", each)
-
-
 def _row(msgtype: str, log_ns: int, data: bytes) -> dict[str, Cell]:
     """Return the columns of an encoded message."""
     message = messages.decode(msgtype, data)
     row = {"time": (log_ns / 1e9, _TIMES[0].dtype), "log_ns": (log_ns, _TIMES[1].dtype)}
     if messages.fields(msgtype)[:1] == [("header", (Nodetype.NAME, "std_msgs/msg/Header"))]:
         row["stamp_ns"] = messages.stamp_ns(message), _STAMP.dtype
-    row |= {n: cell for n, cell in _element(Nodetype.NAME, msgtype, "", message) if not n.startswith("header.stamp.")}
-    return row
+    parts = flattened(message)
+    return row | {name: (value, dtype) for name, value, dtype in parts if not name.startswith("header.stamp.")}
 
 
 def _rows(source: Source, topic: str) -> Iterator[dict[str, Cell]]:
@@ -80,8 +64,8 @@ def _columns(source: Source, topic: str) -> list[Column]:
         for name, (_, dtype) in row.items():
             types.setdefault(name, dtype)
             seen[name] = seen.get(name, 0) + 1
-        if len(types) > _MOST_COLUMNS:
-            raise InputError(f"{source.path}: {topic} has {len(types)} columns; allowed in a table: {_MOST_COLUMNS}")
+        if len(types) > MOST_COLUMNS:
+            raise InputError(f"{source.path}: {topic} has {len(types)} columns; allowed in a table: {MOST_COLUMNS}")
     order = {name: place for place, (name, _) in enumerate(messages.fields(source.topics[topic].type))}
 
     def place(name: str) -> int:

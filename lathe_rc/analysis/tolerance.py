@@ -206,7 +206,8 @@ def judge(
 
 
 def judge_zones(
-    largest: Sequence[Array],
+    largest: Array,
+    by_zone: Sequence[Array],
     tolerance: float,
     zones: Sequence[Zone],
     before: int = 0,
@@ -214,22 +215,23 @@ def judge_zones(
     unjudged: str = "",
     doubt: float = 0.0,
 ) -> Verdict:
-    """Judge whether a part is in tolerance, by zones of its surface.
+    """Judge whether a part is in tolerance, by zones of its surface if it has any.
 
     Args:
-        largest: largest errors outside of all zones and in each, see `ZoneErrors.largest`.
+        largest: see `judge`.
+        by_zone: largest errors outside of all zones and in each, see `ZoneErrors.largest`.
         tolerance: allowed error to each side outside of the zones [m].
         zones: the zones.
         before: see `judge`.
         unjudged: see `judge`.
         doubt: see `judge`.
     """
-    if unjudged:
-        return judge(largest[0], tolerance, before, unjudged=unjudged, doubt=doubt)
+    if unjudged or not zones:
+        return judge(largest, tolerance, before, unjudged=unjudged, doubt=doubt)
     named = [(tolerance, "elsewhere"), *((zone.tolerance, zone.name) for zone in zones)]
     parts = [
         replace(judge(errors, allowed, before, doubt=doubt), place=place)
-        for errors, (allowed, place) in zip(largest, named, strict=True)
+        for errors, (allowed, place) in zip(by_zone, named, strict=True)
         if allowed
     ]
     worst = min(parts, key=lambda each: each.spare if each.spare == each.spare else -np.inf)

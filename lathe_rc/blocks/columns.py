@@ -2,7 +2,7 @@
 """Signal topics as tables: columns with units, and one row per sample or message."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -13,9 +13,12 @@ from rosbags.interfaces import Nodetype
 
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Sparse
+from lathe_rc.errors import InputError
 from lathe_rc.messages import NOT_SIGNALS, START_NS, Samples, Signals
 
 TEXT = np.dtype(object)  #: element type of strings
+MOST_COLUMNS = 1024  #: columns of a table
+_OCTET = {"octet": "uint8", "char": "uint8", "byte": "uint8"}
 _FIELD = re.compile(r"\S+\s+(\w+)\s*#(.*)")
 _UNIT = re.compile(r"\[([^\[\]]+)\]")
 
@@ -75,6 +78,28 @@ def _element(kind: Nodetype, detail: Any) -> np.dtype[Any]:
     """Return the element type of a field that is a number, a string, or a list of them."""
     base = detail if kind == Nodetype.BASE else cast("Any", detail)[0][1]
     return TEXT if base[0] == "string" else np.dtype(base[0])
+
+
+def flattened(message: Any) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
+    """Yield name, value and type of each number and string in a message of any type, such as ``position[0]``.
+
+    Raises:
+        InputError: a list has more elements than a table may have columns.
+    """
+    return _parts(Nodetype.NAME, message.__msgtype__, "", message)
+
+
+def _parts(kind: Nodetype, detail: Any, name: str, value: Any) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
+    if kind == Nodetype.BASE:
+        yield name, value, TEXT if "string" in detail[0] else np.dtype(_OCTET.get(detail[0], detail[0]))
+    elif kind == Nodetype.NAME:
+        for part, (inner, about) in messages.fields(detail):
+            yield from _parts(inner, about, f"{name}.{part}" if name else part, getattr(value, part))
+    elif len(value) > MOST_COLUMNS:
+        raise InputError(f"{name} has {len(value)} elements; allowed in a table: {MOST_COLUMNS} columns")
+    else:
+        for place, each in enumerate(value):
+            yield from _parts(detail[0][0], detail[0][1], f"{name}[{place}]", each)
 
 
 def dense_rows(first: int, signals: Signals, step_ns: int) -> dict[str, Samples]:

@@ -5,7 +5,7 @@ A path names fields and elements: ``/commands.data[0]``, ``/joint_states.positio
 with the number that x has in the field ``name`` of the same message.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +15,14 @@ from rosbags.interfaces import Nodetype
 
 from lathe_rc import messages
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.blocks.columns import TEXT, flattened
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Clock
 
 _SI = "1"  # unit: ROS messages have SI units (REP 103)
-_MOST = 256  # columns of a topic
 _GAP = 10.0  # intervals between messages, over which nothing is known
-_NAMES = "name"
 
 
 class _Series(NamedTuple):
@@ -51,7 +50,7 @@ class MessageColumns(measurement_file.Source):
             for topic, about in sorted(source.topics.items()):
                 if about.count and about.type in messages.store().fielddefs:
                     _, _, data = next(source.messages({topic}))
-                    self.units |= {f"{topic}.{name}": _SI for name in _names(_decoded(path, topic, about.type, data))}
+                    self.units |= {f"{topic}.{name}": _SI for name in _numbers(_decoded(path, topic, about.type, data))}
             known = self.units.keys() >= set(asked)
             series = {column: _series(source, column) for column in asked} if known else {}
         self._step_ns, self._columns = _resampled(path, series) if series else (0.0, {})
@@ -72,39 +71,16 @@ def _decoded(path: Path, topic: str, msgtype: str, data: bytes) -> Any:
         raise LatheError(f"{path}: {topic}: {shown(error)}") from None
 
 
-def _names(message: Any, before: str = "") -> Iterator[str]:
-    """Yield the paths of the numbers in a message, up to `_MOST` of a list."""
-    for name, (kind, detail) in messages.fields(message.__msgtype__):
-        value = getattr(message, name)
-        if name == "header":
-            continue
-        if kind == Nodetype.NAME:
-            yield from _names(value, f"{before}{name}.")
-        elif kind == Nodetype.BASE and detail[0] != "string":
-            yield f"{before}{name}"
-        elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and len(value) and not isinstance(value[0], str):
-            if hasattr(value[0], "__msgtype__"):
-                continue
-            names = getattr(message, _NAMES, ())
-            yield from (f"{before}{name}[{k}]" for k in range(min(len(value), _MOST)))
-            if not isinstance(names, str) and len(names) == len(value):
-                yield from (f"{before}{name}[{each}]" for each in names)
-
-
-def _number(message: Any, path: str) -> float:
-    """Return the number at a path of a message.
-
-    Raises:
-        LookupError: the message has no such element.
-    """
-    owner, value = message, message
-    for part in path.split("."):
-        name, _, element = part.partition("[")
-        owner, value = value, getattr(value, name)
-        if element:
-            key = element[:-1]
-            value = value[int(key) if key.isdigit() else list(getattr(owner, _NAMES)).index(key)]
-    return float(value)
+def _numbers(message: Any) -> dict[str, float]:
+    """Return the numbers in a message by path; an element also by its name, if it has one."""
+    found = {
+        name: value for name, value, dtype in flattened(message) if dtype != TEXT and not name.startswith("header.")
+    }
+    names = getattr(message, "name", ())
+    named = [] if isinstance(names, str) else [*enumerate(names)]
+    for name in [*found]:
+        found |= {name.replace(f"[{k}]", f"[{each}]"): found[name] for k, each in named if name.endswith(f"[{k}]")}
+    return found
 
 
 def _series(source: Source, column: str) -> _Series:
@@ -115,8 +91,8 @@ def _series(source: Source, column: str) -> _Series:
     for _, log_ns, data in source.messages({topic}):
         message = _decoded(source.path, topic, msgtype, data)
         try:
-            values.append(_number(message, path))
-        except (LookupError, ValueError):
+            values.append(float(_numbers(message)[path]))
+        except LookupError:
             raise InputError(
                 f"{source.path}: {topic} at {log_ns} ns has no {path}; allowed: in every message"
             ) from None

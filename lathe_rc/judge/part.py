@@ -10,7 +10,7 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge, judge_zones
+from lathe_rc.analysis.tolerance import Growth, Verdict, growth, judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
@@ -78,12 +78,12 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     for of, allowed in tolerances(judged(scenario.nodes)).items():
         if topic.endswith(f"/{of}"):
             (sound, why), doubt, before = recording.sound_form, form_doubt(scenario.nodes), _turns_before(recording)
-            if by_zone := zones(judged(scenario.nodes)).get(of):
-                errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
-                angle = recording.of_type(messages.ENCODER)["angle_true"]
-                errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
-                return judge_zones(errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
-            return judge(recording.errors.largest, allowed, before, unjudged=why, doubt=doubt)
+            by_zone = zones(judged(scenario.nodes)).get(of, ())
+            errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
+            angle = recording.of_type(messages.ENCODER)["angle_true"]
+            errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
+            largest = recording.errors.largest
+            return judge_zones(largest, errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
     return None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge, judge_zones
+from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
@@ -122,9 +122,8 @@ class Form:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
         if not self.tolerance or self.refused:
             return None
-        if self.zones:
-            return judge_zones(self._by_zone.largest(), self.tolerance, self.zones, self._before, doubt=self._doubt)
-        return judge(np.array(self._largest), self.tolerance, self._before, doubt=self._doubt)
+        largest, by_zone = np.array(self._largest), self._by_zone.largest()
+        return judge_zones(largest, by_zone, self.tolerance, self.zones, self._before, doubt=self._doubt)
 
     @property
     def growth(self) -> Growth | None:

@@ -103,10 +103,11 @@ class ToolParameters(FormParameters):
         return Judged(remapped(self, "tool"), "form", self.step, self.tolerance, self.nose_radius, zones=self.zones)
 
     def shown(self) -> Mapping[str, Any]:
-        """Part, tolerance and feed of the tool."""
+        """Part, tolerance and feed of the tool; drawings have no tolerance that differs by zone."""
         return {
             "part": True,
-            "tolerance": self.tolerance * 1e6,
+            "tolerance": 0.0 if self.zone_start else self.tolerance * 1e6,
+            "by_zone": bool(self.zone_start),
             "fed": bool(self.feed or self.height_from == "slide"),
             "feed": self.feed if self.height_from == "feed" else 0.0,
             "radius": self.part_radius * 1e3,
