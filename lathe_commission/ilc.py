@@ -140,7 +140,7 @@ class Response:
 
     @property
     def known(self) -> Known:
-        """The drive, as laws are told of it."""
+        """Knowledge of the drive for laws."""
         model = self.model
         return Known(self, model.delay if model else 0.0, self.points, model.mode_frequency if model else ())
 
