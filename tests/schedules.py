@@ -7,7 +7,7 @@ check the guarantees of docs/cell.md. The same seed gives the same schedule.
 """
 
 import random
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -361,9 +361,18 @@ def unsafe(cell: Simulation) -> list[str]:
     # A new process of a killed member may be too late for the end of the run.
     failed = [each for each in everyone if each.protocol.failure and each.full_name not in cell.killed]
     causes = [str(each.protocol.failure) for each in failed]
-    if causes and not cell.loses and not any(name in text for name in to_blame for text in causes):
-        found.append(f"none of {causes} names {sorted(to_blame)}")
+    named = to_blame | (_fed_by(cell, to_blame) if cell.devices else set())
+    if causes and not cell.loses and not any(name in text for name in named for text in causes):
+        found.append(f"none of {causes} names {sorted(named)}")
     return found
+
+
+def _fed_by(cell: Simulation, names: Collection[str]) -> set[str]:
+    """Return the members that wait for some others: their readers cannot tell that from a device that loses blocks."""
+    found = set(names)
+    for _ in cell.designs:
+        found |= {each.name for each in cell.designs if found & {name for name, _ in each.inputs}}
+    return found - set(names)
 
 
 def _end_of_safe(cell: Simulation, safe: int) -> int:

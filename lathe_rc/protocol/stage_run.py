@@ -170,7 +170,9 @@ class StageRun(Work):
         return self.together if self.restart is None else max(min(self.together, self.restart.keep_at - self.blocks), 1)
 
     def hold_quiet_inputs(self, now: float) -> None:
-        """Hold inputs from devices that have lost the last block."""
+        """Hold inputs from devices that have lost the last block, until the last one is computed."""
+        if self.node.protocol.over:
+            return
         queues = self.inputs.queues.values()
         for queue in queues:
             queue.end_with(queues, now)

@@ -19,6 +19,7 @@ SAMPLES = 200_000  # beyond the event of each scenario that has one
 #: scenarios that Python changes beside the steps, with what they are refused for
 REFUSED = {
     "adaptive_inverse": "correction_model = identified",
+    "oval3000_hard": "gauge: the event 'sample 0: freeze'",
     **dict.fromkeys(["supervised", "supervised_full_cell", "supervised_two_channel"], "publish_margin = true"),
 }
 #: the same with what Python does left out, and stages with further kinds of inputs
