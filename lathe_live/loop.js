@@ -71,5 +71,5 @@ $("back")?.addEventListener("click", () => {
 $("write")?.addEventListener("click", async () => {
   try { $("written").textContent = (await ask("write", { values: { ...VALUES } })).written; } catch (error) { $("written").textContent = error.message; }
 });
-if (INPUTS.length) update();
+if (INPUTS.length) READY.then(update);
 }

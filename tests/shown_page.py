@@ -4,6 +4,7 @@
 import base64
 import json
 import re
+import zlib
 from hashlib import sha256
 from html.parser import HTMLParser
 
@@ -23,7 +24,7 @@ class ShownPage(HTMLParser):
         self.tags, self.links, self.ids, self.scripts, self.tables = [], [], [], [], {}
         self.feed(source)
         self.text = " ".join(self.text.split())
-        found = json.loads(self.scripts[0]) if self.scripts else {}
+        found = json.loads(zlib.decompress(base64.b64decode(self.scripts[0]))) if self.scripts else {}
         self.specs, self.data = found.get("specs", {}), found.get("data", {})
 
     def handle_starttag(self, tag, attributes):

@@ -64,26 +64,31 @@ def test_a_long_run_is_averaged_together_with_a_short_one(compared, monkeypatch)
     assert_allclose(found.maps["fast"], fine.reshape(3, 3, 128).mean(axis=1), atol=1e-9)
 
 
-@pytest.mark.parametrize("tolerance", [0.5, 3.0, 12.0, 500.0])
-def test_the_strip_tells_the_verdict_of_any_tolerance(compared, tolerance):
+@pytest.mark.parametrize(("tolerance", "doubt"), [(0.5, 0.0), (3.0, 0.0), (12.0, 0.0), (12.0, 8.0), (500.0, 0.0)])
+def test_the_strip_tells_the_verdict_of_any_tolerance(compared, tolerance, doubt, monkeypatch):
     charts = Charts()
+    monkeypatch.setattr(compared.forms["slow"], "doubt", doubt * 1e-6)
     together = figures.compared(compared.forms, tolerance * 1e-6)
     charts.data.update(together.data)
     (place,) = charts.place([figures.verdicts(together)])
     drawn = base64.b64decode(charts.picture(place, 1).partition(",")[2]).decode()
     for name, result in compared.results.items():
-        since = judge(result.part.form.largest, tolerance * 1e-6).since
+        since = judge(result.part.form.largest, tolerance * 1e-6, doubt=compared.forms[name].doubt).since
         told = f"within the tolerance from revolution {since} on" if since else "not within the tolerance at the end"
         assert re.search(f">{name}: {told}<", drawn)
 
 
-def test_a_scenario_runs_first(compared, tmp_path):
+def test_a_scenario_runs_first_and_nodes_that_only_it_has_are_folded(compared, tmp_path):
     page = tmp_path / "page.html"
-    (tmp_path / "short.yaml").write_text(config("piston", "spindle_encoder.revolutions=5").to_yaml())
+    (tmp_path / "short.yaml").write_text(config("supervised", "spindle_encoder.revolutions=5").to_yaml())
     done = lathe("compare", tmp_path / "short.yaml", compared.folder / "fast", "-o", page)
     assert done.exit_code == 0, done.output
-    rows = ShownPage(page.read_text(encoding="utf-8")).rows("")
-    assert [row[:2] for row in rows] == [["short", "5"], ["fast", "9"]]
+    shown = ShownPage(page.read_text(encoding="utf-8"))
+    assert [row[:2] for row in shown.rows("")] == [["short", "5"], ["fast", "9"]]
+    common, folded = shown.source.split("<details>")
+    assert "spindle_encoder.revolutions" in common
+    assert "supervisor.force_limit" in folded
+    assert "supervisor.force_limit" not in common
 
 
 @pytest.mark.parametrize(

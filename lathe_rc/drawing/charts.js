@@ -1,7 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // Draws the figures of a page in its own colours, light or dark, and as wide as the page is.
 // A figure with a parameter "box" is enlarged by dragging across it; a double click or the button shows the whole figure again.
-const { specs: SPECS, data: DATA, chosen: CHOSEN, look: LOOK } = JSON.parse(document.getElementById("figures").textContent);
+let SPECS, DATA, CHOSEN, LOOK;
+const READY = (async () => {
+  const packed = Uint8Array.from(atob(document.getElementById("figures").textContent), each => each.charCodeAt(0));
+  const whole = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  ({ specs: SPECS, data: DATA, chosen: CHOSEN, look: LOOK } = await new Response(whole).json());
+})();
 const DARK = matchMedia("(prefers-color-scheme: dark)"), ENLARGED = {}, LEAST = 8, MARGIN = 5; // [px]
 // Inputs of the page that set a parameter of the figures which have it; their parameters are named in usermeta.signals.
 const STEERS = [...document.querySelectorAll("input[data-signal]")], STEERED = {};
@@ -80,4 +85,4 @@ let waiting, width = innerWidth;
 addEventListener("resize", () => { if (innerWidth != width) { width = innerWidth; clearTimeout(waiting); waiting = setTimeout(drawAll, 150); } });
 DARK.addEventListener("change", drawAll);
 STEERS.forEach(each => each.addEventListener("input", steerAll));
-drawAll();
+READY.then(drawAll);

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -142,9 +143,10 @@ class Charts:
         return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
     @property
-    def document(self) -> Spec:
-        """Return all data that the page's script needs."""
-        return {"specs": self.specs, "data": self.data, "chosen": self.chosen, "look": LOOK}
+    def packed(self) -> str:
+        """Return all data that the page's script needs, as JSON in zlib's format, a fifth of the size, in base64."""
+        document = {"specs": self.specs, "data": self.data, "chosen": self.chosen, "look": LOOK}
+        return base64.b64encode(zlib.compress(json.dumps(document).encode(), 9)).decode()
 
     @property
     def scripts(self) -> list[str]:

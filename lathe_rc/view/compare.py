@@ -105,16 +105,17 @@ def _servo_figures(
         yield {"node": node, "loop": loop, "run": name, **{each: charts.place([spec]) for each, spec in drawn.items()}}
 
 
-def _parameters(runs: Mapping[str, Gathered]) -> Grid | None:
-    """Return the parameters that differ, as the scenarios of the bags give them; None if none do."""
+def _parameters(runs: Mapping[str, Gathered]) -> tuple[Grid | None, Grid | None]:
+    """Return the parameters that differ, as the scenarios of the bags give them: of nodes of all runs, of some only."""
     scenarios = [data.nodes for data in runs.values()]
     names = {(node, name) for nodes in scenarios for node, values in nodes.items() for name in values}
-    rows = []
+    common, further = list[list[str]](), list[list[str]]()
     for node, name in sorted(name for name in names if name[1] != "run_id"):
         values = [str(nodes.get(node, {}).get(name, _ABSENT)) for nodes in scenarios]
         if len(set(values)) > 1:
-            rows.append([f"{node}.{name}", *values])
-    return grid(("parameter", *runs), rows, ("parameter", *runs), len(rows))
+            (common if all(node in nodes for nodes in scenarios) else further).append([f"{node}.{name}", *values])
+    columns = ("parameter", *runs)
+    return grid(columns, common, columns, len(common)), grid(columns, further, columns, len(further))
 
 
 def _signals(runs: Mapping[str, Gathered], charts: Charts) -> Iterator[dict[str, Any]]:

@@ -36,6 +36,7 @@ class Compared:
         revolutions: number of revolutions of the longest run.
         shown: revolution shown first, the last one that all runs have.
         sizes: largest magnitude of the form error [µm] by name and revolution.
+        doubts: how far the desired form of each run may be off between the points of its table [µm].
         tolerance: tolerance shown first [µm].
         unjudged: runs whose end is not known.
     """
@@ -46,6 +47,7 @@ class Compared:
     revolutions: int
     shown: int
     sizes: Mapping[str, tuple[Samples, Samples]]
+    doubts: Mapping[str, float]
     tolerance: float
     unjudged: Collection[str] = ()
 
@@ -62,7 +64,7 @@ class Compared:
         numbers = {MAPS: fields, SPECTRA: spectra * 2.0 / _ACROSS}
         sizes: Rows = []
         for name, (revolution, size) in self.sizes.items():
-            sizes += rows(r=revolution, v=size, l=name)
+            sizes += rows(r=revolution, v=size, d=self.doubts[name], l=name)
         plain = {name: [{"data": number(each, 4)} for each in found.ravel()] for name, found in numbers.items()}
         return {**plain, SIZES: sizes}
 
@@ -89,7 +91,8 @@ def compared(forms: Mapping[str, Form], tolerance: float, unjudged: Collection[s
     least = min(float(size[-1]) for _, size in sizes.values())
     shown = min(form.map.size for form in forms.values())
     first_shown = tolerance * 1e6 or float(f"{2.0 * least:.1g}")
-    return Compared(maps, differences, step, longest, shown, sizes, first_shown, unjudged)
+    doubts = {name: 1e6 * form.doubt for name, form in forms.items()}
+    return Compared(maps, differences, step, longest, shown, sizes, doubts, first_shown, unjudged)
 
 
 def _rows(form: Form, step: int, count: int) -> Samples:
@@ -161,7 +164,7 @@ def _rule(channel: str, signal: str, dash: Sequence[int] = ()) -> Spec:
 def verdicts(runs: Compared) -> Spec:
     """Return a strip of revolutions within and beyond the tolerance per run, with the verdict."""
     worst = {"op": "max", "field": "beyond", "as": "last"}, {"op": "max", "field": "r", "as": "end"}
-    beyond = {"calculate": "datum.v <= tolerance ? 0 : datum.r", "as": "beyond"}
+    beyond = {"calculate": "datum.v + datum.d <= tolerance ? 0 : datum.r", "as": "beyond"}
     text = (
         f"datum.l + (indexof({json.dumps([*runs.unjudged])}, datum.l) >= 0 ? ': not judged, its end is not known' : "
         "datum.last >= datum.end ? ': not within the tolerance at the end' : "

@@ -78,7 +78,7 @@ class Form:
         zones: Sequence[Zone] = (),
     ) -> None:
         self._soundness = Soundness.of_form(types)
-        self._encoder, self.tool, self.tolerance, self._doubt = encoder, tool, tolerance, doubt
+        self._encoder, self.tool, self.tolerance, self.doubt = encoder, tool, tolerance, doubt
         self._nose_radius = nose_radius
         self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
@@ -123,7 +123,7 @@ class Form:
         if not self.tolerance or self.refused:
             return None
         largest, by_zone = np.array(self._largest), self._by_zone.largest()
-        return judge_zones(largest, by_zone, self.tolerance, self.zones, self._before, doubt=self._doubt)
+        return judge_zones(largest, by_zone, self.tolerance, self.zones, self._before, doubt=self.doubt)
 
     @property
     def growth(self) -> Growth | None:

@@ -61,7 +61,7 @@ def test_the_comparison_is_quiet_and_small(page, tmp_path):
     assert visit.console == []
     assert visit.requests == []
     assert visit.document.count('class="drawn"') == 7
-    assert page.stat().st_size < 4_000_000
+    assert page.stat().st_size < 3_000_000
 
 
 def test_one_revolution_and_one_tolerance_steer_all_figures(page, tmp_path):
