@@ -3,6 +3,7 @@
 
 import functools
 import http.server
+import json
 import queue
 import re
 import subprocess
@@ -33,20 +34,30 @@ addEventListener("load", () => document.fonts.ready.then(() => setTimeout(() => 
 </script></body>"""
 
 
-# Types a word into the search and tells the server the first answers once they are there: a worker looks for them.
+# Types words into the search, one after the other, and tells the server the first answers to each once they are there: a
+# worker looks for them.
 _SEARCH = """<script>
-addEventListener("load", () => {
-  const query = document.querySelector("[data-md-component=search-query]");
+addEventListener("load", async () => {
+  const query = document.querySelector("[data-md-component=search-query]"), answers = [];
+  const links = () => [...document.querySelectorAll(".md-search-result__link")].map(link => new URL(link.href).pathname);
+  async function type(word, until) {
+    query.value = word;
+    do {
+      query.dispatchEvent(new Event("keyup", { bubbles: true }));
+      await new Promise(done => setTimeout(done, 200));
+    } while (!until(links()));
+  }
   document.getElementById("__search").checked = true;
   query.focus();
-  query.value = "predistortion";
-  setInterval(() => {
-    query.dispatchEvent(new Event("keyup", { bubbles: true }));
-    const found = [...document.querySelectorAll(".md-search-result__link")].map(link => new URL(link.href).pathname);
-    if (found.length) fetch("/told?" + found.join());
-  }, 200);
+  for (const word of WORDS) {
+    await type(word, found => found.length);
+    answers.push(links().join());
+    await type("", found => !found.length);
+  }
+  fetch("/told?" + answers.join(";"));
 });
 </script></body>"""
+WORDS = ["predistortion", "tolerance", "csv", "plot", "emergency stop", "install", "delay", "noise", "piston", "stability"]
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -94,18 +105,20 @@ def test_the_check_would_see_a_stranger_and_a_complaint(site, tmp_path):
     assert any("complaint" in line for line in visit.console)
 
 
-def test_search_finds_a_word_in_pages_and_docstrings(site, tmp_path):
+def test_search_finds_guides_before_docstrings(site, tmp_path):
     folder, address = site
     text = (folder / "index.html").read_text(encoding="utf-8")
-    (folder / "search.html").write_text(text.replace("</body>", _SEARCH), encoding="utf-8")
+    script = _SEARCH.replace("WORDS", json.dumps(WORDS))
+    (folder / "search.html").write_text(text.replace("</body>", script), encoding="utf-8")
     command = ["chromium", *WITHOUT_END, *QUIET, OFFLINE, f"--user-data-dir={tmp_path}", f"{address}/search.html"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as browser:
         try:
-            places = Quiet.told.get(timeout=120).split(",")
+            answers = [answer.split(",") for answer in Quiet.told.get(timeout=120).split(";")]
         finally:
             browser.kill()
-    assert "/force_position/" in places
-    assert "/api/lathe_rc.control/" in places
+    first = {word: found[0] for word, found in zip(WORDS, answers, strict=True)}
+    assert not [place for place in first.items() if place[1].startswith(("/api/", "/reference/", "/changelog/"))]
+    assert "/api/lathe_rc.control/" in answers[0]
 
 
 @pytest.mark.parametrize("width", [1280, 420])

@@ -27,6 +27,7 @@ from workplace import NODE, ROOT
 DOCS = ROOT / "docs"
 ROOT_PAGES = {"README.md": "start.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 MERMAID = "assets/mermaid.js"
+LISTS = {"reference.md", "changelog.md", "contributing.md", "tests.md", "licences.md", "performance.md"}  #: found last
 SECTIONS = "## All pages"  # of docs/index.md; a heading below is a section, a link that begins an item a page of it
 
 _SECTION = re.compile(r"^### (.+)$|^- \[(.+?)\]\((.+?)\)", re.MULTILINE)
@@ -101,7 +102,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Point links into the site, take equations out, and write lists as Python-Markdown reads them."""
-    if page.file.src_uri.startswith(f"{api.FOLDER}/"):
+    own = page.file.src_uri.startswith(f"{api.FOLDER}/")
+    if own or page.file.src_uri in LISTS:
+        page.meta["search"] = {"boost": 1e-4}  # headings count a thousand times as much as text
+    if own:
         return markdown
     by_place = {place: name for name, place in ROOT_PAGES.items()}
     source = ROOT / by_place[page.file.src_uri] if page.file.src_uri in by_place else DOCS / page.file.src_uri
