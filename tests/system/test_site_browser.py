@@ -34,12 +34,12 @@ addEventListener("load", () => document.fonts.ready.then(() => setTimeout(() => 
 </script></body>"""
 
 
-# Types words into the search, one after the other, and tells the server the first answers to each once they are there: a
-# worker looks for them.
+# Types words into the search, one after the other, and tells the server the answers to each once a worker found them.
 _SEARCH = """<script>
 addEventListener("load", async () => {
   const query = document.querySelector("[data-md-component=search-query]"), answers = [];
-  const links = () => [...document.querySelectorAll(".md-search-result__link")].map(link => new URL(link.href).pathname);
+  const found = document.getElementsByClassName("md-search-result__link");
+  const links = () => [...found].map(link => new URL(link.href).pathname);
   async function type(word, until) {
     query.value = word;
     do {
@@ -57,7 +57,7 @@ addEventListener("load", async () => {
   fetch("/told?" + answers.join(";"));
 });
 </script></body>"""
-WORDS = ["predistortion", "tolerance", "csv", "plot", "emergency stop", "install", "delay", "noise", "piston", "stability"]
+WORDS = "predistortion tolerance csv plot emergency install delay noise piston stability".split()
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
