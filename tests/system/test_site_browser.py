@@ -57,7 +57,7 @@ addEventListener("load", async () => {
   fetch("/told?" + answers.join(";"));
 });
 </script></body>"""
-WORDS = "predistortion tolerance csv plot emergency install delay noise piston stability".split()
+WORDS = ["predistortion", "tolerance", "csv", "plot", "emergency stop", "install", "delay", "noise", "piston", "margin"]
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
