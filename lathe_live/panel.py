@@ -28,8 +28,8 @@ _FILES = ("save", "load")  # events that need a file, which the page does not na
 
 def page() -> Page:
     """Return the page of the panel."""
-    styles, scripts = [own_file("panel.css", _HERE)], [own_file("panel.js", _HERE)]
-    return Page("panel", own_file("panel.html", _HERE), styles, scripts)
+    scripts = [own_file(f"{name}.js", _HERE) for name in ("panel", "panel_drawings", "panel_commands")]
+    return Page("panel", own_file("panel.html", _HERE), [own_file("panel.css", _HERE)], scripts)
 
 
 def with_loops(panel: Site, loop: Site) -> Site:

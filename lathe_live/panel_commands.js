@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: Apache-2.0
+// Commands of the panel; each answer stands at its command.
+async function tell(name, question) {
+  try {
+    const answer = await ask(name, question);
+    if ($("refusal")) $("refusal").remove();
+    return answer;
+  } catch (error) {
+    refuse(error.message);
+    return null;
+  }
+}
+let refused;
+function refuse(text) {
+  clearTimeout(refused);
+  const place = $("refusal") || $("bar").insertAdjacentElement("afterend", Object.assign(document.createElement("p"), { id: "refusal", className: "trouble" }));
+  place.setAttribute("role", "alert");
+  place.textContent = text;
+  refused = setTimeout(() => place.remove(), 15000);
+}
+
+function options(select, names) {
+  const before = select.value;
+  select.replaceChildren(...names.map(name => new Option(name)));
+  if (names.includes(before)) select.value = before;
+}
+
+function describe() { // fills the commands from what the cell tells of itself
+  document.title = `${ABOUT.name}: panel`;
+  $("name").textContent = ABOUT.name;
+  $("commands").hidden = !can("command");
+  for (const id of ["change", "repeat", "restart"]) $(id).hidden = !can("change");
+  $("record").hidden = !can("record");
+  for (const [id, why] of Object.entries(cannot())) $(id).title = why;
+  for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
+  $("seeking").hidden = !can("seek");
+  for (const place of document.querySelectorAll(".of-part")) place.hidden = !ABOUT.part;
+  if (!can("command")) return;
+  $("actions").replaceChildren(...ABOUT.nodes.filter(node => node.actions.length || node.knobs.length).map(node => {
+    const row = document.createElement("div"), name = document.createElement("b");
+    row.className = "actions";
+    name.textContent = node.name;
+    row.append(name);
+    if (node.learning.length) {
+      const state = Object.assign(document.createElement("span"), { className: "note" });
+      state.dataset.learning = JSON.stringify(node.learning);
+      row.append(state);
+    }
+    for (const action of node.actions) {
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: action, title: DOES[action] || "" });
+      button.addEventListener("click", () => tell("act", { node: node.name, action }));
+      row.append(button);
+    }
+    for (const knob of node.knobs) {
+      const label = document.createElement("label"), input = Object.assign(document.createElement("input"), { size: 8, value: knob.value, title: knob.doc });
+      input.addEventListener("change", async () => {
+        if (!await tell("act", { node: node.name, action: `set ${knob.name} ${input.value}` })) input.value = knob.value; else knob.value = input.value;
+      });
+      label.append(`${knob.name} `, input, knob.unit == "1" ? "" : ` ${knob.unit}`);
+      row.append(label);
+    }
+    return row;
+  }));
+  const form = $("fault").elements, breakable = ABOUT.nodes.filter(node => Object.keys(node.targets).length);
+  $("fault").hidden = !breakable.length;
+  $("fault-note").textContent = breakable.length ? "" : "Nothing may break in this cell: go on with allow_faults = true.";
+  options(form.node, breakable.map(node => node.name));
+  offerFaults();
+  $("parameters").replaceChildren(...ABOUT.parameters.map(name => new Option(name)));
+}
+
+function offerFaults() {
+  const form = $("fault").elements, node = ABOUT.nodes.find(each => each.name == form.node.value);
+  if (!node) return;
+  options(form.target, [...new Set(Object.values(node.targets).flat())].sort());
+  options(form.kind, Object.keys(node.targets).filter(kind => node.targets[kind].includes(form.target.value)));
+  const kind = ABOUT.faults[form.kind.value];
+  if (!kind || form.values.dataset.of == form.kind.value) return;
+  form.values.dataset.of = form.kind.value;
+  form.values.value = Object.entries(kind.values).map(([name, value]) => `${name}=${value ?? ""}`).join(" ");
+  $("fault-note").textContent = kind.doc;
+}
+for (const name of ["node", "target", "kind"]) $("fault").elements[name].addEventListener("change", offerFaults);
+$("fault").addEventListener("submit", event => {
+  event.preventDefault();
+  const { node, target, kind, values } = event.target.elements;
+  tell("act", { node: node.value, action: `fault ${target.value} ${kind.value} ${values.value}`.trim() });
+});
+$("repair").addEventListener("click", () => {
+  const { node, target } = $("fault").elements;
+  tell("act", { node: node.value, action: `repair ${target.value}` });
+});
+$("change").addEventListener("submit", event => {
+  event.preventDefault();
+  const { name, value } = event.target.elements;
+  tell("change", { values: name.value ? { [name.value.trim()]: value.value } : {}, here: event.submitter.value == "here" });
+});
+$("record").addEventListener("submit", event => {
+  event.preventDefault();
+  tell("record", { bag: SHOWN.now.bag ? "" : event.target.elements.bag.value });
+});
+$("go").addEventListener("click", () => tell(SHOWN.now.state == "running" ? "pause" : "start"));
+$("step").addEventListener("click", () => tell("step"));
+$("restart").addEventListener("click", () => tell("change", { values: {}, here: false }));
+$("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pace").value) }); $("pace").blur(); });
+$("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
