@@ -8,10 +8,7 @@ const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const LATE = "#8a8a8a", OUT_OF_ORDER = ["degraded", "retracting", "safe"];
 const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
-const DOES = { // tool tips
-  freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned",
-  retract: "takes the tool out of the part", reset: "lets a retracted tool approach the part again; refused until it is out of the part, and after a stop",
-};
+const DOES = { freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned" }; // tool tips
 const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
@@ -52,8 +49,8 @@ async function follow() {
   for (;;) {
     if (document.hidden) await new Promise(done => document.addEventListener("visibilitychange", done, { once: true }));
     try {
-      const told = await ask("frame", HAVE);
-      answered = performance.now();
+      const asked = performance.now(), told = await ask("frame", HAVE);
+      heard = asked;
       if (told.now.version !== version) {
         ABOUT = await ask("about");
         version = told.now.version;
@@ -90,7 +87,7 @@ function draw(changed, moving = true) {
   if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
-  drawSafety(now);
+  drawHeader(now);
   for (const id of ["limits", "loops"]) $(id).textContent = (now[id] || []).join("\n");
   for (const place of document.querySelectorAll("[data-learning]")) {
     const found = JSON.parse(place.dataset.learning).map(topic => (now.learning || {})[topic]).filter(value => value !== undefined);
@@ -108,23 +105,48 @@ function draw(changed, moving = true) {
   drawLog();
 }
 
-const SILENT = 5000; // [ms] without an answer from which on nothing on the page is current
-let answered = performance.now();
-function drawSafety({ safety, growth, failure }) {
-  const lost = performance.now() - answered > SILENT, late = lost || safety && safety.late;
-  const unknown = !safety || safety.state == "unknown", wrong = failure || growth && growth.diverges;
-  $("lamp").style.background = late ? LATE : wrong ? COLOURS.safe : unknown ? "none" : COLOURS[safety.state] || "none";
+// ---- header: state, verdict and age, at every width and scroll -------------------------------------------------------
+
+// The newest answer is at least as new as its question, however slow the link: its age counts from there.
+const SILENT = 5000, BEHIND = 1, STILL = 3; // [ms] and [s] from which on values are old
+let heard = performance.now();
+
+function ages({ age, safety, state, live }) { // what is old, and why, in words
+  const silent = performance.now() - heard, lost = silent > SILENT, still = state == "running" && age && age.still > STILL;
+  const behind = live && age && (age.behind === null || age.behind > BEHIND);
+  const words = lost ? `lathe panel was not heard for ${Math.round(silent / 1000)} s: everything below is old`
+    : !age || state == "waiting" ? "no run heard yet" : age.behind === null ? "shows an earlier run; another one has begun"
+    : behind ? `shows the run as it was ${digits(age.behind, 3)} s before its newest sample`
+    : still ? `no new sample for ${Math.round(age.still)} s` : "up to date";
+  return { lost, words, samples: lost || behind || live && still, safety: lost || safety && safety.late };
+}
+
+function drawHeader(now) {
+  const { safety, part, failure } = now, old = ages(now), unknown = !safety || safety.state == "unknown";
+  document.body.classList.toggle("lost", Boolean(old.samples));
+  $("age").textContent = old.words;
+  $("age").className = old.samples ? "age late" : "age";
+  $("lamp").style.background = old.safety ? LATE : failure ? COLOURS.safe : unknown ? "none" : COLOURS[safety.state] || "none";
   const since = safety && safety.cause ? ` since ${(safety.since * (ABOUT.step || 0)).toFixed(3)} s` : "";
   const told = !safety ? "no supervisor" : unknown ? "unknown: the supervisor was not heard yet"
-    : late ? safety.state : (SAID[safety.state] || safety.state) + since;
-  $("safety").textContent = told + (lost ? ", no answer from lathe panel" : late ? `, last heard ${Math.round(safety.age)} s ago` : "");
+    : old.safety ? safety.state : (SAID[safety.state] || safety.state) + since;
+  $("safety").textContent = told + (old.lost ? ", no answer from lathe panel" : old.safety ? `, last heard ${Math.round(safety.age)} s ago` : "");
+  $("safety").parentNode.classList.toggle("old", Boolean(old.safety));
   $("alarm").textContent = !safety ? "" : safety.cause || (OUT_OF_ORDER.includes(safety.state) ? "(cause not heard)" : "");
-  $("growth").textContent = growth ? growth.text : "";
-  $("growth").className = growth && growth.diverges ? "said wrong" : "said";
-  $("in-force").textContent = (SHOWN.now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
+  $("verdict").textContent = part ? part.title + (old.samples ? " (old)" : "") : "";
+  $("ground").textContent = part ? part.text : "";
+  $("part").className = `part ${old.samples ? "old" : part ? part.mood : ""}`;
+  const { retract, reset } = now.next || {};
+  $("next").textContent = can("command") && reset && !(reset.text == "nothing to reset") ? `next: ${reset.text}` : "";
+  for (const [id, step] of [["retract", retract], ["reset", reset]]) {
+    $(id).disabled = Boolean(step) && !step.allowed && !old.safety;
+    $(id).title = step ? step.text : "";
+  }
+  $("in-force").textContent = (now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
   $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }
-setInterval(() => { if (performance.now() - answered > SILENT) drawSafety(SHOWN.now); }, 1000);
+setInterval(() => { if (performance.now() - heard > SILENT) drawHeader(SHOWN.now); }, 1000);
+document.addEventListener("visibilitychange", () => drawHeader(SHOWN.now)); // a hidden page asks for nothing
 
 let logged = 0, loggedRun = 0;
 function drawLog() {

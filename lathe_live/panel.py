@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from lathe_live.page_server import Answer, Page, Site
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
-from lathe_live.panel_view import Have, View, news
+from lathe_live.panel_view import Have, View, has_memory, news
 from lathe_rc import messages
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.stage import Stage
@@ -197,5 +197,6 @@ def _node(stage: Stage) -> dict[str, Any]:
             for name in stage.tunable
         ],
         "targets": stage.fault_targets,
+        "memory": has_memory(stage),
         "learning": [full(topic) for topic, kind in stage.sparse_topics.items() if kind == messages.LEARNING],
     }

@@ -1,22 +1,46 @@
 // SPDX-License-Identifier: Apache-2.0
 // Commands of the panel; each answer stands at its command.
-async function tell(name, question) {
+async function tell(place, name, question) {
   try {
-    const answer = await ask(name, question);
-    if ($("refusal")) $("refusal").remove();
-    return answer;
+    const found = await ask(name, question);
+    answer(place, found.text ? `asked for: ${found.text}` : "");
+    return found;
   } catch (error) {
-    refuse(error.message);
+    answer(place, error instanceof TypeError ? "no answer: has lathe panel ended?" : error.message, true);
     return null;
   }
 }
-let refused;
-function refuse(text) {
-  clearTimeout(refused);
-  const place = $("refusal") || $("bar").insertAdjacentElement("afterend", Object.assign(document.createElement("p"), { id: "refusal", className: "trouble" }));
-  place.setAttribute("role", "alert");
-  place.textContent = text;
-  refused = setTimeout(() => place.remove(), 15000);
+function answer(place, text, refused = false) { // one for each row of commands
+  const row = place.closest(".bar, .actions, .row");
+  row.querySelectorAll(".answer").forEach(each => each.remove());
+  if (!text) return;
+  const said = Object.assign(document.createElement("p"), { className: refused ? "answer refused" : "answer", textContent: text });
+  said.setAttribute("role", refused ? "alert" : "status");
+  row.append(said);
+  setTimeout(() => said.remove(), 15000);
+}
+
+const SURE = 8000; // [ms] in which a second click confirms
+function confirmed(button, warning, command) { // asks for a second click while a warning holds
+  let asked = -SURE;
+  const words = button.textContent;
+  button.addEventListener("click", () => {
+    const sure = performance.now() - asked < SURE, why = warning();
+    if (why && !sure) {
+      asked = performance.now();
+      button.textContent = `${words}: sure?`;
+      answer(button, `${why} Click again to ${words}.`, true);
+      setTimeout(() => { button.textContent = words; }, SURE);
+      return;
+    }
+    [asked, button.textContent] = [-SURE, words];
+    command();
+  });
+}
+function cutting() { // why a cleared memory would trip the supervisor; empty: it would not
+  const { safety } = SHOWN.now;
+  if (!safety || ["retracting", "safe"].includes(safety.state)) return "";
+  return "The tool is in the part: without what was learned, the error exceeds the supervisor's limits, and it may retract the tool.";
 }
 
 function options(select, names) {
@@ -24,6 +48,8 @@ function options(select, names) {
   select.replaceChildren(...names.map(name => new Option(name)));
   if (names.includes(before)) select.value = before;
 }
+
+const supervisor = () => ABOUT.nodes.find(node => node.actions.includes("reset"));
 
 function describe() { // fills the commands from what the cell tells of itself
   document.title = `${ABOUT.name}: panel`;
@@ -34,9 +60,10 @@ function describe() { // fills the commands from what the cell tells of itself
   for (const [id, why] of Object.entries(cannot())) $(id).title = why;
   for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
   $("seeking").hidden = !can("seek");
+  for (const id of ["retract", "reset"]) $(id).hidden = !can("command") || !supervisor();
   for (const place of document.querySelectorAll(".of-part")) place.hidden = !ABOUT.part;
   if (!can("command")) return;
-  $("actions").replaceChildren(...ABOUT.nodes.filter(node => node.actions.length || node.knobs.length).map(node => {
+  $("actions").replaceChildren(...ABOUT.nodes.filter(node => node != supervisor() && (node.actions.length || node.knobs.length)).map(node => {
     const row = document.createElement("div"), name = document.createElement("b");
     row.className = "actions";
     name.textContent = node.name;
@@ -48,13 +75,13 @@ function describe() { // fills the commands from what the cell tells of itself
     }
     for (const action of node.actions) {
       const button = Object.assign(document.createElement("button"), { type: "button", textContent: action, title: DOES[action] || "" });
-      button.addEventListener("click", () => tell("act", { node: node.name, action }));
+      confirmed(button, action == "clear" && node.memory ? cutting : () => "", () => tell(button, "act", { node: node.name, action }));
       row.append(button);
     }
     for (const knob of node.knobs) {
       const label = document.createElement("label"), input = Object.assign(document.createElement("input"), { size: 8, value: knob.value, title: knob.doc });
       input.addEventListener("change", async () => {
-        if (!await tell("act", { node: node.name, action: `set ${knob.name} ${input.value}` })) input.value = knob.value; else knob.value = input.value;
+        if (!await tell(input, "act", { node: node.name, action: `set ${knob.name} ${input.value}` })) input.value = knob.value; else knob.value = input.value;
       });
       label.append(`${knob.name} `, input, knob.unit == "1" ? "" : ` ${knob.unit}`);
       row.append(label);
@@ -84,23 +111,30 @@ for (const name of ["node", "target", "kind"]) $("fault").elements[name].addEven
 $("fault").addEventListener("submit", event => {
   event.preventDefault();
   const { node, target, kind, values } = event.target.elements;
-  tell("act", { node: node.value, action: `fault ${target.value} ${kind.value} ${values.value}`.trim() });
+  tell(event.target, "act", { node: node.value, action: `fault ${target.value} ${kind.value} ${values.value}`.trim() });
 });
 $("repair").addEventListener("click", () => {
   const { node, target } = $("fault").elements;
-  tell("act", { node: node.value, action: `repair ${target.value}` });
+  tell($("repair"), "act", { node: node.value, action: `repair ${target.value}` });
 });
 $("change").addEventListener("submit", event => {
   event.preventDefault();
   const { name, value } = event.target.elements;
-  tell("change", { values: name.value ? { [name.value.trim()]: value.value } : {}, here: event.submitter.value == "here" });
+  tell(event.target, "change", { values: name.value ? { [name.value.trim()]: value.value } : {}, here: event.submitter.value == "here" });
 });
 $("record").addEventListener("submit", event => {
   event.preventDefault();
-  tell("record", { bag: SHOWN.now.bag ? "" : event.target.elements.bag.value });
+  tell(event.target, "record", { bag: SHOWN.now.bag ? "" : event.target.elements.bag.value });
 });
-$("go").addEventListener("click", () => tell(SHOWN.now.state == "running" ? "pause" : "start"));
-$("step").addEventListener("click", () => tell("step"));
-$("restart").addEventListener("click", () => tell("change", { values: {}, here: false }));
-$("pace").addEventListener("change", () => { tell("pace", { factor: Number($("pace").value) }); $("pace").blur(); });
-$("seek").addEventListener("change", () => { tell("seek", { sample: Number($("seek").value) }); $("seek").blur(); });
+$("go").addEventListener("click", () => tell($("go"), SHOWN.now.state == "running" ? "pause" : "start"));
+$("step").addEventListener("click", () => tell($("step"), "step"));
+$("restart").addEventListener("click", () => tell($("restart"), "change", { values: {}, here: false }));
+for (const id of ["retract", "reset"]) {
+  $(id).addEventListener("click", () => tell($(id), "act", { node: supervisor().name, action: id }));
+}
+$("more").addEventListener("click", () => { // on narrow screens: the other commands, above the bar
+  $("more").setAttribute("aria-expanded", document.body.classList.toggle("sheet"));
+});
+new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
+$("pace").addEventListener("change", () => { tell($("pace"), "pace", { factor: Number($("pace").value) }); $("pace").blur(); });
+$("seek").addEventListener("change", () => { tell($("seek"), "seek", { sample: Number($("seek").value) }); $("seek").blur(); });

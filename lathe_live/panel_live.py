@@ -52,27 +52,30 @@ class LivePanel(LiveRuns):
         view: see `View`.
     """
 
-    urgent = frozenset({*LOGGED, messages.SAFETY, messages.CELL_STATE})
+    urgent = frozenset({*LOGGED, messages.SAFETY, messages.ENCODER, messages.CELL_STATE})
 
     def __init__(self) -> None:
         self._state, self._held = "waiting", False
         self._known: dict[str, Any] = {"pace": None, "bag": "", "failure": ""}
         super().__init__(self._heard)
         self.view = View({}, 0, live=True)
-        self._safety, self._signs = Decoder(messages.SAFETY, ["state"]), RunOrder()
+        fields = {messages.SAFETY: ["state", "reaction"], messages.ENCODER: []}
+        self._signs, self._urgent = RunOrder(), {kind: Decoder(kind, names) for kind, names in fields.items()}
         self.know()
 
     def hear(self, topic: str, msgtype: str, data: bytes) -> None:
-        """Set the lamp and the failure of the cell at once: the samples may wait, or be left out."""
+        """Set lamp, age and failure of the cell at once: the samples may wait, or be left out."""
         lamp = self.view.lamp
         if msgtype == messages.CELL_STATE:
             state = messages.decode(msgtype, data)
             self.know(failure=str(state.message) if state.state in (Phase.FAILED, Phase.SAFE) else "")
-        elif msgtype == messages.SAFETY:
-            block = self._safety.decode(data)
+        elif msgtype in self._urgent:
+            block = self._urgent[msgtype].decode(data)
             end = block.first_index + block.samples
             if self._goes_on(topic, block.run_id, block.first_index, end):
-                lamp.hear(end - 1, int(block.signals["state"][-1]))
+                self.view.age.heard(end)
+                if msgtype == messages.SAFETY:
+                    lamp.hear(end - 1, *(int(block.signals[name][-1]) for name in ("state", "reaction")))
         else:
             message = messages.decode(msgtype, data)
             index = int(message.sample_index)
@@ -80,10 +83,11 @@ class LivePanel(LiveRuns):
                 lamp.take(Sparse(topic, msgtype, index, messages.signals_of(message)))
 
     def _goes_on(self, topic: str, run_id: str, first: int, end: int) -> bool:
-        """Return True if samples belong to the run of the lamp, which begins anew if necessary."""
+        """Return True if samples belong to the run of lamp and age, which begin anew if necessary."""
         where = self._signs.place(topic, run_id, first, end)
         if where == "new":
             self.view.lamp.clear()
+            self.view.age.begin()
         return where != "old"
 
     def _heard(self, block: Block, types: Mapping[str, str]) -> _Heard:

@@ -108,7 +108,8 @@ class Player:
 
     def told(self) -> Mapping[str, Any]:
         """Return the status of the run, for its snapshots."""
-        return {"bag": "", "events": "", "begun": self.first, "version": 1}
+        lost = self._recording.lost if self.reached == self.samples else ""
+        return {"bag": "", "events": "", "begun": self.first, "version": 1, "lost": lost}
 
     def close(self) -> None:
         """Nothing is open."""

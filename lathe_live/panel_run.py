@@ -274,7 +274,7 @@ class LiveCell:
         self._version += 1
 
     def _remark(self) -> None:
-        self.view.know(self.scenario)
+        self.view.know(self.scenario, self.cell.stages.values())
         for text in [*self.cell.unchecked, *self.cell.warnings]:
             self.view.say(self.reached, "check", text)
 

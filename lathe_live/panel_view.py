@@ -9,25 +9,30 @@ browser misses snapshots and delays nothing.
 import math
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from lathe_live.panel_age import Age
 from lathe_live.panel_lamp import OUT, Lamp
 from lathe_live.panel_outlook import outlook
+from lathe_live.panel_verdict import Evaluation
 from lathe_live.rerun_part import Outlook, Scale
 from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
 from lathe_rc import event_log, messages
-from lathe_rc.analysis.tolerance import LAST, growth
+from lathe_rc.analysis.tolerance import LAST, Verdict
 from lathe_rc.arrays import Array
 from lathe_rc.blocks.ports import Sparse
-from lathe_rc.cell.parameters import judged
+from lathe_rc.cell.judged import Judged
+from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
+from lathe_rc.judge.part import RunningVerdict
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view import machine_state
 from lathe_rc.view.form_limits import form_limits, varying_speed
@@ -37,6 +42,7 @@ PERIOD = 0.125  #: least time between two snapshots [s]
 MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
+_STILL = 1.0  # [s] without a new sample from which on a run that is held is paused
 _SHAPE = 90  # points of the part's outline
 _MOST_LINES = 2000  # of the log in an answer
 _UM = 1e6
@@ -102,6 +108,7 @@ class Snapshot:
         rows, log: rows of the map, lines of the log.
         history: number, RMS and largest error of each revolution [µm].
         latest: newest revolutions.
+        part: evaluation of the part.
     """
 
     number: int
@@ -112,11 +119,17 @@ class Snapshot:
     log: list[dict[str, Any]]
     history: list[tuple[int, float, float]]
     latest: Sequence[Row] = ()
+    part: Evaluation = Evaluation()
 
 
 def _short(values: Array) -> list[float]:
     """Return numbers with four digits."""
     return [float(f"{value:.4g}") for value in values.tolist()]
+
+
+def has_memory(stage: Stage) -> bool:
+    """Return whether a stage commands from a memory that can be cleared."""
+    return "clear" in stage.actions and any(port.type == messages.COMMAND for port in stage.outputs)
 
 
 def _row(revolution: Revolution, *, out: bool) -> Row:
@@ -136,7 +149,9 @@ class View:
 
     Attributes:
         outlook: see `lathe_live.panel_outlook`; empty: unknown.
+        memories: learning controllers whose memories can be cleared.
         lamp: state of the supervisor; a sink of its own, since it must not wait for the samples of a live view.
+        age: age of the samples shown; a live view also tells it the samples that it does not show yet.
     """
 
     def __init__(
@@ -147,8 +162,12 @@ class View:
         self.run = 0
         self.latest: Snapshot | None = None
         self.outlook: Mapping[str, Any] = {}
-        self.lamp = Lamp(live=live)
+        self.live, self.lamp, self.age = live, Lamp(live=live), Age()
+        self.memories: Collection[str] = ()
         self._loops: Sequence[Loop] = ()
+        self._declared: Mapping[str, Judged] = {}
+        self._doubt = 0.0  # about the form, see `RunningVerdict`
+        self._judge: RunningVerdict | None = None  # from the first sample of the part on
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -159,9 +178,17 @@ class View:
         self.learn(types)
         self.clear(margin)
 
-    def know(self, scenario: Scenario) -> None:
-        """Show what the samples do not tell: tolerance and shape of the scenario, results of its loops from now on."""
-        self.outlook, self._loops = outlook(scenario), loops(judged(scenario.nodes))
+    def know(self, scenario: Scenario, stages: Iterable[Stage] = ()) -> None:
+        """Show what the samples do not tell: tolerance and shape of the scenario, verdict and loops from now on.
+
+        Args:
+            scenario: scenario of the cell.
+            stages: stages that can be commanded.
+        """
+        self.memories = [stage.name for stage in stages if has_memory(stage)]
+        self._declared, self._doubt = judged(scenario.nodes), form_doubt(scenario.nodes)
+        self._judge = None
+        self.outlook, self._loops = outlook(scenario), loops(self._declared)
         self._watches = watches(self._loops, self._types)
         for loop in self._loops:
             loop.running(0).add(*np.zeros((4, loop.delay + 2)))  # compiles the kernel before the run
@@ -175,6 +202,8 @@ class View:
     def clear(self, margin: float | None = None) -> None:
         """Begin with another run of the same cell."""
         self.run += 1
+        if not self.live:
+            self.age.begin()
         self._revolutions, self._soundness = Revolutions(), Soundness(self._form)
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "learning": {}}
         self._is_out = False
@@ -185,8 +214,8 @@ class View:
         self._rows: list[Row] = []
         self._newest: list[Row] = []
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
-        self._largest: list[float] = []  # form error of each revolution [m]
-        self._growth: tuple[int, dict[str, Any] | None] = (0, None)  # number of revolutions, and growth then
+        self._judge = None
+        self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
         self._conditions = event_log.Conditions()
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
@@ -197,6 +226,19 @@ class View:
     def reached(self) -> int:
         """Sample after the newest."""
         return int(self._now.get("sample", 0))
+
+    def current(self, snapshot: Snapshot) -> dict[str, Any]:
+        """Return the values of a snapshot for the page, with state of the supervisor and age of now.
+
+        A run that is held for this panel may be continued by others: it is paused once no samples come.
+        """
+        lamp = self.lamp.now(supervised=self.supervised, memories=self.memories)
+        now: dict[str, Any] = {**snapshot.now, **lamp}
+        age = self.age.now(int(now.get("sample", 0)), self._step_ns * 1e-9)
+        if self.live and now["state"] == "paused" and (age["still"] or 0.0) < _STILL:
+            now["state"] = "running"
+        out = lamp["next"]["retract"]["text"] if lamp["next"] and lamp["safety"]["state"] in OUT else ""
+        return {**now, "age": age, "live": self.live, "part": asdict(snapshot.part.headline(out))}
 
     @property
     def supervised(self) -> bool:
@@ -217,6 +259,7 @@ class View:
             self._message(full(message.topic), message)
         self._now["sample"] = first + samples
         self._now["time"] = (first + samples) * self._step_ns * 1e-9
+        self.age.heard(first + samples)
         encoder, tool, cut = (named.get(topic) for topic in (self.topics.encoder, self.topics.tool, self.topics.cut))
         if encoder:
             slowest, fastest = float(encoder["speed_true"].min()), float(encoder["speed_true"].max())
@@ -251,6 +294,9 @@ class View:
         }
         self._now["height"] = float(tool["height"][-1]) * 1e3
         if sound:
+            if self._judge is None:
+                self._judge = RunningVerdict(self._declared, self.topics.tool, self._doubt)
+            self._judge.add(first, angle[:sound], {name: signal[:sound] for name, signal in tool.items()})
             fields = (tool[name][:sound] for name in ("error", "reference", "height"))
             self._add(self._revolutions.add(first, angle[:sound], *fields))
 
@@ -264,7 +310,6 @@ class View:
             self._end = revolution.end
             rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
             self._history.append((revolution.number, rms, largest))
-            self._largest.append(revolution.largest)
             self._newest = [*self._newest[1 - WATERFALL :], row]
             if (revolution.number - 1) % self._every == 0:
                 self._rows.append(row)
@@ -286,15 +331,31 @@ class View:
         if message.type == messages.EVENT:
             self._conditions.take(message)
 
-    def _growing(self) -> dict[str, Any] | None:
-        """Return the growth of the form error as `lathe_rc.harness.Result` evaluates it; None if it does not grow."""
-        count = len(self._largest)
-        if self._growth[0] != count:
-            found = growth(np.array(self._largest))
-            # A live view may lack revolutions.
-            found = found and replace(found, since=self._history[found.since - 1][0])
-            self._growth = count, {"text": found.told(), "diverges": found.diverges} if found else None
-        return self._growth[1]
+    def _evaluated(self, unjudged: str) -> Evaluation:
+        """Evaluate the part as ``lathe run`` does; ``unjudged``: reason why its end cannot be judged, or empty."""
+        judge, rests_on = self._judge, (self._judge, len(self._history), unjudged)
+        if judge and self._judged[0] != rests_on:
+            self._judged = rests_on, Evaluation(judge.verdict(unjudged), judge.growth())
+        found = self._judged[1]
+        results = [watch.result() for watch in self._watches]
+        told = [(f"{each.loop.node}: {text}", good) for each in results for text, good in each.judged()]
+        missing = self._missing(found.verdict)
+        return replace(found, missing=missing, loops=[each for each in told if each[1] is not None])
+
+    def _missing(self, verdict: Verdict | None) -> str:
+        """Return which of the revolutions up to now are not judged, or why none is."""
+        judge = self._judge
+        if not self.topics.tool:
+            return "no tool in this cell"
+        if not self._declared:
+            return "the scenario, and so the tolerance, is not known"
+        if judge is None:
+            return "no sample of the part yet"
+        if verdict is None:
+            node = next((node for node, each in self._declared.items() if each.quantity == "form"), "tool")
+            return f"no tolerance: {node}.tolerance = 0"
+        last, turns = judge.before + verdict.revolutions, math.floor(self.turns)
+        return f"revolutions {last + 1} to {turns} were not received" if turns > last and not verdict.unjudged else ""
 
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
@@ -342,10 +403,19 @@ class View:
         with self._news:
             number = self.latest.number + 1 if self.latest else 1
             scale = self._scale.deviation / 1e3 if self._scale else 1.0
-            current = {**self._now, **told, "exaggeration": scale, "growth": self._growing()}
+            current = {**self._now, **told, "exaggeration": scale}
             current |= {"limits": self._limiting(), "loops": self._looped()}
+            why = self._soundness.why or str(told.get("failure") or told.get("lost") or "")
             self.latest = Snapshot(
-                number, self.run, current, self._epoch, self._rows, self._log, self._history, tuple(self._newest)
+                number,
+                self.run,
+                current,
+                self._epoch,
+                self._rows,
+                self._log,
+                self._history,
+                tuple(self._newest),
+                self._evaluated(why),
             )
             self._news.notify_all()
 
@@ -423,7 +493,7 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         "number": snapshot.number,
         "run": snapshot.run,
         "epoch": snapshot.epoch,
-        "now": {**snapshot.now, **view.lamp.now(supervised=view.supervised)},
+        "now": view.current(snapshot),
         "rows": [{**_told(row), "height": round(row.revolution.height * 1e3, 6)} for row in rows],
         "more": had + len(rows) < len(snapshot.rows),
         "log": snapshot.log[have.log : have.log + _MOST_LINES],

@@ -6,28 +6,36 @@ import json
 import re
 import socket
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import cells
+import numpy as np
 import pytest
 from bags import lathe
 from cells import until
 
 import lathe_rc
-from lathe_live import page_server, panel, panel_lamp, panel_view
+from lathe_live import page_server, panel, panel_age, panel_lamp, panel_view
 from lathe_live.live_runs import Backlog
 from lathe_live.page_server import Site
 from lathe_live.panel_live import LivePanel
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
+from lathe_live.panel_verdict import Evaluation
 from lathe_live.panel_view import Have, news
 from lathe_live.rerun_signals import is_drawn
 from lathe_rc import event_log, harness, messages
+from lathe_rc.analysis.tolerance import growth, judge
 from lathe_rc.bag.reading.source import Source
+from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
+from lathe_rc.judge import part
+from lathe_rc.safety import next_step
+from lathe_rc.safety.state_machine import Reaction, State
 
 ROOT = Path(__file__).parents[1]
 
@@ -197,10 +205,8 @@ def test_a_diverging_run_is_named_as_lathe_run_names_it(opened):
     assert result.growth.diverges
     shown = opened(cell)
     shown.ask("start")
-    assert shown.until(lambda now: now["state"] == "ended")["growth"] == {
-        "text": result.growth.told(),
-        "diverges": True,
-    }
+    part = shown.until(lambda now: now["state"] == "ended")["part"]
+    assert (part["mood"], part["text"].startswith(f"{result.growth.told()}; no tolerance")) == ("bad", True)
 
 
 def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_path):
@@ -502,3 +508,196 @@ def test_a_cell_of_nodes_that_fails_is_told_in_its_own_words(retracted):
         hear(live, [("/cell_state", messages.CELL_STATE, told)])
         now = news(live.view, Have(), 0.0)["now"]
         assert (now["failure"], now["state"]) == (text, "failed" if text else "running")
+
+
+# --- the header: verdict, age and next steps
+
+
+@pytest.mark.parametrize("name", ["supervised", "zones"])
+def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
+    """Also by zones, and for a view that begins in the middle of a run."""
+    zoned = {"zone_start": [0.0], "zone_width": [1.0], "zone_tolerance": [20e-6], "tolerance": 2e-6}
+    loaded = (
+        scenario("supervised", 12)
+        if name == "supervised"
+        else cells.scenario(spindle_encoder={"revolutions": 12.2}, tool=zoned)
+    )
+    recording, declared = harness.run(loaded).recording, judged(loaded.nodes)
+    angle, tool = recording.of_type(messages.ENCODER)["angle_true"], recording.dense["/tool"]
+    running = part.RunningVerdict(declared, "/tool", form_doubt(loaded.nodes))
+    late = part.RunningVerdict(declared, "/tool", form_doubt(loaded.nodes))
+    size = recording.samples // 9
+    for first in range(0, recording.samples, size):
+        piece = slice(first, first + size)
+        for each, begins in ((running, 0), (late, 3 * size)):
+            if first >= begins:
+                each.add(first, angle[piece], {field: signal[piece] for field, signal in tool.items()})
+        cut = {topic: {n: s[: piece.stop] for n, s in fields.items()} for topic, fields in recording.dense.items()}
+        found = part.verdict(loaded, replace(recording, dense=cut))
+        assert running.verdict() == found or found.revolutions == 0
+        assert running.verdict().told() == found.told()
+    assert 3 < late.before == found.revolutions - late.verdict().revolutions
+    assert late.verdict().in_tolerance
+    assert late.verdict().since == late.before + 1  # no word about revolutions that were not seen
+    assert running.growth() == part.error_growth(recording)
+
+
+def _evaluated(errors, doubt=0.0, **more):
+    largest = np.array(errors) * 1e-6
+    return Evaluation(judge(largest, 2e-6, doubt=doubt), growth(largest), **more)
+
+
+_TURNED = [100.0, 10.0, 3.0, 1.5, 1.2, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("evaluated", "out", "headline"),
+    [
+        (_evaluated(_TURNED), "", "good PART GOOD in tolerance (±2 µm) from revolution 4 on, 0.5 µm to spare"),
+        (_evaluated(_TURNED), "the tool is on its way out", "open PART NOT JUDGED the tool is on its way out; in"),
+        (_evaluated(_TURNED, missing="revolutions 8 to 9"), "", "open PART NOT JUDGED revolutions 8 to 9; in"),
+        (_evaluated(_TURNED, doubt=1.5e-6), "", "open PART NOT JUDGED not shown in tolerance (±2 µm): 1 µm"),
+        (_evaluated(_TURNED[3:]), "", "open PART NOT JUDGED 5 revolutions are needed to see whether"),
+        (_evaluated([]), "", "open PART NOT JUDGED no complete revolution yet"),
+        (_evaluated([*_TURNED, 3.0]), "", "bad PART BAD not in tolerance (±2 µm): 3 µm in the last revolution"),
+        (
+            _evaluated([0.1] * 8 + [0.15 * 1.3**k for k in range(9)]),
+            "",
+            "bad PART GOOD, BUT DIVERGES form error diverges from revolution",
+        ),
+        (
+            replace(_evaluated(_TURNED), verdict=judge(np.ones(7) * 1e-6, 2e-6, unjudged="not measured: a fault")),
+            "",
+            "open PART NOT JUDGED not judged (±2 µm): not measured: a fault",
+        ),
+        (Evaluation(missing="no tolerance: tool.tolerance = 0"), "", "open PART NOT JUDGED no tolerance: tool"),
+        (_evaluated(_TURNED, loops=[("force: beyond", False)]), "", "bad PART GOOD, LOOP BAD in tolerance"),
+        (Evaluation(loops=[("force: in tolerance", True)]), "", "good LOOP GOOD force: in tolerance"),
+    ],
+)
+def test_a_part_is_good_only_with_every_ground(evaluated, out, headline):
+    found = evaluated.headline(out)
+    assert f"{found.mood} {found.title} {found.text}".startswith(headline)
+
+
+def test_the_headline_names_what_is_not_judged(opened):
+    """A tool without a tolerance, and a fault of the form."""
+    for name, given, text in (
+        ("piston", ["tool.tolerance=0.0"], "no tolerance: tool.tolerance = 0"),
+        (
+            "supervised",
+            ["tool.faults=['revolution 1: tool.error off']"],
+            "not judged (±2 µm): not measured from sample",
+        ),
+    ):
+        shown = opened(scenario(name, 2, *given))
+        shown.ask("start")
+        found = shown.until(lambda now: now["state"] == "ended")["part"]
+        assert (found["title"], found["text"][: len(text)]) == ("PART NOT JUDGED", text)
+
+
+def test_the_next_step_after_a_retraction_is_the_one_that_lasts(opened):
+    """A reset alone retracts again, as the page says; after both memories are cleared, it holds."""
+    fault = "fault coarse/command.position wrong scale=0.9"
+    shown = opened(scenario("supervised_full_cell", 60))
+    told = lambda: shown.now["next"]["reset"]  # noqa: E731
+
+    def on(condition):
+        while not condition(shown.now):
+            shown.ask("step")
+            later = shown.now["sample"] + 1
+            shown.until(lambda now, later=later: now["state"] == "paused" and now["sample"] >= later)
+
+    shown.now = {"sample": 0}
+    on(lambda _: len(shown.history) >= 12)
+    assert (shown.now["part"]["title"], told()["text"]) == ("PART GOOD", "nothing to reset")
+    shown.ask("act", node="electrodynamic_actuator", action=fault)
+    on(lambda now: now["safety"]["state"] == "retracting")
+    assert not told()["allowed"]
+    assert "wait until the tool is out" in told()["text"]
+    assert f"repair electrodynamic_actuator: {fault.removeprefix('fault ')}" in told()["text"]
+    shown.ask("act", node="electrodynamic_actuator", action="repair coarse/command.position")
+    on(lambda now: now["safety"]["state"] == "safe")
+    both = "clear fine_controller and learning_controller, then reset; otherwise the tool may be retracted again"
+    assert told()["text"].startswith(both)
+    shown.ask("act", node="supervisor", action="reset")
+    on(lambda now: now["safety"]["state"] == "nominal")
+    on(lambda now: now["safety"]["state"] == "safe")
+    assert told()["text"].startswith(both)
+    for node in ("learning_controller", "fine_controller"):
+        shown.ask("act", node=node, action="clear")
+    on(lambda _: told()["text"].startswith("reset: the tool approaches the part again"))
+    shown.ask("act", node="supervisor", action="reset")
+    on(lambda now: now["safety"]["state"] == "nominal")
+    shown.ask("start")
+    now = shown.until(lambda now: now["state"] == "ended")
+    assert (now["safety"]["state"], now["part"]["title"]) == ("nominal", "PART GOOD")
+
+
+@pytest.mark.parametrize(
+    ("state", "reaction", "alarms", "more", "allowed", "text"),
+    [
+        (State.SAFE, Reaction.STOP, ["speed"], {}, False, "a reset is refused after a stop: begin a new run"),
+        (State.RETRACTING, Reaction.RETRACT, ["force"], {}, False, "wait until the tool is out of the part"),
+        (State.NOMINAL, Reaction.NONE, [], {}, False, "nothing to reset"),
+        (State.SAFE, Reaction.RETRACT, ["operator"], {"memories": ["law"]}, True, "reset: the tool approaches"),
+        (State.SAFE, Reaction.RETRACT, ["force"], {"faults": ["cut: x"]}, True, "repair cut: x, then reset; otherwise"),
+        (State.DEGRADED, Reaction.FREEZE, ["stability_margin"], {}, True, "set a smaller learning_gain, then reset"),
+    ],
+)
+def test_each_state_has_a_next_step(state, reaction, alarms, more, allowed, text):
+    found = next_step.reset(state, reaction, alarms, **more)
+    assert (found.allowed, found.text[: len(text)]) == (allowed, text)
+
+
+def test_an_attached_panel_says_how_far_behind_it_is(retracted, monkeypatch):
+    """Behind under load, up to date afterwards, behind another run; still when no sample comes."""
+    types, heard = retracted
+    clock = [100.0]
+    monkeypatch.setattr(panel_age, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    live, backlog = attached(types), Backlog(2**25)
+
+    def now():
+        return news(live.view, Have(), 0.0)["now"]
+
+    hear(live, heard[: len(heard) // 3])
+    live.know()  # publishes at once
+    assert now()["age"] == {"behind": pytest.approx(0.0, abs=0.1), "still": 0.0}
+    hear(live, heard[len(heard) // 3 :], backlog)
+    assert now()["age"]["behind"] == pytest.approx(2 / 3 * 8 * 60 / 1000, abs=0.1)
+    backlog.close()
+    for message in backlog:
+        live.take(*message)
+    live.end()
+    clock[0] += 4.0
+    assert now()["age"] == {"behind": 0.0, "still": 4.0}
+    # Another run of the cell is heard, but not shown yet.
+    monkeypatch.setattr(panel_age, "_OTHER", 0.1)
+    hear(live, heard[:300], Backlog(2**25))
+    assert now()["age"]["behind"] is None
+
+
+def test_an_attached_panel_is_paused_only_while_no_samples_come(retracted, monkeypatch):
+    """A run that this panel has held may be continued by somebody else."""
+    types, heard = retracted
+    clock = [100.0]
+    monkeypatch.setattr(panel_age, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    live = attached(types)
+    state = lambda: news(live.view, Have(), 0.0)["now"]["state"]  # noqa: E731
+    hear(live, heard[: len(heard) // 3])
+    live.know(held=True)
+    clock[0] += 2.0
+    assert state() == "paused"
+    hear(live, heard[len(heard) // 3 : len(heard) // 2])
+    assert state() == "running"
+
+
+def test_lost_samples_leave_the_part_unjudged(retracted):
+    """The revolutions before a gap do not count, and the part is not good while its newest ones are missing."""
+    types, heard = retracted
+    live = attached(types)
+    blocks = [message for message in heard if message[1] in messages.block_types()]
+    third = len(blocks) // 3
+    hear(live, [*blocks[:third], *(each for each in blocks[third:] if each[1] != messages.TOOL)])
+    live.know()
+    assert "were not received" in news(live.view, Have(), 0.0)["now"]["part"]["text"]

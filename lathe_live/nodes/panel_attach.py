@@ -181,7 +181,7 @@ def attach(
     with standalone_node(PANEL, PanelParameters, {}, words, signals=SignalHandlerOptions.NO) as (node, _):
         live = LivePanel()
         asking = _Asking(rclpy.create_node(PANEL_COMMANDS), cell, live)
-        live.view.know(scenario)
+        live.view.know(scenario, cell.stages.values())
         site = panel.with_loops(panel.attached_site(live.view, cell, asking), loop)
         listener = Listener(node, live)
         set_by_signal(listener.stopped)

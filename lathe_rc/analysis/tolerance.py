@@ -23,7 +23,7 @@ from lathe_rc.signals.zones import Zone
 
 LAST = 10  #: largest number of revolutions at the end of a run that margin and budget cover
 DOUBTED = 0.1  #: part of the tolerance from which the doubt of a form is told
-_FEWEST = 4  # smallest number of revolutions in a rise
+FEWEST = 4  #: largest number of revolutions that do not show whether an error grows
 _FACTOR = 2.0  # factor in the definitions of settled error and growth, see the module docstring
 _BENT = 1.2  # ratio of the rise in the last third to that in the middle third above which the rise accelerates
 _NOTHING = 1e-12  # [m] form error below which a rise is rounding error
@@ -250,7 +250,7 @@ def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth
         quantity: quantity that is judged.
     """
     finite = largest[np.isfinite(largest)]
-    if finite.size <= _FEWEST:
+    if finite.size <= FEWEST:
         return None
     sizes = np.fmax(np.where(np.isfinite(largest), largest, _FACTOR * finite.max()), _NOTHING)
     near = np.flatnonzero(sizes <= _FACTOR * sizes.min())
@@ -264,7 +264,7 @@ def growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> Growth
     # Only up to half of the largest rise, because the error stops growing at the limits of a drive.
     climb = sizes[start : start + 2 + int(np.argmax(rise >= rise.max() / _FACTOR))]
     steps = np.diff(np.log(climb))
-    if climb.size <= _FEWEST or steps.max() > steps.sum() / 2.0:
+    if climb.size <= FEWEST or steps.max() > steps.sum() / 2.0:
         return None
     first, middle, last = (float(third.mean()) for third in np.array_split(climb, 3))
     diverges = last - middle > _BENT * (middle - first)
@@ -279,7 +279,7 @@ def swing_growth(largest: Array, before: int = 0, quantity: Quantity = FORM) -> 
     """
     found: Growth | None = None
     group = 1
-    while largest.size // group > _FEWEST:
+    while largest.size // group > FEWEST:
         whole = largest[: largest.size // group * group].reshape(-1, group)
         grown = growth(whole.max(axis=1), quantity=quantity)
         if grown and (found is None or grown.diverges):

@@ -18,7 +18,7 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
-from lathe_rc.messages import Signals, full
+from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.signals.form_errors import RunningErrors, that_count, turns_before
 from lathe_rc.signals.zones import Zone, ZoneErrors
 
@@ -85,6 +85,63 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
             largest = recording.errors.largest
             return judge_zones(largest, errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
     return None
+
+
+class RunningVerdict:
+    """Verdict on the form of a part and growth of its error, chunk by chunk.
+
+    Where samples are missing, it begins anew, as for a snapshot: it is about the complete revolutions since then.
+
+    Args:
+        declared: declarations of the nodes by name.
+        topic: fully qualified topic of the tool.
+        doubt: how far the desired form may be off between the points of its table [m].
+
+    Attributes:
+        tolerance: allowed error to each side [m]; None: the tool has no tolerance.
+        before: number of revolutions before the first one evaluated.
+    """
+
+    def __init__(self, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> None:
+        allowed = {of: limit for of, limit in tolerances(declared).items() if topic.endswith(f"/{of}")}
+        self.tolerance = next(iter(allowed.values()), None)
+        self._zones = zones(declared).get(next(iter(allowed), ""), ())
+        self._doubt, self._next = doubt, -1
+        self._begin(0)
+
+    def _begin(self, before: int) -> None:
+        self.before = before
+        self._errors, self._by_zone = RunningErrors(before), ZoneErrors(self._zones, before)
+
+    def add(self, first: int, angle: Samples, tool: Signals) -> None:
+        """Add samples from index ``first`` on: true spindle angle [rad], shape (n,), and the signals of the tool."""
+        if first != self._next and angle.size:
+            self._begin(int(np.ceil(angle[0] / (2.0 * np.pi))) if first else turns_before(angle))
+        self._next = first + angle.size
+        self._errors.add(angle, tool["error"])
+        self._by_zone.add(angle, tool["height"], tool["error"])
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest form error of each complete revolution [m], shape (revolutions,)."""
+        return self._errors.found().largest
+
+    def verdict(self, unjudged: str = "") -> Verdict | None:
+        """Judge the part as if the run ended after the samples so far; None without a tolerance.
+
+        Args:
+            unjudged: reason why the end of the run cannot be judged; empty if it can.
+        """
+        if self.tolerance is None:
+            return None
+        by_zone = self._by_zone.largest()
+        return judge_zones(
+            self.largest, by_zone, self.tolerance, self._zones, self.before, unjudged=unjudged, doubt=self._doubt
+        )
+
+    def growth(self) -> Growth | None:
+        """Return the growth of the form error."""
+        return growth(self.largest, self.before)
 
 
 def error_growth(recording: Recording) -> Growth | None:

@@ -18,7 +18,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.safety import state_machine
+from lathe_rc.safety import next_step, state_machine
 from lathe_rc.safety.monitors import (
     Alarm,
     Clearance,
@@ -347,15 +347,16 @@ class Supervisor(Stage):
             return
         if self.reaction is Reaction.NONE:
             return  # no alarm since the start or the last reset
-        to = state_machine.after(self.state, action)
-        if to is not None and self.reaction is not Reaction.STOP:
-            self._state[:2] = to, Reaction.NONE
-            self._told.append(RESET)
-            self._lookout.reset()
-            for monitor in self._plain:
-                monitor.reset()
-        else:
+        if next_step.refusal(self.state, self.reaction):
             self._told.append(RESET_REFUSED)
+            return
+        to = state_machine.after(self.state, action)
+        assert to is not None, "it is not refused"
+        self._state[:2] = to, Reaction.NONE
+        self._told.append(RESET)
+        self._lookout.reset()
+        for monitor in self._plain:
+            monitor.reset()
 
     def go_safe(self) -> None:
         """Raise an alarm that cannot be reset, because cell members are lost."""

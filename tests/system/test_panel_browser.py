@@ -2,6 +2,8 @@
 """The panel in a real browser, wide and narrow, light and dark."""
 
 import contextlib
+import random
+import re
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from bags import sized
 from test_panel import attached, bag, hear, retracted, scenario
 
 import lathe_rc
@@ -56,7 +59,7 @@ def submit(browser, form, button, **values):
 
 
 def one_revolution(browser):
-    before = browser.run("SHOWN.now.sample")
+    before = browser.run("SHOWN.now.sample || 0")
     browser.click("#step")
     browser.until(f"SHOWN.now.state == 'paused' && SHOWN.now.sample > {before}")
 
@@ -98,8 +101,8 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     assert "error tool" in log
     assert "µm, limit 30 µm: retracting, retract" in log
     for action, told in (("reset", "reset"), ("retract", "operator")):
-        buttons = "[...document.querySelectorAll('#actions button')]"
-        browser.run(f"{buttons}.find(each => each.textContent == '{action}').click()")
+        browser.click(f"#{action}:enabled")
+        assert browser.until("document.querySelector('#bar .answer').textContent").endswith(f": {action}")
         one_revolution(browser)
         browser.until(f"SHOWN.log.some(line => line.source == 'safety/status' && line.text.startsWith('{told}'))")
     browser.click("#go")
@@ -122,6 +125,10 @@ def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page
             paper = "rgb(22, 24, 26)" if dark else "rgb(255, 255, 255)"
             browser.until(f"getComputedStyle(document.body).backgroundColor == '{paper}'")
             assert browser.run("document.documentElement.scrollWidth") <= width
+            browser.run("window.scrollTo(0, document.body.scrollHeight)")
+            for part in ("lamp", "safety", "verdict", "ground", "age", "go", "retract", "reset"):
+                box = browser.run(f"document.getElementById('{part}').getBoundingClientRect().toJSON()")
+                assert 0 <= box["top"] < box["bottom"] <= 900, (width, part, box)
             # Each canvas is drawn anew in the colours of the page.
             corner = "[...document.getElementById('map').getContext('2d').getImageData(0, 0, 1, 1).data].slice(0, 3)"
             browser.until(f"'rgb(' + {corner}.join(', ') + ')' == '{paper}'")
@@ -129,7 +136,8 @@ def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page
             browser.until(f"{drawn} >= 8")  # with drives, once a frame of the run is drawn
     # A refused command, and one that is accepted
     submit(browser, "change", "button[value=start]", name="seed", value="none")
-    assert "seed" in browser.until("document.getElementById('refusal').textContent")
+    refused = browser.until("document.querySelector('#change .answer.refused').textContent")
+    assert "seed" in refused  # at the command
     submit(browser, "change", "button[value=start]", name="spindle_encoder.revolutions", value="4.0")
     browser.until("SHOWN.now.samples < 20000")
     browser.click("#go")
@@ -142,7 +150,7 @@ def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page
 
 
 def test_the_lamp_shows_what_was_heard_and_is_grey_when_nothing_is(retracted, tmp_path, monkeypatch):
-    """Before the first message, nominal, retracted, silent, diverging, and after the end of the server."""
+    """Before the first message, nominal, retracted, silent, 20 s behind, and after the end of the server."""
     types, heard = retracted
     live, read = attached(types), "document.getElementById({!r}).textContent".format
     colour = "getComputedStyle(document.getElementById('lamp')).backgroundColor"
@@ -161,10 +169,94 @@ def test_the_lamp_shows_what_was_heard_and_is_grey_when_nothing_is(retracted, tm
         monkeypatch.setattr(panel_lamp, "_LATE", -1.0)
         browser.until(f"{read('safety')}.includes('last heard') && {colour} == 'rgb(138, 138, 138)'")
         monkeypatch.undo()
-        growth = {"text": "form error diverges from revolution 12 on", "diverges": True}
-        monkeypatch.setattr(live.view, "_growing", lambda: growth)
         hear(live, heard[: len(heard) // 3])  # the run again
-        browser.until(f"{read('safety')} == 'nominal' && {colour} == 'rgb(179, 38, 46)'")
-        assert browser.run(read("growth")) == growth["text"]
+        browser.until(f"{read('safety')} == 'nominal' && {colour} == 'rgb(46, 125, 79)'")
+        browser.until(f"{read('age')} == 'up to date' && !document.body.classList.contains('lost')")
+        monkeypatch.setattr(live.view.age, "_newest", live.view.age._newest + 20 * 64000)
+        browser.until(f"{read('age')}.startsWith('shows the run as it was 20')")
+        assert browser.run(read("verdict")).endswith("(old)")
         serving.close()
         browser.until(f"{read('safety')}.includes('no answer') && {colour} == 'rgb(138, 138, 138)'")
+        assert re.match(r"lathe panel was not heard for \d+ s", browser.run(read("age")))
+        assert browser.run("document.body.classList.contains('lost')")
+
+
+def test_a_memory_is_cleared_while_the_tool_cuts_only_after_a_second_click(page):
+    """The warning stands at the button; on a narrow screen, both are above the bar of commands."""
+    browser, cell = page
+    one_revolution(browser)
+    browser.look(420, 900)
+    browser.click("#more")
+    clear = "[...document.querySelectorAll('#actions button')].find(each => each.textContent.startsWith('clear'))"
+    browser.run(f"{clear}.click()")
+    told = browser.until("document.querySelector('#actions .answer.refused').textContent")
+    assert "may retract the tool. Click again to clear." in told
+    assert cell.events == {}
+    browser.run(f"{clear}.click()")
+    browser.until("document.querySelector('#actions .answer:not(.refused)').textContent.endsWith(': clear')")
+    assert [event.partition(": ")[2] for event in cell.events["learning_controller"]] == ["clear"]
+
+
+COMMANDS = [
+    ("learning_controller", "freeze"),
+    ("learning_controller", "learn"),
+    ("learning_controller", "clear"),
+    ("learning_controller", "set learning_gain 0.7"),
+    ("supervisor", "retract"),
+    *3 * [("supervisor", "reset")],
+    ("spindle_encoder", "fault encoder missed_index"),
+    ("spindle_encoder", "fault encoder.speed wrong scale=1.2"),
+    ("electrodynamic_actuator", "fault coarse/command.position wrong scale=0.9"),
+    ("electrodynamic_actuator", "fault coarse/state.measured_position stuck"),
+    ("tool", "fault tool.error off"),
+    ("spindle_encoder", "repair encoder"),
+    ("spindle_encoder", "repair encoder.speed"),
+    ("electrodynamic_actuator", "repair coarse/command.position"),
+    ("electrodynamic_actuator", "repair coarse/state.measured_position"),
+]
+
+
+def test_the_page_shows_the_state_of_the_supervisor_in_a_campaign_of_random_commands(tmp_path):
+    """After each command and fault; also the verdict of `lathe run`, and whether a reset is carried out or refused."""
+    read, seen = "document.getElementById({!r}).textContent".format, set()
+    for seed in range(sized(100)):
+        choice = random.Random(seed)
+        cell = LiveCell(load(ROOT / "config" / "supervised.yaml", ["spindle_encoder.revolutions=120"]))
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        with (
+            Driver(cell, 0.0) as driver,
+            page_server.serving(panel.site(driver, cell)) as address,
+            Chromium(folder) as browser,
+        ):
+            browser.open(address)
+            browser.until("SHOWN.now.state == 'paused' && ABOUT.nodes.length")
+            supervisor, command = cell.cell.stages["supervisor"], ""
+            for _ in range(20):
+                for _ in range(choice.choice([1, 1, 2, 6])):
+                    one_revolution(browser)
+                if command == "reset":
+                    logged = [line["text"].partition(":")[0] for line in cell.view.latest.log if line["sample"] == at]
+                    assert (carried_out, not carried_out) == ("reset" in logged[1:], "reset refused" in logged), logged
+                browser.until(f"SHOWN.now.sample == {cell.reached}")
+                state = supervisor.state.name.lower()
+                seen.add(state)
+                assert browser.run(read("safety")).partition(" ")[0] == state, (seed, cell.events)
+                title, ground, age = (browser.run(read(name)) for name in ("verdict", "ground", "age"))
+                assert age == "up to date"
+                assert not (title == "PART GOOD" and state in panel_lamp.OUT)
+                node, command = choice.choice(COMMANDS)
+                carried_out, at = browser.run("!document.getElementById('reset').disabled"), cell.reached
+                driver.call(lambda node=node, command=command: cell.act(node, command))
+                if command == "reset" and not supervisor.reaction:
+                    command = ""  # nothing to reset: neither
+            given = [
+                f"{node}.events={[e for e in events if f'sample {at}:' not in e]!r}"
+                for node, events in cell.events.items()
+            ]
+            turns = f"spindle_encoder.revolutions={cell.view.turns}"
+            found = harness.run(load(ROOT / "config" / "supervised.yaml", [turns, *given])).verdict
+            assert found.told() in ground
+            assert (title == "PART BAD") == (not found.in_tolerance and not found.unjudged)
+            assert found.in_tolerance or title != "PART GOOD"
+    assert seen == {"nominal", "degraded", "retracting", "safe"}
