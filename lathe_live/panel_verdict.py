@@ -60,10 +60,8 @@ class Evaluation:
         if verdict is None:
             return (BAD, "ERROR DIVERGES", [grown, self.missing]) if diverges else _open(grown, self.missing)
         told = verdict.told()
-        if verdict.unjudged:
-            return _open(told)
-        if not verdict.revolutions:
-            return _open("no complete revolution yet", out)
+        if verdict.unjudged or not verdict.revolutions:
+            return _open(*([told] if verdict.unjudged else ["no complete revolution yet", out]))
         if not verdict.in_tolerance:
             if verdict.largest <= verdict.tolerance:  # the form is in doubt
                 return _open(told, grown, out, self.missing)

@@ -28,8 +28,8 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
+from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.judge.part import RunningVerdict
@@ -118,8 +118,8 @@ class Snapshot:
     rows: list[Row]
     log: list[dict[str, Any]]
     history: list[tuple[int, float, float]]
-    latest: Sequence[Row] = ()
-    part: Evaluation = Evaluation()
+    latest: Sequence[Row]
+    part: Evaluation
 
 
 def _short(values: Array) -> list[float]:
