@@ -42,6 +42,6 @@ def _judged() -> dict[str, str]:
 @pytest.mark.timeout(100_000)
 def test_each_mutant_of_the_protocol_is_found_or_judged():
     """A promise that no fault can break would prove nothing."""
-    judged, tried = _judged(), mutants.tried(1, MUTANTS, WITHIN, os.cpu_count() or 1)
+    judged, tried = _judged(), mutants.tried(2, MUTANTS, WITHIN, os.cpu_count() or 1)
     left = [name for name, found in tried if not found and name not in judged]
     assert not left, f"no schedule finds, and mutants.txt does not judge: {left}"
