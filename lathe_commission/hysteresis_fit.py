@@ -131,10 +131,7 @@ def of_measurement(measurement: Measurement) -> Loop:
     """
     if "command" not in measurement or "displacement" not in measurement:
         raise measurement.lacking("command and displacement")
-    command, displacement = measurement.read("command", "displacement")
-    if not command.size:
-        raise InputError(f"{measurement.name}: no points; give one and a half loops or more")
-    return Loop(command, displacement)
+    return Loop(*measurement.read("command", "displacement"))
 
 
 def read_csv(path: Path) -> Loop:

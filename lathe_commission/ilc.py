@@ -166,7 +166,7 @@ def frequency_response(
         InputError: the values are no response.
     """
     if isinstance(of, str | os.PathLike):
-        return Response(of_measurement(measurement_file.read(Path(of), {}, ".csv"), averages))
+        return Response(of_measurement(measurement_file.read(Path(of)), averages))
     if hasattr(of, "omega"):
         frequency, found = np.asarray(of.omega, float), np.ravel(getattr(of, "frdata", ()))
         if found.size != frequency.size:

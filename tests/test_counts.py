@@ -141,7 +141,7 @@ def test_a_file_with_another_header_or_line_is_refused(path):
         path.write_text(f"time_s,counts\n1,2\n{row}\n")
         assert_refused(lambda: list(CsvReader(path).read()), rf"counts.csv:3: '{row}'; allowed")
     path.write_text("time,counts\n1,2\n")
-    assert_refused(lambda: CsvReader(path), "header 'time,counts'; allowed: time_ns,counts or time_s,counts")
+    assert_refused(lambda: CsvReader(path), "columns 'time, counts'; allowed: time_ns,counts or time_s,counts")
 
 
 # --- the angle
@@ -522,7 +522,7 @@ def test_a_last_line_that_is_torn_is_named(path, left):
     write_rows(path, turning()[1])
     *lines, last = path.read_text().splitlines()
     path.write_text("\n".join([*lines, last[:left]]))
-    torn = rf"counts.csv:501: .*\(the last line, '{last[:left]}', has no end: torn\? remove it\)"
+    torn = r"counts.csv:501: .*\(the last line has no end: torn\? remove it\)"
     assert_refused(lambda: EncoderDevice("encoder_device", follower(path).nodes["encoder_device"]), torn)
 
 

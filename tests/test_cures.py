@@ -200,7 +200,8 @@ def test_a_set_point_is_read_in_its_own_unit(tmp_path):
         ("force_turning", "force_controller", "force_n", "position_um"),
     ):
         given = (name, f"{node}.trajectory=csv", f"{node}.trajectory_file={tmp_path}")
-        assert refused(*given[:2], f"{given[2]}/{other}.csv").endswith(f"allowed: time_s,{own}")
+        said = refused(*given[:2], f"{given[2]}/{other}.csv")
+        assert f"allowed: time and {own.partition('_')[0]} (rename" in said
         Cell(load(*given[:2], f"{given[2]}/{own}.csv").nodes)
 
 

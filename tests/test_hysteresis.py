@@ -289,7 +289,7 @@ def test_file_gives_the_loop(tmp_path):
     ("text", "message"),
     [
         ("displacement_um,u\n0,1\n", "columns 'displacement_um', 'u'; allowed: command and displacement"),
-        (HEAD, "no points; give one and a half loops"),
+        (HEAD, "no rows below its header; allowed"),
     ],
 )
 def test_bad_file_is_refused(tmp_path, text, message):

@@ -558,7 +558,7 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
     [
         ("a,b\n1,2\n", [], "columns 'a', 'b'; allowed: time and response of a step"),
         (HEADER + EVEN, ["--column", "command=u"], "--column command=u: .* has no such column; it has 'time_ms', "),
-        (HEADER + EVEN, ["--column", "speed=u"], "allowed: QUANTITY=COLUMN"),
+        (HEADER + EVEN, ["--column", "pace=u"], "allowed: QUANTITY=COLUMN"),
         (
             HEADER + EVEN,
             ["--column", "command=u:furlong"],
@@ -566,11 +566,11 @@ EVEN = "".join(f"{k * 0.05:.9g},{np.sin(k * k):.9g},{np.cos(k):.9g}\n" for k in 
         ),
         (HEADER.replace("_um", " [V]", 1) + EVEN, [], "has the unit 'V'; allowed for command"),
         (HEADER + EVEN + "30.3,1,1\n", [], "not in even steps.*resample the record, or give --rate"),
-        (HEADER + EVEN + "30,x,1\n", [], ":602: 'x' is not a number"),
+        (HEADER + EVEN + "30,x,1\n", [], ":602: 'command_um' is 'x'; allowed: a finite number"),
         ("\n".join((HEADER + EVEN).splitlines()[:300]), [], r"record: \d+ samples; allowed: 512 or more"),
         (HEADER + EVEN, [], "the response follows the command at"),
         (HEADER + EVEN, ["--band", "0:5"], "the response follows the command at 0 frequencies .* a wider --band"),
-        (HEADER, [], "time: 0 samples; allowed: 2 or more"),
+        (HEADER, [], "no rows below its header; allowed: one or more"),
         (HEADER + EVEN, ["--band", "5:9000"], "up to 9000 Hz of a record at 20000 Hz; allowed: up to 8000 Hz"),
         (HEADER + EVEN, ["--rate", 2e4], "--rate 20000 beside the times in 'time_ms'; leave --rate out"),
         (RISE, ["--rate", 10], "--rate does not apply to a step response with times; leave it out"),

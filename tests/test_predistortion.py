@@ -185,8 +185,8 @@ def test_file_comes_back(tmp_path_factory, offsets):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("height_mm,offset\n0,0\n", r"path.csv: header 'height_mm,offset'; allowed: height_mm,offset_um"),
-        ("height_mm,offset_um\n", r"path.csv: predistortion: 0 heights and 0 offsets; give as many"),
+        ("height_mm,offset\n0,0\n", r"path.csv: column 'offset' has no unit; allowed for offset: m, mm, um"),
+        ("height_mm,offset_um\n", r"path.csv: no rows below its header; allowed: one or more"),
         ("height_mm,offset_um\n1,0\n0,0\n", r"path.csv: predistortion: height 0.001 m is followed by 0 m; allowed"),
     ],
 )

@@ -191,14 +191,14 @@ GOOD = "0,1\n90,2\n180,3\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "header ''; allowed: angle_deg,radius_um or"),
-        (GOOD, "header '0,1'"),
-        (HEAD, "no points"),
+        ("", "no header; allowed: a first line with the names"),
+        (GOOD, ":1: numbers in place of a header; allowed"),
+        (HEAD, "no rows below its header"),
         (HEAD + "0,1\n90,2\n", "2 different angles; allowed: 3 or more"),
-        (HEAD + GOOD + "270,nan\n", ":5: 'nan'; allowed: finite numbers"),
-        (HEAD + GOOD + "270,1e999\n", ":5: '1e999'; allowed: finite numbers"),
-        ("# c\n" + HEAD + "\n" + GOOD + "270,four\n", ":7: 'four' is not a number"),
-        (HEAD + GOOD + "270,\n", ":5: '' is not a number"),
+        (HEAD + GOOD + "270,nan\n", ":5: 'radius_um' is 'nan'; allowed: a finite number"),
+        (HEAD + GOOD + "270,1e999\n", ":5: 'radius_um' is '1e999'; allowed"),
+        ("# c\n" + HEAD + "\n" + GOOD + "270,four\n", ":7: 'radius_um' is 'four'; allowed"),
+        (HEAD + GOOD + "270,\n", ":5: 'radius_um' is empty; allowed"),
         (HEAD + GOOD + "270\n", ":5: 1 values; allowed: 2"),
         (
             HEAD + "0,1,5\n90,2\n",
@@ -214,13 +214,13 @@ GOOD = "0,1\n90,2\n180,3\n"
         (TALL + "0,0,1\n90,0,1\n180,0,1\n0,1e-9,1\n", ": heights 0 and 1e-09 mm are too close"),
         (HEAD + every(5, 0, 235), ": no point from 235° to 0°, while others are 5° apart; allowed: points all round"),
         (HEAD + every(1, 30, 90), ": no point from 90° to 30°, while others are 1° apart"),
-        ("angle_deg|radius_um\n0|1\n", "header 'angle_deg|radius_um'; allowed: angle_deg,radius_um"),
+        ("angle_deg|radius_um\n0|1\n", "columns 'angle_deg|radius_um'; allowed: angle and radius"),
         (HEAD + GOOD + "1e-320,1\n", ": angles 0 and 9.999888672e-321° are too close"),
         (HEAD + GOOD + "359.9999999,1\n", ": angles 359.9999999 and 360° are too close"),
         (HEAD + GOOD + '270,"4\n', ":5: not CSV"),
         (HEAD + '0,"1\n"\n90,2\n180,3\n', ":2: not CSV"),
         (b"\xff\xfe\x00a\x00n\x00", "not a text file"),
-        (HEAD.encode() + b"0,\x81\n", "not a text file; allowed: CSV in UTF-8, UTF-16 or Windows-1252"),
+        (HEAD.encode() + b"0,\x81\n", "not a text file; allowed: CSV in UTF-8, UTF-16 with a byte order mark, or Win"),
         (HEAD.encode() + b"0,\x00\n", "not a text file"),
         (HEAD + "0,0\n1.571,10\n3.142,0\n4.712,-10\n", "spans 0 to 4.712, which looks like radians; allowed: degrees"),
         (HEAD + "0,0\n0.25,10\n0.5,0\n0.75,-10\n", "angle_deg spans 0 to 0.75, which looks like revolutions"),
@@ -251,10 +251,10 @@ def test_what_is_no_file_or_far_too_large_is_refused_unread(tmp_path):
     with (tmp_path / "large").open("wb") as file:
         file.truncate(2**40)
     for name, message in (
-        ("no.csv", r"no\.csv: cannot be read \(No such file or directory\)"),
-        ("", r"cannot be read \(not a file\)"),
+        ("no.csv", r"no\.csv: cannot be read \(no such file\)"),
+        ("", r"cannot be read \(a folder\)"),
         ("pipe", r"cannot be read \(not a file\)"),
-        ("large", "larger than 64 MiB"),
+        ("large", "not a text file"),
     ):
         assert_refused(lambda name=name: read_csv(tmp_path / name), message)
 

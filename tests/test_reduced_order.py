@@ -93,8 +93,8 @@ def test_csv_gives_the_same_as_arrays(tmp_path):
     read = read_csv(path)
     assert np.array_equal(read.time, channel.time)
     assert np.array_equal(read.response, channel.response)
-    path.write_text("t,response\n0,1\n")
-    with pytest.raises(InputError, match="columns 't', 'response'; allowed: time and response"):
+    path.write_text("s,response\n0,1\n")
+    with pytest.raises(InputError, match="columns 's', 'response'; allowed: time and response"):
         read_csv(path)
 
 

@@ -171,13 +171,13 @@ def test_csv_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "no columns of numbers; allowed: time and response"),
+        ("", "no header; allowed"),
         (None, "cannot be read"),
         ("t,h\n" + GOOD, "columns 't', 'h'; allowed: time and response"),
-        ("time_ms,response\n", "0 times"),
+        ("time_ms,response\n", "no rows below its header; allowed"),
         ("time_ms,response\n" + GOOD + "13\n", ":102: 1 values"),
-        ("time_ms,response\n" + GOOD + "13,one\n", ":102: 'one' is not a number"),
-        ("time_ms,response\n" + GOOD + "13,nan\n", ":102: 'nan'; allowed: finite"),
+        ("time_ms,response\n" + GOOD + "13,one\n", ":102: 'response' is 'one'; allowed"),
+        ("time_ms,response\n" + GOOD + "13,nan\n", ":102: 'response' is 'nan'; allowed"),
         ("time_ms,response\n" + GOOD + "3,1\n", "is followed by 0.003 s; allowed: increasing"),
         ("time_ms,response\n" + GOOD + "13,225\n", "ends at 225; allowed: near 1"),
     ],

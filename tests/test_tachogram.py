@@ -76,11 +76,11 @@ def test_the_file_s_content_is_part_of_the_run_s_identity(path, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("time_s,rpm\n", "no row; allowed: one or more of time_s,rpm"),
-        ("time,rpm\n0,1\n", "header 'time,rpm'; allowed: time_s,rpm"),
+        ("time_s,rpm\n", "no rows below its header; allowed: one or more"),
+        ("time,n\n0,1\n", "column 'n' has no unit; allowed for speed: rpm, 1/min"),
         ("time_s,rpm\n0,1000\n1,1000\n1,900\n", "row 3 is 0 s after the one before; allowed: times that rise"),
         ("time_s,rpm\n0,1000\n0.5,0\n", "rpm = 0 in row 2, 0.5 s after the first; allowed: above 0"),
-        ("time_s\trpm\n0\t1.000,5\n", ":2: '1.000.5' is not a number"),
+        ("time_s\trpm\n0\t1.00,5\n", ":2: 'rpm' is '1.00,5'; allowed"),
         ("time_s,rpm\n0,16.7\n1,16.6\n", "rpm is 16.65 in the middle, with nominal_rpm = 1000, which looks like rev"),
         ("time_s,rpm\n0,1\n1,15\n2,16\n3,17\n", "(multiply by 60, or set nominal_rpm = 15.5 if it is)"),
         ("time_s,rpm\n0,104.72\n", "rpm is 104.7 in the middle, with nominal_rpm = 1000, which looks like rad/s; al"),

@@ -66,6 +66,7 @@ def space_of(
     sampling: many.Sampling,
     cells: Path | None = None,
     carry: Sequence[str] = (),
+    columns: Sequence[str] = (),
 ) -> "lathe_explore.Space":
     """Return the space given by options; with a sample, ranges without a count are sampled."""
     from lathe_explore.sweep.space import Space
@@ -75,8 +76,9 @@ def space_of(
     drawn = pairs("--draw", draw, "NODE.PARAM=normal:DEVIATION, =normal:MEAN:DEVIATION or =uniform:LOW:HIGH")
     sample, sample_seed, correlated = sampling
     ranges = {target: text for target, text in varied.items() if sample and text.removesuffix(":log").count(":") == 1}
-    if carry and not cells:
-        raise InputError(f"--carry {carry[0]} without --cells; allowed: a column of the file of --cells")
+    if (carry or columns) and not cells:
+        option = f"--carry {carry[0]}" if carry else f"--column {columns[0]}"
+        raise InputError(f"{option} without --cells; allowed: a column of the file of --cells")
     return Space(
         grid={target: text for target, text in varied.items() if target not in ranges},
         sampled=ranges | drawn,
@@ -85,7 +87,7 @@ def space_of(
         sample=sample,
         sample_seed=sample_seed,
         seeds=seeds,
-        given=cells_file.read(cells, carry) if cells else (),
+        given=cells_file.read(cells, carry, cells_file.parse_columns(columns)) if cells else (),
         carried=carry,
     )
 
@@ -112,6 +114,13 @@ def _number(pair: str, text: str) -> float:
 @many.seeds
 @click.option("--cells", type=options.PATH, help="CSV or YAML file with a cell a row")
 @click.option("--carry", multiple=True, metavar="COLUMN", help="column of --cells that goes into the rows as text")
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="TARGET=COLUMN[:FACTOR]",
+    help="where --cells names a target otherwise, or in another unit; repeatable",
+)
 @many.measures
 @click.option(
     "--models",
@@ -131,6 +140,7 @@ def run(
     seeds: int,
     cells: Path | None,
     carry: tuple[str, ...],
+    columns: tuple[str, ...],
     overrides: tuple[str, ...],
     revolutions: float | None,
     start_from: Path | None,
@@ -149,7 +159,7 @@ def run(
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
     if not (vary or draw or cells or seeds > 1):
         raise InputError("nothing varies; allowed: --vary, --draw, --cells or --seeds (lathe run computes one cell)")
-    space = space_of(vary, draw, tie, seeds, sampling, cells, carry)
+    space = space_of(vary, draw, tie, seeds, sampling, cells, carry, columns)
     place = out or Path(f"sweep-{loaded.name}")
     with SweepWatch(place, quiet=as_json) as watch:
         found = lathe_explore.run_sweep(loaded, space, place, scheduler=scheduler, workers=workers, watch=watch, **how)

@@ -114,11 +114,14 @@ class Space:
             raise InputError(f"seeds = {self.seeds}; allowed: from 1")
         for target in self.targets():
             scenario.parameter(target)
-        for cell in self.given:
+        for place, cell in enumerate(self.given, 1):
             if missing := [name for name in self.carried if name not in cell]:
                 raise InputError(f"{missing[0]}: no column of the given cells; allowed: {', '.join(cell)}")
             for target in cell.keys() - set(self.carried):
-                _check_type(target, scenario.parameter(target), cell[target])
+                try:
+                    _check_type(target, scenario.parameter(target), cell[target])
+                except InputError as error:
+                    raise InputError(f"row {place} of the given cells: {error}") from None
         if any(dict(first) == dict(second) for first, second in itertools.pairwise(sorted(self.given, key=canonical))):
             raise InputError("two of the given cells are the same; allowed: each once")
         if self.sampled and not self.sample:

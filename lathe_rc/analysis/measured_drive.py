@@ -102,5 +102,5 @@ def _read(path: Path, _: tuple[int, int] | None) -> list[tuple[Array, Complex]]:
     from lathe_rc.analysis import frequency_response  # with SciPy, which a cell without measurements need not import
     from lathe_rc.signals import measurement_file
 
-    found = frequency_response.of_states(measurement_file.read(path, {}, ".csv"))
+    found = frequency_response.of_states(measurement_file.read(path))
     return [(each.frequency, each.value) for each in found]

@@ -1,41 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells given by a file, each with values of some parameters."""
 
-import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Value
-from lathe_rc.signals import table
+from lathe_rc.errors import InputError
+from lathe_rc.signals.table import Table, read_text
 
-_DECIMAL = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")  # beside semicolons or tabulators
 
-
-def read(path: Path, carried: Collection[str] = ()) -> list[dict[str, Value]]:
+def read(
+    path: Path, carried: Collection[str] = (), columns: Mapping[str, tuple[str, float]] | None = None
+) -> list[dict[str, Value]]:
     """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
 
     Args:
         path: the file.
         carried: names of columns that are no targets; their values stay text.
+        columns: names of columns in the file and factors of their numbers, by target.
 
     Raises:
-        InputError: the file cannot be read, or is in neither format.
+        InputError: the file cannot be read, is in neither format, has no cells, or lacks a column.
     """
-    text = table.read_text(path, "cells")
-    if path.suffix.lower() != ".csv":
-        return [
-            {name: str(value) if name in carried else value for name, value in cell.items()}
-            for cell in ros_yaml.rows(text, str(path))
-        ]
-    targets, rows, mark = table.header_and_rows(text, path)
-    for line, row in rows:
-        table.check_width(path, line, len(row), len(targets))
+    cells = _of_yaml(path, carried) if path.suffix.lower() != ".csv" else _of_table(path, carried)
+    if not cells:
+        raise InputError(f"{path}: no cells; allowed: one or more rows below a header of targets")
+    for number, cell in enumerate(cells, 1):
+        for target, (name, factor) in (columns or {}).items():
+            value = cell.pop(name, None)
+            if target in cell:
+                raise InputError(f"{path}: a column {target} beside --column {target}={name}; allowed: one of them")
+            if value is None or (factor != 1.0 and not isinstance(value, int | float)):
+                reason = f"is {value!r}; allowed: a number" if name in cells[0] else "is missing"
+                raise InputError(f"{path}: row {number}: {name!r} {reason} (--column {target}={name})")
+            cell[target] = value * factor if isinstance(value, int | float) and factor != 1.0 else value
+    return cells
 
-    def value(target: str, text: str) -> Value:
-        if target in carried:
-            return text
-        text = table.pointed(text, mark) if _DECIMAL.fullmatch(text) else text
-        return ros_yaml.parse_value(text, f"{path}: {target}")
 
-    return [{target: value(target, text) for target, text in zip(targets, row, strict=True)} for _, row in rows]
+def parse_columns(given: Iterable[str]) -> dict[str, tuple[str, float]]:
+    """Parse ``TARGET=COLUMN[:FACTOR]``.
+
+    Raises:
+        InputError: the text has another form, or the factor is no number.
+    """
+    found = {}
+    for text in given:
+        target, _, column = text.partition("=")
+        name, _, factor = column.rpartition(":") if ":" in column else (column, "", "1")
+        try:
+            found[target] = name, float(factor)
+        except ValueError:
+            name = ""
+        if not target or not name:
+            raise InputError(f"--column {text!r}; allowed: TARGET=COLUMN[:FACTOR], FACTOR a number")
+    return found
+
+
+def _of_yaml(path: Path, carried: Collection[str]) -> list[dict[str, Value]]:
+    cells = ros_yaml.rows(read_text(path), str(path))
+    return [{name: str(value) if name in carried else value for name, value in cell.items()} for cell in cells]
+
+
+def _of_table(path: Path, carried: Collection[str]) -> list[dict[str, Value]]:
+    table = Table(path)
+    found: list[dict[str, Value]] = []
+    for line, row in table.texts(table.names, raw=carried):
+        cell: dict[str, Value] = {}
+        for name, text in zip(table.names, row, strict=True):
+            if not text and name not in carried:
+                raise InputError(f"{path}:{line}: {name} is empty; allowed: a value")
+            cell[name] = text if name in carried else ros_yaml.parse_value(text, f"{path}:{line}: {name}")
+        found.append(cell)
+    return found

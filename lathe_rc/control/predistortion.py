@@ -31,7 +31,7 @@ from lathe_rc.arrays import Array, Integers
 from lathe_rc.control.interpolation import linear
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
-from lathe_rc.signals.table import read_table, write_table
+from lathe_rc.signals.table import write_table
 
 ForceLaw = Callable[[Array], Array]  #: force [N] for a depth of cut [m] at each height, not decreasing with it
 
@@ -177,13 +177,15 @@ class Predistortion:
 
     @classmethod
     def load(cls, path: Path) -> "Predistortion":
-        """Read a path from a CSV file with the columns ``height_mm,offset_um``, as written by `save`.
+        """Read a path from a file with ``height`` and ``offset``, such as `save` writes.
 
         Raises:
             InputError: the file is missing or malformed, or its values are not a valid path.
         """
-        _, rows = read_table(path, [_COLUMNS], "predistortion")
+        from lathe_rc.signals import measurement_file  # with SciPy, which a cell without files need not import
+
+        heights, offsets = measurement_file.read(path).read("height", "offset")
         try:
-            return cls(rows[:, 0] * 1e-3, rows[:, 1] * 1e-6)
+            return cls(heights, offsets)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None

@@ -13,6 +13,7 @@ import termios
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from decimal import Decimal
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO
 
@@ -21,17 +22,18 @@ import numpy as np
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.edge_time import COUNT, STAMP, edge_table, pass_edge, passed
-from lathe_rc.signals.table import lines_of, pointed, read_text
+from lathe_rc.signals.quantities import rank, unit_of
+from lathe_rc.signals.table import Table
 
 #: time [ns], counter and, with edge times, that of the last edge [ns]; an integer counter as int, for all its digits
 Reading = tuple[int, int | float] | tuple[int, int | float, int]
 
 _NUMBER = r"\s*([-+]?[0-9.eE+-]+)\s*"
 _READING = re.compile(rf"{_NUMBER}(?:[,;]|\s){_NUMBER}(?:(?:[,;]|\s){_NUMBER})?")
-_PLAIN = {"time_ns,counts": 1, "time_s,counts": 10**9}  # header, and nanoseconds per unit of the times
-_TIMED = {"time_ns,counts,edge_ns": 1, "time_s,counts,edge_s": 10**9}  # with the time of the counter's last edge
-_HEADERS = _PLAIN | _TIMED
-_COLUMNS = re.compile(r"(time_(n?s),counts(?:,edge_\2)?)(?:,index_(\2|counts))?")  # header of a file
+_PLAIN = ("time_ns,counts", "time_s,counts")  # headers of lines
+_TIMED = ("time_ns,counts,edge_ns", "time_s,counts,edge_s")  # with the time of the counter's last edge
+_NANOSECONDS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
+_OTHER_COLUMNS = re.compile(r"(?P<what>counts|(?:edge|index)(?=_))(?:_(?P<unit>ns|us|ms|s|counts))?")
 _MOST_TIME = 2**63  # [ns], exclusive
 MOST_COUNT = 2.0**64  #: largest magnitude of a counter
 _LONGEST_LINE = 256
@@ -74,25 +76,31 @@ def _time_ns(text: str, unit: int) -> int:
     return int(text) if unit == 1 else round(time * unit)
 
 
-def _reading(text: str, unit: int, where: str, *, timed: bool) -> Reading:
-    """Parse a reading with times in units of ``unit`` nanoseconds; ``where`` locates the text in error messages."""
-    found = _READING.fullmatch(text)
+def _reading(text: str, unit: int, where: str, *, edge_unit: int) -> Reading:
+    """Parse a reading with a time in units of ``unit`` nanoseconds.
+
+    Args:
+        text: a time, a counter and, with an ``edge_unit``, the time of its last edge.
+        unit: unit of the time [ns].
+        where: place of the text, for error messages.
+        edge_unit: unit of the time of the edge [ns]; 0: there is none.
+    """
+    found, timed = _READING.fullmatch(text), bool(edge_unit)
     try:
         if found and bool(found[3]) == timed:
             time_ns, count = _time_ns(found[1], unit), _count(found[2])
-            return (time_ns, count, _time_ns(found[3], unit)) if timed else (time_ns, count)
+            return (time_ns, count, _time_ns(found[3], edge_unit)) if timed else (time_ns, count)
     except (ValueError, ArithmeticError):
         pass
     what = "a time, a counter and the time of its last edge" if timed else "a time and a counter"
-    raise InputError(f"{where}: {shown(text)!r}; allowed: {what}, as {next(iter(_TIMED if timed else _PLAIN))}")
+    raise InputError(f"{where}: {shown(text)!r}; allowed: {what}, as {(_TIMED if timed else _PLAIN)[0]}")
 
 
 class CsvReader(Reader):
-    """Reader of a CSV file with the header ``time_ns,counts`` or ``time_s,counts``; ignores lines starting with #.
+    """Reader of a text table (see `lathe_rc.signals.table`) with columns ``time_ns`` or ``time_s``, and ``counts``.
 
-    With the column ``edge_ns`` or ``edge_s``, it has the times of the last edges. A last column ``index_counts`` has
-    the counter at the newest index pulse, and ``index_ns`` or ``index_s`` the time of this pulse; it is empty before
-    the first pulse.
+    Columns ``edge_ns`` or ``edge_s`` have the times of the last edges. A column ``index_counts`` has the counter at the
+    newest index pulse, and ``index_ns`` or ``index_s`` the time of this pulse; it is empty before the first pulse.
 
     Args:
         path: path of the file.
@@ -109,51 +117,63 @@ class CsvReader(Reader):
     """
 
     def __init__(self, path: Path) -> None:
-        text = read_text(path, "counts")
-        self._path, self._ends = path, text.endswith(("\n", "\r"))
-        lines, mark = lines_of(text)
-        self._lines = [(n, pointed(line, mark).replace(mark, ",")) for n, line in lines]
-        header = self._lines[0][1].replace(" ", "") if self._lines else ""
-        found = _COLUMNS.fullmatch(header)
-        if not found:
-            edges = " and ".join(name.rpartition(",")[2] for name in _TIMED)
+        self._path = path
+        table = Table(path, _column)
+        columns: dict[str, str] = {}
+        units: dict[str, str] = {}
+        for name, below in zip_longest(table.names, table.units, fillvalue=""):
+            what, unit = _column(name) or ("", "")
+            if what in columns:
+                raise InputError(f"{path}: {columns[what]!r} and {name!r} are both {what}; allowed: one of them")
+            if what:
+                columns[what], units[what] = name, unit or below
+        self._units = {what: _NANOSECONDS.get(unit, 0) for what, unit in units.items()}
+        if "counts" not in units or not self._units.get("time") or not self._units.get("edge", 1):
             raise InputError(
-                f"{path}: header {shown(header)!r}; allowed: {' or '.join(_PLAIN)}, and {edges} for the times of "
-                "edges, and index_counts, index_ns or index_s for index pulses"
+                f"{path}: columns {shown(', '.join(table.names))!r}; allowed: {' or '.join(_PLAIN)}, and edge_ns or "
+                "edge_s for the times of edges, and index_counts, index_ns or index_s for index pulses"
             )
-        self._unit, self.timed = _HEADERS[found[1]], found[1] in _TIMED
-        self.index: str = found[3] or ""
+        self.timed, self.index = "edge" in units, units.get("index", "")
         self.pulses: list[tuple[int, int | float]] = []
-        self.numbers = [number for number, _ in self._lines[1:]]
+        self._fields = [what for what in ("time", "counts", "edge", "index") if what in columns]
+        self._rows = table.texts([columns[what] for what in self._fields])
+        if not self._rows:
+            raise InputError(f"{path}: no rows below its header; allowed: readings of a time and a counter")
+        self._ends, self.numbers = table.ends, [line for line, _ in self._rows]
 
     def read(self) -> Iterator[Reading]:
         """Yield all readings of the file, once."""
-        for place, (number, line) in enumerate([] if self.ended else self._lines[1:]):
-            where, text = f"{self._path}:{number}", line
+        for place, (line, fields) in enumerate([] if self.ended else self._rows):
+            where, reading = f"{self._path}:{line}", fields[: 2 + self.timed]
             try:
-                if self.index:
-                    text, _, pulse = line.rpartition(",")
-                    self._add_pulse(place, pulse.strip(), where)
-                yield _reading(text, self._unit, where, timed=self.timed)
+                if self.index and fields[-1]:
+                    self._add_pulse(place, fields[-1], where)
+                yield _reading(",".join(reading), self._units["time"], where, edge_unit=self._units.get("edge", 0))
             except InputError as error:
                 raise InputError(f"{error}{self.torn(place)}") from None
         self.ended = True
 
     def torn(self, place: int) -> str:
         """Return a remark on the last line if it is that of a reading and has no end; otherwise an empty text."""
-        last = place == len(self._lines) - 2 and not self._ends
-        return f" (the last line, {shown(self._lines[-1][1])!r}, has no end: torn? remove it)" if last else ""
+        last = place == len(self._rows) - 1 and not self._ends
+        return " (the last line has no end: torn? remove it)" if last else ""
 
     def _add_pulse(self, place: int, text: str, where: str) -> None:
         """Append an index pulse if the column shows another one than before."""
-        if not text:
-            return
         try:
-            pulse = _count(text) if self.index == "counts" else _time_ns(text, self._unit)
+            pulse = _count(text) if self.index == "counts" else _time_ns(text, self._units["index"])
         except (ValueError, ArithmeticError):
             raise InputError(f"{where}: index_{self.index} = {shown(text)!r}; allowed: a number, or nothing") from None
         if not self.pulses or pulse != self.pulses[-1][1]:
             self.pulses.append((place, pulse))
+
+
+def _column(name: str) -> tuple[str, str] | None:
+    """Return what a column of a file has, ``time``, ``counts``, ``edge`` or ``index``, and its unit; None: neither."""
+    if rank("time", name):
+        return "time", unit_of("time", name) or ""
+    found = _OTHER_COLUMNS.fullmatch(name.casefold())
+    return (found["what"], found["unit"] or "") if found else None
 
 
 class LineReader(Reader):
@@ -212,8 +232,10 @@ class LineReader(Reader):
             for line in lines:
                 if self._skips:
                     self._skips = False
-                elif (text := line.decode("utf-8", "replace").strip()) and text[0] != "#" and text not in _HEADERS:
-                    yield _reading(text, 1, self._name, timed=self._timed)
+                elif (
+                    (text := line.decode("utf-8", "replace").strip()) and text[0] != "#" and text not in _PLAIN + _TIMED
+                ):
+                    yield _reading(text, 1, self._name, edge_unit=int(self._timed))
             if len(self._rest) > _LONGEST_LINE:
                 raise InputError(
                     f"{self._name}: {len(self._rest)} bytes without an end of line; allowed: lines of text"

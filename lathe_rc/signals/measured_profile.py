@@ -10,10 +10,9 @@ import scipy
 
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-from lathe_rc.signals.table import parse_table, read_text
+from lathe_rc.signals import measurement_file
 
 _TURN = 2.0 * np.pi
-_HEADERS = (("angle_deg", "radius_um"), ("angle_deg", "height_mm", "radius_um"))
 _FLATTEST = 0.01  # [µm] smallest peak-to-valley height other than 0: no lathe turns a flatter form
 _MILLIMETRES = 2.0  # [µm] a form with a smaller height may be in mm: few forms have 2 mm
 _METRES = 0.1  # [mm] a smaller range of heights may be in m
@@ -130,26 +129,25 @@ def doubts(form: Measured) -> list[str]:
 
 
 def read_csv(path: Path) -> Measured:
-    """Read a part profile from a CSV file.
+    """Read a part profile from a file with ``angle``, ``radius`` (deviation) and optionally ``height``, with units.
 
-    The columns are ``angle_deg`` [°], optionally ``height_mm`` [mm], and ``radius_um`` (radius deviation) [µm], with
-    rows in any order. Every height must have the same angles. A row at 360° may repeat the row at 0°.
+    Rows are in any order. Every height must have the same angles. A row at 360° may repeat the row at 0°.
 
     Raises:
         InputError: the file is missing, is malformed, has other units, contains a number that is not finite, repeats an
             angle, or covers only part of a revolution.
     """
-    return _measured(read_text(path, "profile"), path)
+    status = path.stat() if path.exists() else None
+    return _measured(path, status and (status.st_mtime_ns, status.st_size, status.st_ino))
 
 
 @lru_cache(maxsize=8)
-def _measured(text: str, path: Path) -> Measured:
-    """Parse a profile from CSV text; cached, since parsing takes longer than some cells run."""
-    header, rows = parse_table(text, path, _HEADERS)
-    if not rows.size:
-        raise InputError(f"{path}: no points; give at least three angles")
-    if len(header) == 2:
-        rows = np.insert(rows, 1, 0.0, axis=1)
+def _measured(path: Path, _: tuple[int, int, int] | None) -> Measured:
+    """Read a profile; cached, since reading takes longer than some cells run."""
+    found = measurement_file.read(path)
+    units = {"angle": "deg", "radius": "um"} | ({"height": "mm"} if "height" in found else {})
+    angle_deg, radius_um, *along = found.read(*units, units=units)
+    rows = np.stack([angle_deg, *(along or [np.zeros(angle_deg.size)]), radius_um], axis=1)
     wrong = rows[(rows[:, 0] < 0.0) | (rows[:, 0] > 360.0), 0]
     if wrong.size:
         raise InputError(f"{path}: angle {wrong[0]:.10g}°; allowed: 0 up to 360, where 360 is 0 again")

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements by quantity, in SI units, from CSV, Parquet, MATLAB, TDMS and MDF files.
+"""Measurements by quantity, in SI units, from text tables, Parquet, MATLAB, TDMS and MDF files.
 
-All commands that read measurements use one format of columns. A column is named by its quantity, with its unit after
-it: ``time_ms``, ``time [ms]``, ``command_um``, ``response``, ``frequency_hz``. Without a unit in its name it has the
-unit that the file states for it, otherwise the SI unit; records of parts need a unit. A mapping of columns gives names
-and units that differ.
+All readers of numbers use one format of columns, see `lathe_rc.signals.quantities`. Without a unit in its name a column
+has the unit that the file states for it, otherwise the SI unit; lengths along a part need a unit. A mapping of columns
+gives names and units that differ.
 """
 
-import csv
-import re
 import shlex
 import warnings
 from abc import ABC, abstractmethod
@@ -21,39 +18,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from lathe_rc import extras, files
+from lathe_rc import extras
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.signals import table
+from lathe_rc.signals.quantities import UNITS, factor, is_decibel, is_quantity, rank, unit_of
+from lathe_rc.signals.table import Table
 
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 25.4e-3}
-_LENGTH = {**_LENGTHS, "": 1.0, "1": 1.0}
-_RATIO = {"": 1.0, "1": 1.0, "%": 1e-2, "pct": 1e-2}
-_DECIBEL = "db"
-_TURN = 2.0 * np.pi
-
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "": 1.0},
-    "command": _LENGTH,
-    "response": _LENGTH,
-    "displacement": _LENGTH,
-    "frequency": {"hz": _TURN, "khz": 1e3 * _TURN, "rad/s": 1.0, "rad_s": 1.0, "": _TURN},
-    "magnitude": {**_RATIO, _DECIBEL: 1.0},
-    "phase": {"deg": np.pi / 180.0, "°": np.pi / 180.0, "rad": 1.0, "": np.pi / 180.0},
-    "real": _RATIO,
-    "imaginary": _RATIO,
-    "coherence": _RATIO,
-    "relative_uncertainty": _RATIO,
-    "state": {"": 1.0, "1": 1.0},
-    "angle": {"deg": _TURN / 360.0, "°": _TURN / 360.0, "rad": 1.0, "rev": _TURN},
-    "radius": _LENGTHS,
-    "height": _LENGTHS,
-    "revolution": {"": 1.0, "1": 1.0},
-}  #: factors to SI units [s, m, rad/s, 1, rad] by quantity and unit; "": no unit known
-_NAMED = re.compile(r"\s*(?P<name>.*?)(?:[\s_]*[\[(]\s*(?P<bracket>[^\])]*?)\s*[\])])?\s*")
-_LONGEST_HEADER = 2**20  # [B]
 _SAME_START = 1e-8  # [s] two columns that begin within it begin together
-_MISSING = ("", "nan")  # texts of a value that was not measured
 _MOST_COLUMNS = 12  # that an error message lists
 
 
@@ -90,6 +61,11 @@ class Source(ABC):
     def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         """Return columns by name, shape (n,) each; ``gaps``: those in which a missing value is NaN."""
 
+    def since_first(self, name: str) -> Array:
+        """Return a column less its first value, shape (n,)."""
+        values = self.read([name])[name]
+        return np.asarray(values - values[:1], np.float64)
+
     def clock(self, name: str) -> Clock | None:
         """Return the sampling of a column; None if the file does not state it."""
         return None
@@ -123,45 +99,13 @@ def parse_mapping(given: Iterable[str]) -> dict[str, Mapped]:
         name, colon, unit = column.rpartition(":")
         if not colon:
             name, unit = column, ""
-        elif _factor(quantity, unit) is None:
+        elif factor(quantity, unit) is None:
             known = ", ".join(unit for unit in UNITS[quantity] if unit)
             raise InputError(
                 f"--column {text!r}: no unit {unit!r} of {quantity}; allowed: {known}, or a number, the SI value of 1"
             )
         mapping[quantity] = Mapped(name, unit)
     return mapping
-
-
-def _plain(unit: str) -> str:
-    """Return a unit in the spelling of `UNITS`."""
-    return unit.strip().replace("µ", "u").replace("μ", "u").casefold()
-
-
-def _factor(quantity: str, unit: str) -> float | None:
-    """Return the SI value of 1 in a unit: one of `UNITS` or a number; None for another text."""
-    found = UNITS[quantity].get(_plain(unit))
-    if found is None:
-        try:
-            found = float(unit)
-        except ValueError:
-            return None
-    return found if np.isfinite(found) and found else None
-
-
-def _unit_of(quantity: str, column: str) -> str | None:
-    """Return the unit in the name of a column, ``NAME_UNIT`` or ``NAME [UNIT]``; None if it has none."""
-    match = _NAMED.fullmatch(column)
-    if match and match["bracket"] is not None:
-        return match["bracket"] if re.search("[^\\W\\d]|[%°]", match["bracket"]) else None  # "[2]" is no unit
-    known = sorted((unit for unit in UNITS[quantity] if unit and unit != "1"), key=len, reverse=True)
-    return next((unit for unit in known if _plain(column).endswith(f"_{unit}")), None)
-
-
-def _is_of(quantity: str, column: str) -> bool:
-    """Return whether a column is named by a quantity, with or without its unit."""
-    match = _NAMED.fullmatch(column)
-    name = _plain(match["name"] if match else column).replace(" ", "_")
-    return name == quantity or any(name == f"{quantity}_{unit}" for unit in UNITS[quantity] if unit)
 
 
 def even_clock(time: Array, what: str, cure: str = "resample the record") -> Clock:
@@ -188,6 +132,21 @@ def even_clock(time: Array, what: str, cure: str = "resample the record") -> Clo
     return Clock(float(time[0]), step)
 
 
+def check_rising(time: Array, path: Path) -> None:
+    """Check that times of a file [s], shape (n,), increase.
+
+    Raises:
+        InputError: they do not; the message names the row.
+    """
+    wrong = np.flatnonzero(np.diff(time) <= 0.0)
+    if wrong.size:
+        place = int(wrong[0]) + 1
+        raise InputError(
+            f"{path}: row {place + 1} is {time[place] - time[place - 1]:.10g} s after the one before; allowed: times "
+            "that rise"
+        )
+
+
 class Measurement:
     """Quantities of a measurement, in SI units.
 
@@ -209,7 +168,8 @@ class Measurement:
                 raise InputError(f"--column {quantity}={column}: {name} has no such column; it has {self._listed()}")
             self._columns[quantity] = Mapped(column, unit)
         for quantity in UNITS.keys() - mapping.keys():
-            fitting = [column for column in source.units if _is_of(quantity, column)]
+            ranks = {column: rank(quantity, column) for column in source.units}
+            fitting = [column for column in ranks if ranks[column] == max(ranks.values()) > 0]
             if fitting:
                 self._columns[quantity] = Mapped(fitting[0], "")
             if len(fitting) > 1:
@@ -227,20 +187,26 @@ class Measurement:
     def lacking(self, allowed: str) -> InputError:
         """Return the error for a measurement without the required quantities; ``allowed`` names these."""
         return InputError(
-            f"{self.name}: columns {self._listed()}; allowed: {allowed} (name others by --column QUANTITY=COLUMN:UNIT)"
+            f"{self.name}: columns {self._listed()}; allowed: {allowed} (rename others in the header, or --column "
+            "QUANTITY=COLUMN:UNIT)"
         )
 
-    def read(self, *quantities: str, gaps: Collection[str] = ()) -> list[npt.NDArray[Any]]:
-        """Return quantities in SI units [s, m, rad/s, 1, rad], shape (n,) each; complex where the file has them so.
+    def read(
+        self, *quantities: str, gaps: Collection[str] = (), units: Mapping[str, str] | None = None
+    ) -> list[npt.NDArray[Any]]:
+        """Return quantities in the units of `UNITS`, shape (n,) each, n above 0; complex where the file has them so.
 
         Args:
             quantities: quantities to read.
             gaps: those that may be missing in some rows, which are NaN.
+            units: units of quantities in place of these; a value in the same unit is not rounded.
 
         Raises:
-            InputError: a column has no finite numbers, its unit is unknown, two columns are named by a quantity, the
-                lengths or the times of the first values differ, or the file is damaged.
+            InputError: a column is missing, has no finite numbers, or has an unknown unit, two columns are named by a
+                quantity, the lengths or the times of the first values differ, or the file is damaged.
         """
+        if not self._columns.keys() >= set(quantities):
+            raise self.lacking(" and ".join(quantities))
         for quantity in self._doubles.keys() & set(quantities):
             one, other, *_ = self._doubles[quantity]
             raise InputError(
@@ -262,12 +228,21 @@ class Measurement:
                 raise InputError(
                     f"{self.name}: {column!r} is {array[wrong[0]]} in row {wrong[0] + 1}; allowed: finite numbers"
                 )
-            found.append(self._in_si(quantity, column, unit, array))
+            wanted = factor(quantity, units[quantity]) if units else None
+            found.append(self._scaled(quantity, column, unit, array, wanted or 1.0))
         sizes = [array.size for array in found]
         if len(set(sizes)) > 1:
             lengths = ", ".join(f"{size} of {name}" for name, size in zip(quantities, sizes, strict=True))
             raise InputError(f"{self.name}: {lengths}; allowed: as many of each")
+        if not any(sizes):
+            raise InputError(f"{self.name}: no rows below its header; allowed: one or more")
         return found
+
+    def since_first(self, quantity: str) -> Array:
+        """Return a quantity less its first value, shape (n,), as exactly as the file states it; see `read`."""
+        self.read(quantity)
+        column, unit = self._columns[quantity]
+        return np.asarray(self._scaled(quantity, column, unit, self._source.since_first(column)))
 
     def _check_starts(self, columns: Sequence[str]) -> None:
         """Check that columns begin at the same time, as far as the file states times."""
@@ -283,8 +258,8 @@ class Measurement:
     def negative(self, quantity: str) -> str:
         """Return the option that reads a quantity with the other sign."""
         column, unit = self._columns[quantity]
-        factor = _factor(quantity, unit or self._unit(quantity, column))
-        return "--column " + shlex.quote(f"{quantity}={column}:{-(factor or 1.0):.9g}")
+        value = factor(quantity, unit or self._unit(quantity, column)) or 1.0
+        return "--column " + shlex.quote(f"{quantity}={column}:{-value:.9g}")
 
     def swapped(self, one: str, other: str) -> str:
         """Return the options that exchange two quantities."""
@@ -292,27 +267,27 @@ class Measurement:
         return " ".join("--column " + shlex.quote(f"{to}={self._columns[of].column}") for to, of in pairs)
 
     def _unit(self, quantity: str, column: str) -> str:
-        named = (
-            None if column.startswith("/") else _unit_of(quantity, column)
-        )  # the brackets of a topic hold an element
+        named = None if column.startswith("/") else unit_of(quantity, column)  # the brackets of a topic hold an element
         return named if named is not None else self._source.units[column]
 
     def _damaged(self) -> str:
         return f"{self.name}: damaged after its header; record or copy it again"
 
-    def _in_si(self, quantity: str, column: str, unit: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def _scaled(
+        self, quantity: str, column: str, unit: str, array: npt.NDArray[Any], wanted: float = 1.0
+    ) -> npt.NDArray[Any]:
         unit = unit or self._unit(quantity, column)
-        factor = _factor(quantity, unit)
-        if factor is None:
+        value = factor(quantity, unit)
+        if value is None:
             known = ", ".join(each for each in UNITS[quantity] if each)
             has = f"the unit {shown(unit)!r}" if unit else "no unit"
             raise InputError(
-                f"{self.name}: column {column!r} has {has}; allowed for {quantity}: {known} (or the "
-                f"SI value of 1, --column {quantity}={column}:NUMBER)"
+                f"{self.name}: column {column!r} has {has}; allowed for {quantity}: {known} (in its name, as "
+                f"'{quantity} [{known.partition(',')[0]}]'; or --column {quantity}={column}:UNIT, or the SI value of 1)"
             )
-        if _plain(unit) == _DECIBEL:
+        if is_decibel(unit):
             return np.asarray(10.0 ** (array / 20.0))
-        return array if factor == 1.0 else array * factor
+        return array if value == wanted else array * (value / wanted)
 
     def clock(self, rate: float | None, *quantities: str) -> Clock:
         """Return the common sampling of quantities: of ``rate`` [Hz], the column of the time, or stated by the file.
@@ -346,85 +321,19 @@ class Measurement:
 # --- formats
 
 
-class _Csv(Source):
-    """CSV file in any dialect (see `lathe_rc.signals.table`); lines that start with # are comments."""
+class _Text(Source):
+    """Text table (see `lathe_rc.signals.table`)."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            with open(path, "rb", opener=files.open_file) as stream:
-                self._encoding = table.encoding(stream.read(_LONGEST_HEADER), path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-        self._skipped, header, first = self._beginning()
-        self._delimiter = table.delimiter_of(header)
-        self._decimal = "," if self._delimiter != "," and "," in first else "."
-        names = next(csv.reader([header], delimiter=self._delimiter), [])
-        self._names = [name.strip() for name in names]
-        doubles = [name for name in self._names if self._names.count(name) > 1]
-        if doubles:
-            raise InputError(f"{path}: two columns {doubles[0]!r}; allowed: each name once")
-        self.units = dict.fromkeys(self._names, "")
-
-    def _lines(self) -> Iterator[tuple[int, str]]:
-        """Yield the lines that are not empty or comments, with their numbers from 1."""
-        try:
-            with open(self._path, encoding=self._encoding, newline=None, opener=files.open_file) as stream:
-                number = 0
-                while line := stream.readline(_LONGEST_HEADER):
-                    number += 1
-                    if line.strip() and line.lstrip()[0] != "#":
-                        yield number, line.rstrip("\n")
-        except UnicodeDecodeError:
-            raise table.not_text(self._path) from None
-
-    def _beginning(self) -> tuple[int, str, str]:
-        """Return the number of lines up to the header, the header, and the line after it."""
-        lines = self._lines()
-        skipped, header = next(lines, (0, ""))
-        return skipped, header, next(lines, (0, ""))[1]
+    def __init__(self, path: Path, known: Collection[str]) -> None:
+        self._table = Table(path, lambda column: column in known or is_quantity(column))
+        names = self._table.names
+        self.units = dict(zip(names, [*self._table.units, *[""] * len(names)], strict=False))
 
     def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        import pyarrow as pa
-        from pyarrow import csv as arrow_csv
+        return self._table.numbers(names, gaps)
 
-        options = {
-            "read_options": arrow_csv.ReadOptions(
-                column_names=self._names, skip_rows=self._skipped, encoding=self._encoding.removesuffix("-sig")
-            ),
-            "parse_options": arrow_csv.ParseOptions(delimiter=self._delimiter),
-            "convert_options": arrow_csv.ConvertOptions(
-                include_columns=list(names),
-                column_types=dict.fromkeys(names, pa.float64()),
-                decimal_point=self._decimal,
-            ),
-        }
-        try:
-            found = arrow_csv.read_csv(self._path, **options)
-        except pa.ArrowInvalid:  # comments among the rows, or an error whose line only the second reading knows
-            return self._read_by_line(names, gaps)
-        arrays = {name: found.column(name).to_numpy() for name in names}
-        if not all(np.isfinite(array).all() for array in arrays.values()):
-            return self._read_by_line(names, gaps)
-        return arrays
-
-    def _read_by_line(self, names: Sequence[str], gaps: Collection[str]) -> Mapping[str, Array]:
-        """Read the columns line by line; errors name the line."""
-        places = [self._names.index(name) for name in names]
-        lines = self._lines()
-        next(lines)
-        found = []
-        for line, row in table.rows(lines, self._path, self._delimiter):
-            table.check_width(self._path, line, len(row), len(self._names))
-            found.append(
-                [
-                    np.nan
-                    if name in gaps and row[place].strip().casefold() in _MISSING
-                    else table.number(table.pointed(row[place], self._delimiter), self._path, line)
-                    for name, place in zip(names, places, strict=True)
-                ]
-            )
-        return dict(zip(names, np.array(found).reshape(-1, len(names)).T, strict=True))
+    def since_first(self, name: str) -> Array:
+        return self._table.numbers([name], since_first=name)[name]
 
 
 class _Parquet(Source):
@@ -472,8 +381,8 @@ class _Mat(Source):
         while structure := structure.rpartition(".")[0]:
             for field, time in self._arrays.items():
                 place, _, last = field.rpartition(".")
-                if place == structure and _is_of("time", last) and time.size == self._arrays[name].size:
-                    return time * (_factor("time", _unit_of("time", last) or "") or 1.0)
+                if place == structure and rank("time", last) and time.size == self._arrays[name].size:
+                    return time * (factor("time", unit_of("time", last) or "") or 1.0)
         return None
 
     def clock(self, name: str) -> Clock | None:
@@ -559,8 +468,6 @@ class _Mdf(Source):
 
 
 _FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
-    ".csv": ("CSV", _Csv),
-    ".txt": ("CSV", _Csv),
     ".parquet": ("Parquet", _Parquet),
     ".mat": ("MATLAB", _Mat),
     ".tdms": ("TDMS", _Tdms),
@@ -570,28 +477,18 @@ _FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
 }
 
 
-def open_file(path: Path, ending: str = "") -> Source:
-    """Open a measurement file; ``ending``, or else that of its name, gives the format.
+def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> Measurement:
+    """Open a measurement file with a mapping of its columns; a file of another ending is a text table.
 
     Raises:
-        InputError: the ending is unknown, or the file is missing or damaged.
+        InputError: the file is missing or damaged, or see `Measurement`.
         LatheError: the package that reads the format is not installed.
     """
+    mapping = mapping or {}
     if not path.is_file():
-        raise InputError(f"{path}: cannot be read ({'a folder' if path.is_dir() else 'no such file'}); check the path")
-    ending = ending or path.suffix.lower()
-    if ending not in _FORMATS:
-        raise InputError(f"{path}: no format of measurements; allowed: {', '.join(_FORMATS)}, or a bag")
-    name, opened = _FORMATS[ending]
+        reason = "a folder" if path.is_dir() else "not a file" if path.exists() else "no such file"
+        raise InputError(f"{path}: cannot be read ({reason}); check the path")
+    name, opened = _FORMATS.get(path.suffix.lower(), ("CSV", None))
     with _readable(f"{path}: no readable {name} file"):
-        return opened(path)
-
-
-def read(path: Path, mapping: Mapping[str, Mapped], ending: str = "") -> Measurement:
-    """Open a measurement file with a mapping of its columns; ``ending`` as for `open_file`.
-
-    Raises:
-        InputError: see `open_file` and `Measurement`.
-        LatheError: see `open_file`.
-    """
-    return Measurement(str(path), open_file(path, ending), mapping)
+        source = opened(path) if opened else _Text(path, {column for column, _ in mapping.values()})
+    return Measurement(str(path), source, mapping)

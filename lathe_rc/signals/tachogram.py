@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tachogram files: spindle speed over time as CSV with the columns time_s and rpm, linear between rows.
+"""Tachogram files: spindle speed over time, written as CSV with the columns time_s and rpm; linear between rows.
 
 Time 0 is at the first row, as it is at the first reading of encoder counts; the file's absolute time is ignored.
 """
@@ -10,7 +10,8 @@ import numpy as np
 
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-from lathe_rc.signals.table import read_table, write_table
+from lathe_rc.signals import measurement_file
+from lathe_rc.signals.table import write_table
 
 _COLUMNS = ("time_s", "rpm")
 _UNITS = {"revolutions per second (Hz)": 60.0, "rad/s": 30.0 / np.pi, "degrees per second": 1.0 / 6.0}  # in rpm
@@ -25,17 +26,10 @@ def read(path: Path) -> tuple[Array, Array]:
     Raises:
         InputError: the file is missing or malformed, the times do not increase, or a speed is not above 0.
     """
-    _, rows = read_table(path, [_COLUMNS], "tachogram", since_first=True)
-    time, rpm = rows[:, 0].copy(), rows[:, 1].copy()
-    if not time.size:
-        raise InputError(f"{path}: no row; allowed: one or more of {','.join(_COLUMNS)}")
-    wrong = np.flatnonzero(np.diff(time) <= 0.0)
-    if wrong.size:
-        place = int(wrong[0]) + 1
-        raise InputError(
-            f"{path}: row {place + 1} is {time[place] - time[place - 1]:.10g} s after the one before; allowed: times "
-            "that rise"
-        )
+    found = measurement_file.read(path)
+    _, rpm = found.read("time", "speed")
+    time = found.since_first("time")
+    measurement_file.check_rising(time, path)
     slow = np.flatnonzero(rpm <= 0.0)
     if slow.size:
         raise InputError(

@@ -12,7 +12,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples
 from lathe_rc.signals.example_002 import fill_reference
-from lathe_rc.signals.table import read_table
 
 
 class TrajectoryParameters(NodeParameters):
@@ -92,12 +91,14 @@ class Trajectory:
         if self._kind == "csv":
             if not parameters.trajectory_file:
                 raise InputError(f"{node}.trajectory_file is empty; name the CSV file of the trajectory")
+            from lathe_rc.signals import measurement_file  # with SciPy, which a cell without files need not import
+
             path = resources.find(Path(parameters.trajectory_file))
             force = type(parameters).rows()["set_point"].unit == "N"
-            column, scale = ("force_n", 1.0) if force else ("position_um", 1e-6)
             with about(node, "trajectory_file"):
-                _, rows = read_table(path, [("time_s", column)], "trajectory")
-            times, values = rows[:, 0].tolist(), (rows[:, 1] * scale).tolist()
+                found = measurement_file.read(path).read("time", "force" if force else "position")
+                measurement_file.check_rising(found[0], path)
+            times, values = (array.tolist() for array in found)
         if len(values) != len(times):
             raise InputError(
                 f"{node}.set_point, set_point_time: {len(values)} values and {len(times)} times; give as many of each"
@@ -106,8 +107,9 @@ class Trajectory:
             _KINDS[self._kind], parameters.step, np.array(times, dtype=float), np.array(values, dtype=float)
         )
         if not course.times.size or np.any(np.diff(course.times) <= 0.0):
-            where = "trajectory_file" if self._kind == "csv" else "set_point_time"
-            raise InputError(f"{node}.{where}: {times[:5]} s; allowed: one time or more, each later than the last")
+            raise InputError(
+                f"{node}.set_point_time: {times[:5]} s; allowed: one time or more, each later than the last"
+            )
         self.course = course
 
     def doubts(self, seconds: float) -> list[str]:
