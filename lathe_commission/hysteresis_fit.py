@@ -14,7 +14,6 @@ The loop must be quasi-static, because the lag during fast motion would be mista
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import scipy
@@ -22,7 +21,6 @@ import scipy
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
 from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
-from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
 
 _WHOLE = 0.95  # fraction of the range that counts as the full range
@@ -129,18 +127,7 @@ def of_measurement(measurement: Measurement) -> Loop:
     Raises:
         InputError: a quantity is missing, or contains a non-finite value.
     """
-    if "command" not in measurement or "displacement" not in measurement:
-        raise measurement.lacking("command and displacement")
     return Loop(*measurement.read("command", "displacement"))
-
-
-def read_csv(path: Path) -> Loop:
-    """Read a loop from a file with the quantities ``command`` and ``displacement`` (`lathe_rc.signals`).
-
-    Raises:
-        InputError: the file is missing or malformed, or contains a non-finite value.
-    """
-    return of_measurement(measurement_file.read(path, {}))
 
 
 def from_signals(

@@ -15,7 +15,6 @@ lower bound; without it, the optimum would be the exact inverse, which is not re
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import scipy
@@ -24,7 +23,6 @@ from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.control.decoupler import LAG, inverse
 from lathe_rc.errors import InputError, at_least
-from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
 from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 
@@ -98,15 +96,6 @@ def of_measurement(measurement: Measurement) -> ChannelStep:
         return ChannelStep(*measurement.read("time", "response"))
     except InputError as error:
         raise InputError(f"{measurement.name}: {error}") from None
-
-
-def read_csv(path: Path) -> ChannelStep:
-    """Read a step response from a file with the quantities ``time`` and ``response`` (`lathe_rc.signals`).
-
-    Raises:
-        InputError: the file is missing or malformed, or does not contain a step response.
-    """
-    return of_measurement(measurement_file.read(path, {}))
 
 
 def _through(transfer: TransferFunction, step: float, signal: Array, hold: Hold) -> Array:

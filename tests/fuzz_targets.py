@@ -46,7 +46,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.control import memory_file
 from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import measured_profile, profile_table
+from lathe_rc.signals import measured_profile, measurement_file, profile_table
 from lathe_rc.stages.feed.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_rc.view import report
 from lathe_rc.view.report_gather import gather
@@ -161,9 +161,9 @@ def _profile(path: Path) -> None:
 
 _TABLES: Mapping[str, Callable[[Path], object]] = {
     "angle_deg": _profile,
-    "time_s": reduced_order.read_csv,
+    "time_s": lambda path: reduced_order.of_measurement(measurement_file.read(path)),
     "time_ms": step_fit.read_csv,
-    "command_um": hysteresis_fit.read_csv,
+    "command_um": lambda path: hysteresis_fit.of_measurement(measurement_file.read(path)),
     "height_mm": Predistortion.load,
     "time_s,": _trajectory,
 }

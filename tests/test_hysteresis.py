@@ -13,10 +13,11 @@ from machines import assert_refused, refusals
 from machines import run as run_in_blocks
 from numpy.testing import assert_allclose
 
-from lathe_commission.hysteresis_fit import Loop, from_signals, identify, read_csv
+from lathe_commission.hysteresis_fit import Loop, from_signals, identify, of_measurement
 from lathe_papers.formulas.vibration import describing_function
 from lathe_rc.errors import InputError
 from lathe_rc.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
+from lathe_rc.signals.measurement_file import read
 
 FORWARD = [PrandtlIshlinskii, BoucWen]
 OPERATORS = [*FORWARD, lambda: PrandtlIshlinskii().inverse(), lambda: BoucWen().inverse()]
@@ -280,7 +281,7 @@ def write(tmp_path, text):
 def test_file_gives_the_loop(tmp_path):
     loop = measured()
     rows = "".join(f"{u:.17g},{y:.17g}\n" for u, y in np.stack((loop.command, loop.displacement), axis=1) * 1e6)
-    back = read_csv(write(tmp_path, "# piezo 7\n\n" + HEAD + rows))
+    back = of_measurement(read(write(tmp_path, "# piezo 7\n\n" + HEAD + rows)))
     assert_allclose(back.command, loop.command, atol=1e-18)
     assert_allclose(identify(back, STROKE).model.weights, WEIGHTS, atol=1e-9)
 
@@ -294,7 +295,7 @@ def test_file_gives_the_loop(tmp_path):
 )
 def test_bad_file_is_refused(tmp_path, text, message):
     path = write(tmp_path, text)
-    assert_refused(lambda: read_csv(path), f"{path}.*{message}")
+    assert_refused(lambda: of_measurement(read(path)), f"{path}.*{message}")
 
 
 @pytest.mark.parametrize(("topics", "message"), [({}, "no topics"), ({"/fine/command": {}}, "there are /fine/command")])

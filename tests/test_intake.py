@@ -99,8 +99,8 @@ def test_a_long_file_has_the_numbers_of_a_short_one(tmp_path):
 
 def test_columns_of_cells_are_mapped_to_targets(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("Toleranz [µm];Nummer\n2,5;0,7\n3;8\n", encoding="cp1252")
-    columns = cells_file.parse_columns(["tool.tolerance=Toleranz [µm]:1e-6"])
+    path.write_text("Grenze [µm];Nummer\n2,5;0,7\n3;8\n", encoding="cp1252")
+    columns = cells_file.parse_columns(["tool.tolerance=Grenze [µm]:1e-6"])
     found = cells_file.read(path, ["Nummer"], columns)
     assert found == [{"Nummer": "0,7", "tool.tolerance": 2.5 * 1e-6}, {"Nummer": "8", "tool.tolerance": 3.0 * 1e-6}]
     for given, said in ((["a=b:c"], r"allowed: TARGET=COLUMN\[:FACTOR\]"), (["=b"], "allowed: TARGET=COLUMN")):

@@ -298,7 +298,7 @@ def test_revolutions_without_heights_are_numbered(tmp_path):
     assert (tmp_path / "profile.csv").read_text().splitlines() == [
         "angle_deg,revolution,radius_um", "0,1,1", "120,1,2", "240,1,3", "0,2,4", "120,2,5", "240,2,6",
     ]  # fmt: skip
-    with pytest.raises(InputError, match="header"):
+    with pytest.raises(InputError, match="a column of revolutions; allowed"):
         read_csv(tmp_path / "profile.csv")
 
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lathe_commission.reduced_order import ChannelStep, fit, fit_inverse, read_csv, step_of
+from lathe_commission.reduced_order import ChannelStep, fit, fit_inverse, of_measurement, step_of
 from lathe_rc.control.decoupler import FULL_W1, LAG, PAPER, REALISTIC, gain, lags
 from lathe_rc.errors import InputError
+from lathe_rc.signals.measurement_file import read
 from lathe_rc.transfer import TransferFunction
 
 TIME = np.arange(1001) * 1e-3
@@ -90,12 +91,12 @@ def test_csv_gives_the_same_as_arrays(tmp_path):
     channel, path = measured(PAPER.w1), tmp_path / "step.csv"
     rows = np.stack((channel.time, channel.response), axis=1)
     np.savetxt(path, rows, "%.17g", delimiter=",", header="time_s,response", comments="")
-    read = read_csv(path)
-    assert np.array_equal(read.time, channel.time)
-    assert np.array_equal(read.response, channel.response)
+    found = of_measurement(read(path))
+    assert np.array_equal(found.time, channel.time)
+    assert np.array_equal(found.response, channel.response)
     path.write_text("s,response\n0,1\n")
     with pytest.raises(InputError, match="columns 's', 'response'; allowed: time and response"):
-        read_csv(path)
+        of_measurement(read(path))
 
 
 @pytest.mark.parametrize(

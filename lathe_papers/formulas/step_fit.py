@@ -205,10 +205,8 @@ def read_csv(path: Path) -> StepResponse:
     Raises:
         InputError: the file is missing or malformed, or does not contain a step response.
     """
-    measurement = measurement_file.read(path, {})
-    if "time" not in measurement or "response" not in measurement:
-        raise measurement.lacking("time and response")
+    values = measurement_file.read(path).read("time", "response")
     try:
-        return StepResponse(*measurement.read("time", "response"))
+        return StepResponse(*values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -145,6 +145,8 @@ def read_csv(path: Path) -> Measured:
 def _measured(path: Path, _: tuple[int, int, int] | None) -> Measured:
     """Read a profile; cached, since reading takes longer than some cells run."""
     found = measurement_file.read(path)
+    if "revolution" in found:
+        raise InputError(f"{path}: a column of revolutions; allowed: one revolution, or one for each height")
     units = {"angle": "deg", "radius": "um"} | ({"height": "mm"} if "height" in found else {})
     angle_deg, radius_um, *along = found.read(*units, units=units)
     rows = np.stack([angle_deg, *(along or [np.zeros(angle_deg.size)]), radius_um], axis=1)
