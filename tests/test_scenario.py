@@ -128,7 +128,7 @@ OVERRIDES = [
 #: of what the cell finds when it is built or checked
 SETTINGS = [
     ("tool.profile_file=''", "tool.profile_file is empty; name the CSV file"),
-    ("tool.profile_file=/no/such.csv", "/no/such.csv: cannot be read (No such file or directory)"),
+    ("tool.profile_file=/no/such.csv", "/no/such.csv: cannot be read (no such file); check the path"),
     ("spindle_encoder.deviation_frequency=[1.0, 2.0]", "1 amplitudes, 2 frequencies and 1 phases"),
     ("spindle_encoder.deviation_amplitude=[-1.5]", "speed falls to"),
     ("spindle_encoder.tachogram_time=[1.0]", "1 times and 0 deviations"),

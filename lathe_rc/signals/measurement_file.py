@@ -153,14 +153,14 @@ class Measurement:
     Args:
         name: path of the measurement, for error messages.
         source: its columns.
-        mapping: columns of quantities that are not named by them.
+        mapping: columns of quantities that are not named by them; None: the caller has no option for it.
 
     Raises:
         InputError: a column of the mapping does not exist.
     """
 
-    def __init__(self, name: str, source: Source, mapping: Mapping[str, Mapped]) -> None:
-        self.name, self._source = name, source
+    def __init__(self, name: str, source: Source, mapping: Mapping[str, Mapped] | None) -> None:
+        self.name, self._source, self._has_option, mapping = name, source, mapping is not None, mapping or {}
         self._columns: dict[str, Mapped] = {}
         self._doubles: dict[str, list[str]] = {}  # columns that are named by the same quantity
         for quantity, (column, unit) in mapping.items():
@@ -186,10 +186,11 @@ class Measurement:
 
     def lacking(self, allowed: str) -> InputError:
         """Return the error for a measurement without the required quantities; ``allowed`` names these."""
-        return InputError(
-            f"{self.name}: columns {self._listed()}; allowed: {allowed} (rename others in the header, or --column "
-            "QUANTITY=COLUMN:UNIT)"
-        )
+        cure = "rename others in the header" + self._or_option("QUANTITY=COLUMN:UNIT")
+        return InputError(f"{self.name}: columns {self._listed()}; allowed: {allowed} ({cure})")
+
+    def _or_option(self, value: str) -> str:
+        return f", or --column {value}" if self._has_option else ""
 
     def read(
         self, *quantities: str, gaps: Collection[str] = (), units: Mapping[str, str] | None = None
@@ -209,9 +210,8 @@ class Measurement:
             raise self.lacking(" and ".join(quantities))
         for quantity in self._doubles.keys() & set(quantities):
             one, other, *_ = self._doubles[quantity]
-            raise InputError(
-                f"{self.name}: {one!r} and {other!r} are both {quantity}; allowed: one (--column {quantity}={one})"
-            )
+            cure = f"rename one in the header{self._or_option(f'{quantity}={one}')}"
+            raise InputError(f"{self.name}: {one!r} and {other!r} are both {quantity}; allowed: one ({cure})")
         columns = {quantity: self._columns[quantity] for quantity in quantities}
         self._check_starts([column for column, _ in columns.values()])
         with _readable(self._damaged()):
@@ -281,10 +281,9 @@ class Measurement:
         if value is None:
             known = ", ".join(each for each in UNITS[quantity] if each)
             has = f"the unit {shown(unit)!r}" if unit else "no unit"
-            raise InputError(
-                f"{self.name}: column {column!r} has {has}; allowed for {quantity}: {known} (in its name, as "
-                f"'{quantity} [{known.partition(',')[0]}]'; or --column {quantity}={column}:UNIT, or the SI value of 1)"
-            )
+            cure = f"in its name, as '{quantity} [{known.partition(',')[0]}]'"
+            cure += self._or_option(f"{quantity}={column}:UNIT or the SI value of 1")
+            raise InputError(f"{self.name}: column {column!r} has {has}; allowed for {quantity}: {known} ({cure})")
         if is_decibel(unit):
             return np.asarray(10.0 ** (array / 20.0))
         return array if value == wanted else array * (value / wanted)
@@ -484,11 +483,10 @@ def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> Measurement
         InputError: the file is missing or damaged, or see `Measurement`.
         LatheError: the package that reads the format is not installed.
     """
-    mapping = mapping or {}
     if not path.is_file():
         reason = "a folder" if path.is_dir() else "not a file" if path.exists() else "no such file"
         raise InputError(f"{path}: cannot be read ({reason}); check the path")
     name, opened = _FORMATS.get(path.suffix.lower(), ("CSV", None))
     with _readable(f"{path}: no readable {name} file"):
-        source = opened(path) if opened else _Text(path, {column for column, _ in mapping.values()})
+        source = opened(path) if opened else _Text(path, {column for column, _ in (mapping or {}).values()})
     return Measurement(str(path), source, mapping)
