@@ -356,7 +356,7 @@ def test_snapshot_comes_to_the_disk_in_bounded_pieces(tmp_path):
         grown.append(file.stat().st_size - size)
         size += grown[-1]
     block = feed.needed / (PRE / BLOCK + 18)
-    assert max(grown) < 6 * block
+    assert max(grown) < 6 * block + 2 * (4096 + block)  # two chunks may have waited for the thread that writes them
     assert size - begun > PRE / BLOCK * block
 
 
