@@ -61,6 +61,13 @@ def zones(declared: Mapping[str, Judged]) -> dict[str, tuple[Zone, ...]]:
     return {each.topic: each.zones for each in declared.values() if each.zones}
 
 
+def limits(declared: Mapping[str, Judged], topic: str) -> tuple[float, tuple[Zone, ...]]:
+    """Return the tolerance [m] that is declared for a tool, by its fully qualified topic, and its zones; 0: none."""
+    own = [each for each in declared.values() if topic.endswith(f"/{each.topic}")]
+    allowed = next((each.tolerance for each in own if each.quantity == "form" and each.tolerance), 0.0)
+    return allowed, next((each.zones for each in own if each.zones), ())
+
+
 def strictest(declared: Mapping[str, Judged]) -> float:
     """Return the smallest tolerance of the forms and their zones [m]; 0 if there is none."""
     allowed = [limit for each in declared.values() if each.quantity == "form" for limit in each.tolerances if limit]
@@ -75,16 +82,15 @@ def nose_radius(declared: Mapping[str, Judged]) -> float:
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
-    for of, allowed in tolerances(judged(scenario.nodes)).items():
-        if topic.endswith(f"/{of}"):
-            (sound, why), doubt, before = recording.sound_form, form_doubt(scenario.nodes), _turns_before(recording)
-            by_zone = zones(judged(scenario.nodes)).get(of, ())
-            errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
-            angle = recording.of_type(messages.ENCODER)["angle_true"]
-            errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
-            largest = recording.errors.largest
-            return judge_zones(largest, errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
-    return None
+    allowed, by_zone = limits(judged(scenario.nodes), topic)
+    if not allowed:
+        return None
+    (sound, why), doubt, before = recording.sound_form, form_doubt(scenario.nodes), _turns_before(recording)
+    errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
+    angle = recording.of_type(messages.ENCODER)["angle_true"]
+    errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
+    largest = recording.errors.largest
+    return judge_zones(largest, errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
 
 
 class RunningVerdict:
@@ -98,14 +104,12 @@ class RunningVerdict:
         doubt: how far the desired form may be off between the points of its table [m].
 
     Attributes:
-        tolerance: allowed error to each side [m]; None: the tool has no tolerance.
+        tolerance: allowed error to each side [m]; 0: the tool has no tolerance.
         before: number of revolutions before the first one evaluated.
     """
 
     def __init__(self, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> None:
-        allowed = {of: limit for of, limit in tolerances(declared).items() if topic.endswith(f"/{of}")}
-        self.tolerance = next(iter(allowed.values()), None)
-        self._zones = zones(declared).get(next(iter(allowed), ""), ())
+        self.tolerance, self._zones = limits(declared, topic)
         self._doubt, self._next = doubt, -1
         self._begin(0)
 
@@ -132,7 +136,7 @@ class RunningVerdict:
         Args:
             unjudged: reason why the end of the run cannot be judged; empty if it can.
         """
-        if self.tolerance is None:
+        if not self.tolerance:
             return None
         by_zone = self._by_zone.largest()
         return judge_zones(

@@ -326,7 +326,7 @@ class _Text(Source):
     def __init__(self, path: Path, known: Collection[str]) -> None:
         self._table = Table(path, lambda column: column in known or is_quantity(column))
         names = self._table.names
-        self.units = dict(zip(names, [*self._table.units, *[""] * len(names)], strict=False))
+        self.units = dict.fromkeys(names, "") | dict(zip(names, self._table.units, strict=False))
 
     def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
         return self._table.numbers(names, gaps)

@@ -221,20 +221,12 @@ def gather(path: Path) -> Gathered:
             declared = provenance.judged(source.about)
         except InputError as error:
             unjudged = str(error)
-        allowed, nose, by_zone = part.tolerances(declared), part.nose_radius(declared), part.zones(declared)
-        doubt = provenance.doubt_of(source.about)
+        nose, doubt = part.nose_radius(declared), provenance.doubt_of(source.about)
         forms = [
-            Form(
-                encoder,
-                tool,
-                next((limit for name, limit in allowed.items() if tool.endswith(f"/{name}")), 0.0),
-                nose,
-                doubt,
-                types,
-                next((zones for name, zones in by_zone.items() if tool.endswith(f"/{name}")), ()),
-            )
+            Form(encoder, tool, allowed, nose, doubt, types, zones)
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
+            for allowed, zones in [part.limits(declared, tool)]
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
         servos = [Servo(watch) for watch in watches(loops(declared), types)]
