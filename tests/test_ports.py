@@ -16,6 +16,7 @@ from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.protocol import BadBlock, ForeignMessage
 from lathe_rc.protocol.block_queue import BlockQueue
 from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.inputs import Inputs
 from lathe_rc.stages.tool.tool import ToolParameters
 
 SIZE = 4
@@ -84,6 +85,17 @@ def test_blocks_in_order_are_taken():
     for first in (0, 4, 8):
         assert taken.add(block(first)).first_index == first
     assert [b.first_index for b in taken.blocks] == [0, 4, 8]
+
+
+def test_a_stage_without_inputs_follows_the_spindle_from_its_own_sample_on():
+    """A late reader of the spindle may miss older blocks, which newer ones replace, but no block that it needs."""
+    inputs = Inputs([], ToolParameters(run_id="run", block_size=SIZE), 2)
+    pace = inputs.follow("/encoder", "/spindle", 16)
+    for first in (0, 8, 12):
+        assert pace.add(block(first)) is None
+    assert pace.add(block(16)) and pace.end == 20
+    with pytest.raises(BadBlock, match="goes from sample 20 to 24: 4 samples are missing"):
+        pace.add(block(24))
 
 
 @pytest.mark.parametrize(

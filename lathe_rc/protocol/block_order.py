@@ -73,10 +73,10 @@ class BlockOrder:
         """
         if self.rejected:
             return None
-        if self.open:
-            self.source, self.end, self.open = source, first, False
         if self.repeats and first + samples <= self.end:
             return None
+        if self.open:
+            self.source, self.end, self.open = source, first, False
         missing = first - self.end
         if missing < 0 or (missing and (self._longest_gap is None or not (self.received or self.lossy))):
             what = f"{missing} samples are missing" if missing > 0 else "a block came twice"

@@ -155,11 +155,14 @@ class Inputs:
                 queue.hold_newest(end)
         return bool(self.forward) and all(queue.held_from is not None for queue in self.forward) and self.pace is None
 
-    def follow(self, topic: str, master: str) -> BlockQueue:
-        """Limit the stage to the time master's blocks; return the queue that takes them, from the first that comes."""
+    def follow(self, topic: str, master: str, first: int) -> BlockQueue:
+        """Limit the stage to the time master's blocks; return the queue that takes those after sample ``first``.
+
+        Earlier ones may be missing, since newer ones replace them while a late reader receives them.
+        """
         self.pace = BlockQueue(topic, messages.ENCODER, self._parameters, [])
         self.pace.expect(master, None)
-        self.pace.repeats = True
+        self.pace.end, self.pace.repeats = first, True
         return self.pace
 
     # ---- restart ------------------------------------------------------------------------------------

@@ -125,7 +125,7 @@ class StageRun(Work):
         master = self.node.protocol.master
         assert master is not None, "it has declared the safe state"
         topic = next(topic for topic, sparse in zip(master.publishes, master.sparse, strict=True) if not sparse)
-        self.listen(self.inputs.follow(topic, master.name))
+        self.listen(self.inputs.follow(topic, master.name, self.samples))
 
     def failed(self) -> None:
         """Dissolve the chain after a failure; its other stages go on alone (implements `Work`)."""
