@@ -109,7 +109,7 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
 
 def test_ctrl_c_keeps_what_is_computed_and_nothing_is_computed_twice(tmp_path):
     # Long cells: after the first file of rows, which is written after some seconds, most are still to be computed.
-    words = ["--revolutions=200", "--vary", f"{LEAD}=1.4e-3:1.5e-3:{MANY}", "--out", str(tmp_path / "rows")]
+    words = ["--revolutions=200", "--vary", f"{LEAD}=1.4e-3:1.5e-3:{CELLS}", "--out", str(tmp_path / "rows")]
     with lathe_sweep(*words, start_new_session=True) as stopped:
         for line in stopped.stderr:
             if "dashboard" in line:
@@ -118,15 +118,15 @@ def test_ctrl_c_keeps_what_is_computed_and_nothing_is_computed_twice(tmp_path):
         os.killpg(stopped.pid, signal.SIGINT)  # as a terminal does it
         said = stopped.stderr.read()
     assert stopped.returncode == 130
-    assert re.fullmatch(r"lathe: stopped; \d+ of 800 cells are in .*: the same command goes on\n", said)
+    assert re.fullmatch(r"lathe: stopped; \d+ of 240 cells are in .*: the same command goes on\n", said)
     parts = sorted((tmp_path / "rows" / "rows").glob("*.parquet"))
     there = {key: path for path in parts for key in pyarrow.parquet.read_table(path)["key"].to_pylist()}
-    assert 0 < len(there) < MANY
+    assert 0 < len(there) < CELLS
     with lathe_sweep(*words) as again:
         assert again.wait() == 0
     table = Folder(tmp_path / "rows").table()
-    assert table["cell"].to_pylist() == list(range(MANY))
-    assert len(set(table["key"].to_pylist())) == MANY
+    assert table["cell"].to_pylist() == list(range(CELLS))
+    assert len(set(table["key"].to_pylist())) == CELLS
     new = set((tmp_path / "rows" / "rows").glob("*.parquet")) - set(parts)
     assert not there.keys() & {key for path in new for key in pyarrow.parquet.read_table(path)["key"].to_pylist()}
 
