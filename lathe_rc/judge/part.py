@@ -128,7 +128,7 @@ class RunningVerdict:
     @property
     def largest(self) -> np.ndarray:
         """Largest form error of each complete revolution [m], shape (revolutions,)."""
-        return self._errors.found().largest
+        return self._errors.largest()
 
     def verdict(self, unjudged: str = "") -> Verdict | None:
         """Judge the part as if the run ended after the samples so far; None without a tolerance.

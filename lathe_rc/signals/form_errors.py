@@ -168,18 +168,28 @@ class RunningErrors:
             if self._filled == len(self._rows):
                 self._rows = np.concatenate((self._rows, np.empty_like(self._rows)))
 
-    def found(self) -> FormErrors:
-        """Return the form errors of all complete revolutions, as if the run ended after the samples so far."""
+    def _complete(self) -> tuple[Array, float]:
+        """Return the rows of all complete revolutions, as if the run ended after the samples so far, and their end."""
         state, filled = self._state, self._filled
         if state[_SAMPLES] < 2.0:
-            return FormErrors(np.empty(0), np.empty(0), np.empty(0), np.zeros(1, np.int64))
+            return self._rows[:0], 0.0
         end = state[_START] if state[_START] >= 0.0 else state[_SAMPLES]
         if end < state[_SAMPLES] and turns_at_end(state[_BEFORE], state[_TURNS]) > state[_NUMBER]:
             end = state[_SAMPLES]
             _end(state, self._rows[filled])  # in a free row, which further samples overwrite
             filled += 1
-        start, rms, high, low = self._rows[:filled].T.copy()
+        return self._rows[:filled], float(end)
+
+    def found(self) -> FormErrors:
+        """Return the form errors of all complete revolutions, as if the run ended after the samples so far."""
+        rows, end = self._complete()
+        start, rms, high, low = rows.T.copy()
         return FormErrors(rms, np.maximum(high, -low), high - low, np.append(start, end).astype(np.int64))
+
+    def largest(self) -> Array:
+        """Return the largest magnitudes alone [m], shape (revolutions,)."""
+        rows, _ = self._complete()
+        return np.asarray(np.maximum(rows[:, 2], -rows[:, 3]))
 
 
 def form_errors(angle: Array, error: Array, first: int = 0) -> FormErrors:

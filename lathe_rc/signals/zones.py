@@ -80,4 +80,4 @@ class ZoneErrors:
 
     def largest(self) -> list[Array]:
         """Return the largest magnitudes [m], shape (revolutions,) each; empty without zones."""
-        return [running.found().largest for running in self._running]
+        return [running.largest() for running in self._running]
