@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Takes img/panel.png and img/panel_narrow.png: the panel of the full cell after a fault, light and dark."""
+"""Takes img/panel.png, panel_timeline.png and panel_narrow.png: the panel of the full cell after a fault."""
 
 import sys
 import tempfile
@@ -27,8 +27,13 @@ with (
         if revolution == BROKEN:
             driver.call(lambda: cell.act("electrodynamic_actuator", "fault coarse/command.position wrong scale=0.9"))
         driver.call(driver.step)
-        browser.until(f"SHOWN.now.state == 'paused' && SHOWN.history.length >= {revolution}")
-    save(browser.shot(), "panel", 128)
+        browser.until(f"SHOWN.now.state == 'paused' && SHOWN.rows.length >= {revolution}")
+    browser.until("TIME.sample == SHOWN.now.sample")
+    shot = browser.shot()
+    save(shot, "panel", 128)
+    box = browser.run("document.getElementById('time').getBoundingClientRect().toJSON()")
+    top = round(box["top"] + browser.run("scrollY"))
+    save(shot.crop((0, top - 8, WIDE[0], round(top + box["height"] + 8))), "panel_timeline")
     narrow = []
     for dark in (False, True):
         browser.look(*NARROW, dark=dark)

@@ -199,12 +199,19 @@ class RunView(ABC):
             self.note(index, f"no results from here on: {why}")
         self._unsound = True
 
+    def leave_out(self, index: int, count: int) -> None:
+        """Report chunks dropped before a sample since the last report."""
+        self.note(index, self.left_out(index, count))
+
+    def left_out(self, index: int, count: int) -> str:
+        """Return a text about a number of chunks that were dropped before a sample."""
+        piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
+        return f"left out, wholly or in part: {count} pieces of {piece:.3g} s, by {at:.2f} s"
+
     def _report_losses(self, index: int) -> None:
-        """Report the chunks dropped before a sample since the last report."""
         if missing := self.pieces.lost - self.shown.left_out:
             self.shown.left_out = self.pieces.lost
-            piece, at = (samples * self._step_ns * 1e-9 for samples in (self._size, index))
-            self.note(index, f"left out, wholly or in part: {missing} pieces of {piece:.3g} s, by {at:.2f} s")
+            self.leave_out(index, missing)
 
     def close(self) -> ShownRun:
         """Show the remaining samples, and end the view."""

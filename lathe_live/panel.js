@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // The panel: takes snapshots of a run from the server and draws them; sends commands.
 const $ = id => document.getElementById(id);
-const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, history: 0, latest: 0 }; // see Have in panel_view.py
-const SHOWN = { now: {}, rows: [], history: [], latest: [], log: [], force: [], shape: null, ranges: {} };
+const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, latest: 0 }; // see Have in panel_view.py
+const SHOWN = { now: {}, rows: [], open: null, latest: [], log: [], shape: null, ranges: {}, at: null };
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
-const WATERFALL = 12, MOST_LOG = 300, MOST_FORCE = 600, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
+const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const LATE = "#8a8a8a", OUT_OF_ORDER = ["degraded", "retracting", "safe"];
 const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
 const DOES = { freeze: "stops learning, keeps what is learned", learn: "learns on", clear: "forgets what is learned" }; // tool tips
-const GAP = 0.3; // [s] between snapshots from which on the force is not joined by a line
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const can = what => ABOUT.can.includes(what);
 const cannot = () => ABOUT.cannot || {}; // why a button is of no use
@@ -28,21 +27,26 @@ const seen = (name, value, least) => { // the largest magnitude so far, for scal
 
 function merge(told) {
   if (told.run != HAVE.run) {
-    Object.assign(SHOWN, { rows: [], history: [], latest: [], log: [], force: [], shape: null, ranges: {} });
+    Object.assign(SHOWN, { rows: [], latest: [], log: [], shape: null, ranges: {}, at: null });
+    $("shown").hidden = true;
     HAVE.epoch = told.epoch;
   }
-  for (; HAVE.epoch < told.epoch; HAVE.epoch++) SHOWN.rows = SHOWN.rows.filter((_, k) => k % 2 == 0);
-  if (told.now.measured_force !== undefined && told.now.time != SHOWN.now.time) SHOWN.force = [...SHOWN.force, [told.now.time, told.now.measured_force]].slice(-MOST_FORCE);
+  for (; HAVE.epoch < told.epoch; HAVE.epoch++) SHOWN.rows = SHOWN.rows.flatMap((row, k) => k % 2 ? [joined(SHOWN.rows[k - 1], row)] : []);
   SHOWN.now = told.now;
+  SHOWN.open = told.open;
   SHOWN.rows.push(...told.rows);
-  SHOWN.history.push(...told.history);
   SHOWN.latest = [...SHOWN.latest, ...told.latest].slice(-WATERFALL);
   SHOWN.log.push(...told.log);
   SHOWN.shape = told.shape || SHOWN.shape;
-  const changed = told.run != HAVE.run || told.rows.length || told.history.length || told.latest.length;
-  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: SHOWN.log.length, history: SHOWN.history.length });
+  const changed = told.run != HAVE.run || told.rows.length || told.latest.length;
+  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: SHOWN.log.length });
   HAVE.latest = SHOWN.latest.length ? SHOWN.latest[SHOWN.latest.length - 1].revolution : 0;
   return changed;
+}
+
+function joined(one, other) { // as Row.merged in panel_view.py
+  const cells = one.out != other.out ? (one.out ? other : one).cells : one.cells.map((um, k) => Math.abs(other.cells[k]) > Math.abs(um) ? other.cells[k] : um);
+  return { ...other, since: one.since, cells, out: one.out && other.out };
 }
 
 async function follow() {
@@ -83,8 +87,6 @@ function draw(changed, moving = true) {
   $("go").textContent = now.state == "running" ? "pause" : "start";
   for (const id of ["go", "step"]) $(id).disabled = id in cannot() || ["ended", "failed"].includes(now.state) && can("change");
   if (document.activeElement != $("pace")) $("pace").value = String(now.pace);
-  if ($("seek").max != now.samples) $("seek").max = now.samples;
-  if (document.activeElement != $("seek")) $("seek").value = now.sample || 0;
   $("record").querySelector("button").textContent = now.bag ? "end the recording" : "record from here on";
   $("again").textContent = (now.begun ? `from a checkpoint at sample ${now.begun}: ` : "") + (now.events || "no events or changed parameters yet");
   drawHeader(now);
@@ -97,11 +99,10 @@ function draw(changed, moving = true) {
   drawDials(now);
   changedSince ||= changed;
   if (ABOUT.part && changedSince && (!moving || performance.now() - drawnAt > CALM)) {
-    drawMap(); drawWaterfall(); drawHistory();
+    drawMap(); drawWaterfall();
     [changedSince, drawnAt] = [false, performance.now()];
   }
-  $("forces").hidden = now.measured_force === undefined;
-  if (now.measured_force !== undefined) drawForce();
+  followTimeline(now, moving);
   drawLog();
 }
 
@@ -148,17 +149,19 @@ function drawHeader(now) {
 setInterval(() => { if (performance.now() - heard > SILENT) drawHeader(SHOWN.now); }, 1000);
 document.addEventListener("visibilitychange", () => drawHeader(SHOWN.now)); // a hidden page asks for nothing
 
-let logged = 0, loggedRun = 0;
-function drawLog() {
-  if (loggedRun != HAVE.run) { $("log").replaceChildren(); logged = 0; loggedRun = HAVE.run; }
-  for (const line of SHOWN.log.slice(Math.max(logged, SHOWN.log.length - MOST_LOG))) {
+let logged = 0, loggedOf = "";
+function drawLog() { // up to the instant that is shown
+  const { at } = SHOWN, of = `${HAVE.run} ${at ? at.sample : ""}`, lines = at ? SHOWN.log.filter(line => line.sample < at.sample) : SHOWN.log;
+  if (loggedOf != of) { $("log").replaceChildren(); logged = 0; loggedOf = of; }
+  for (const line of lines.slice(Math.max(logged, lines.length - MOST_LOG))) {
     const item = document.createElement("li"), time = document.createElement("time");
     time.textContent = `${(line.sample * (ABOUT.step || 0)).toFixed(3)} s`;
     item.append(time, `${line.source}: ${line.text}`);
     $("log").prepend(item);
   }
-  logged = SHOWN.log.length;
+  logged = lines.length;
   while ($("log").children.length > MOST_LOG) $("log").lastChild.remove();
+  $("left-out").textContent = SHOWN.now.left_out || "";
 }
 
 addEventListener("load", follow);

@@ -28,7 +28,9 @@ _FILES = ("save", "load")  # events that need a file, which the page does not na
 
 def page() -> Page:
     """Return the page of the panel."""
-    scripts = [own_file(f"{name}.js", _HERE) for name in ("panel", "panel_drawings", "panel_commands")]
+    scripts = [
+        own_file(f"{name}.js", _HERE) for name in ("panel", "panel_drawings", "panel_timeline", "panel_commands")
+    ]
     return Page("panel", own_file("panel.html", _HERE), [own_file("panel.css", _HERE)], scripts)
 
 
@@ -104,8 +106,17 @@ def attached_site(view: View, cell: Cell, commands: Attached) -> Site:
 
 
 def _watching(view: View) -> dict[str, Answer]:
-    """Return the answer that every run has: news."""
-    return {"frame": lambda question: news(view, Have.of(question), _PATIENCE)}
+    """Return the answers that every run has: news, the timeline, and an extreme of it."""
+
+    def timeline(question: Mapping[str, Any]) -> object:
+        first, last = (None if question.get(name) is None else _number(question, name) for name in ("first", "last"))
+        return view.timeline.shown(first, last, int(_number(question, "cells")))
+
+    def extreme(question: Mapping[str, Any]) -> object:
+        return view.timeline.extreme(_number(question, "first"), _number(question, "last"), _text(question, "lane"))
+
+    frame = lambda question: news(view, Have.of(question), _PATIENCE)  # noqa: E731
+    return {"frame": frame, "timeline": timeline, "extreme": extreme}
 
 
 def _done(command: Callable[[Mapping[str, Any]], object]) -> Answer:
@@ -160,7 +171,7 @@ def _text(question: Mapping[str, Any], name: str) -> str:
 
 def _number(question: Mapping[str, Any], name: str) -> float:
     value = question.get(name)
-    if not isinstance(value, int | float) or isinstance(value, bool):
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= 1e300:
         raise InputError(f"{name} = {json.dumps(value):.80}; allowed: a number")
     return float(value)
 

@@ -11,7 +11,7 @@ async function tell(place, name, question) {
   }
 }
 function answer(place, text, refused = false) { // one for each row of commands
-  const row = place.closest(".bar, .actions, .row");
+  const row = place.closest(".bar, .actions, .row, .time");
   row.querySelectorAll(".answer").forEach(each => each.remove());
   if (!text) return;
   const said = Object.assign(document.createElement("p"), { className: refused ? "answer refused" : "answer", textContent: text });
@@ -59,7 +59,6 @@ function describe() { // fills the commands from what the cell tells of itself
   $("record").hidden = !can("record");
   for (const [id, why] of Object.entries(cannot())) $(id).title = why;
   for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
-  $("seeking").hidden = !can("seek");
   for (const id of ["retract", "reset"]) $(id).hidden = !can("command") || !supervisor();
   for (const place of document.querySelectorAll(".of-part")) place.hidden = !ABOUT.part;
   if (!can("command")) return;
@@ -137,4 +136,3 @@ $("more").addEventListener("click", () => { // on narrow screens: the other comm
 });
 new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
 $("pace").addEventListener("change", () => { tell($("pace"), "pace", { factor: Number($("pace").value) }); $("pace").blur(); });
-$("seek").addEventListener("change", () => { tell($("seek"), "seek", { sample: Number($("seek").value) }); $("seek").blur(); });

@@ -113,15 +113,26 @@ function cut(rows) { // the rows that determine a scale: those in which the tool
   return found.length ? found : rows;
 }
 
+function shares(rows) { // the place of an error in the colours, and the errors beside them
+  const largest = cut(rows).map(row => row.cells.reduce((most, um) => Math.max(most, Math.abs(um)), 0)).sort((a, b) => a - b);
+  const tolerance = ABOUT.tolerance, end = Math.max(largest[largest.length - 1], 1e-6);
+  // By the tolerance: white within a tenth of it, full colour from it on. Without one as in the report (colour_range):
+  // linear up to the quietest quarter of the rows, logarithmic beyond.
+  if (tolerance) return { share: um => Math.sign(um) * Math.max(0, Math.min(1, (Math.abs(um) / tolerance - 0.1) / 0.9)), ticks: [-tolerance, 0, tolerance] };
+  const bend = Math.min(Math.max(largest[(largest.length - 1) >> 2], end * 1e-4), end) / 8;
+  return { share: um => Math.sign(um) * Math.log1p(Math.abs(um) / bend) / Math.log1p(end / bend), ticks: end > 24 * bend ? [-end, -8 * bend, 8 * bend, end] : [-end, 0, end] };
+}
+const mapRows = () => SHOWN.open ? [...SHOWN.rows, SHOWN.open] : SHOWN.rows;
+const rowNumber = row => row.since == row.revolution ? String(row.revolution) : `${row.since}–${row.revolution}`;
+
 function drawMap() {
-  const { pen, width, height, ink, soft } = canvas("map"), [left, top, right, bottom] = [58, 8, width - 14, height - 46];
-  const rows = SHOWN.rows, columns = 180;
+  const rows = mapRows(), columns = 180, told = row => ABOUT.fed ? `${row.height.toFixed(2)} mm` : rowNumber(row);
+  const named = [...new Set(rows.length ? [0, rows.length >> 1, rows.length - 1] : [])];
+  const { pen, width, height, ink, soft } = canvas("map"), [top, right, bottom] = [8, width - 14, height - 46];
+  const left = Math.max(58, ...named.map(k => pen.measureText(told(rows[k])).width + 8));
   angles(pen, left, right, bottom + 14, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
-  // As in the report (colour_range): linear up to the quietest quarter of the rows, logarithmic beyond.
-  const largest = cut(rows).map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
-  const end = Math.max(largest[largest.length - 1], 1e-6), bend = Math.min(Math.max(largest[(largest.length - 1) >> 2], end * 1e-4), end) / 8;
-  const share = um => Math.sign(um) * Math.log1p(Math.abs(um) / bend) / Math.log1p(end / bend), colour = diverging();
+  const { share, ticks } = shares(rows), colour = diverging();
   const image = new ImageData(columns, rows.length);
   rows.forEach((row, k) => row.cells.forEach((um, column) => {
     image.data.set([...(row.out ? [150, 150, 150] : colour(share(um))), 255], 4 * (k * columns + column));
@@ -141,21 +152,29 @@ function drawMap() {
     }
     pen.stroke();
   }
-  const told = row => ABOUT.fed ? `${row.height.toFixed(2)} mm` : String(row.revolution);
-  for (const k of new Set([0, rows.length >> 1, rows.length - 1])) label(pen, told(rows[k]), left - 5, Math.min(top + (k + 0.7) * tall, bottom), soft, "right");
+  pen.beginPath(); // the revolution that is shown, and a notch where some were not received
+  const shown = SHOWN.at && rows.findIndex(row => row.revolution > SHOWN.at.first);
+  if (SHOWN.at) pen.rect(left - 2, top + (shown < 0 ? rows.length - 1 : shown) * tall, right - left + 4, Math.max(tall, 2));
+  for (let k = 1; k < rows.length; k++) if (rows[k].since > rows[k - 1].revolution + 1) { pen.moveTo(right, top + k * tall); pen.lineTo(width, top + k * tall); }
+  pen.strokeStyle = ink;
+  pen.stroke();
+  for (const k of named) label(pen, told(rows[k]), left - 5, Math.min(top + (k + 0.7) * tall, bottom), soft, "right");
   label(pen, ABOUT.fed ? "height" : "revolution", 2, bottom + 14, soft);
   for (let x = 0; x < 160; x++) { pen.fillStyle = `rgb(${colour(x / 80 - 1)})`; pen.fillRect(left + x, bottom + 22, 1, 8); }
-  for (const um of end > 24 * bend ? [-end, -8 * bend, 8 * bend, end] : [-end, 0, end]) label(pen, digits(um, 2), left + 80 + 80 * share(um), bottom + 42, soft, "center");
+  for (const um of ticks) label(pen, digits(um, 2), left + 80 + 80 * share(um), bottom + 42, soft, "center");
   label(pen, ABOUT.tolerance ? `tolerance ±${digits(ABOUT.tolerance)} µm` : ABOUT.by_zone ? "tolerance by zone: see lathe run" : "no tolerance given", left + 185, bottom + 32, soft);
 }
 
 function drawWaterfall() {
-  const { pen, width, height, ink, soft, line, good, bad } = canvas("waterfall"), [left, top, right, bottom] = [84, 16, width - 70, height - 24];
-  const rows = SHOWN.latest, tall = (bottom - top) / WATERFALL, tolerance = ABOUT.tolerance;
+  const { at } = SHOWN, tolerance = ABOUT.tolerance, farthest = row => Math.max(...row.cells.map(Math.abs));
+  const rows = at ? mapRows().filter(row => row.since <= at.first + at.every).slice(-WATERFALL) : SHOWN.latest;
+  const largest = cut(rows).map(farthest).sort((a, b) => a - b);
+  const most = tolerance ? 1.5 * tolerance : nice(1.3 * Math.max(largest[largest.length >> 1] || 0, 1e-6));
+  const told = row => rowNumber(row) + (farthest(row) > most ? `: to ${digits(farthest(row), 2)}` : ""); // where the curve is cut off
+  const { pen, width, height, ink, soft, line, good, bad } = canvas("waterfall"), [top, right, bottom] = [16, width - 70, height - 24];
+  const left = Math.max(84, ...rows.map(row => pen.measureText(told(row)).width + 8)), tall = (bottom - top) / WATERFALL, scale = 0.45 * tall / most;
   angles(pen, left, right, height - 6, soft);
   if (!rows.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
-  const largest = cut(rows).map(row => Math.max(...row.cells.map(Math.abs))).sort((a, b) => a - b);
-  const most = nice(1.3 * Math.max(largest[largest.length >> 1], tolerance, 1e-6)), scale = 0.45 * tall / most;
   rows.forEach((row, k) => {
     const y = top + (k + 0.5 + WATERFALL - rows.length) * tall, x = column => left + (right - left) * (column + 0.5) / row.cells.length;
     if (tolerance) { pen.globalAlpha = 0.5; pen.fillStyle = line; pen.fillRect(left, y - tolerance * scale, right - left, 2 * tolerance * scale); pen.globalAlpha = 1; }
@@ -166,74 +185,11 @@ function drawWaterfall() {
       row.cells.forEach((um, column) => { if (column && wanted(um)) { pen.moveTo(x(column - 1), place(row.cells[column - 1])); pen.lineTo(x(column), place(um)); } });
       pen.stroke();
     }
-    const far = Math.max(...row.cells.map(Math.abs)); // beyond its strip, where the curve is cut off
-    label(pen, row.revolution + (far > most ? `: to ${digits(far, 2)}` : ""), left - 5, y + 4, soft, "right");
+    label(pen, told(row), left - 5, y + 4, soft, "right");
   });
   Object.assign(pen, { strokeStyle: ink, lineWidth: 1 });
   pen.strokeRect(right + 8, bottom - tall, 0, most * scale * 2);
   label(pen, `${digits(2 * most)} µm`, right + 14, bottom - tall + most * scale + 4, ink);
-}
-
-function drawHistory() {
-  const { pen, width, height, ink, soft, line, good, bad } = canvas("history"), [left, top, right, bottom] = [46, 8, width - 60, height - 24];
-  const found = SHOWN.history;
-  if (!found.length) { label(pen, "after the first revolution", (left + right) / 2, (top + bottom) / 2, soft, "center"); return; }
-  const values = found.flatMap(([, rms, largest]) => [rms, largest]).filter(value => value > 0);
-  if (ABOUT.tolerance) values.push(ABOUT.tolerance);
-  const low = Math.floor(Math.log10(Math.min(...values)) - 0.05), high = Math.max(Math.ceil(Math.log10(Math.max(...values)) + 0.05), low + 1);
-  const y = um => bottom - (Math.log10(Math.max(um, 10 ** low)) - low) / (high - low) * (bottom - top);
-  const first = found[0][0], last = found[found.length - 1][0], x = n => left + (right - left) * (last > first ? (n - first) / (last - first) : 0.5);
-  Object.assign(pen, { lineWidth: 1, strokeStyle: line });
-  for (let decade = low; decade <= high; decade++) {
-    pen.beginPath(); pen.moveTo(left, y(10 ** decade)); pen.lineTo(right, y(10 ** decade)); pen.stroke();
-    label(pen, digits(10 ** decade), left - 5, y(10 ** decade) + 4, soft, "right");
-  }
-  if (ABOUT.tolerance) {
-    Object.assign(pen, { strokeStyle: bad });
-    pen.setLineDash([6, 4]);
-    pen.beginPath(); pen.moveTo(left, y(ABOUT.tolerance)); pen.lineTo(right, y(ABOUT.tolerance)); pen.stroke();
-    pen.setLineDash([]);
-    label(pen, "tolerance", right - 4, y(ABOUT.tolerance) - 4, bad, "right");
-  }
-  const every = Math.max(1, Math.floor(found.length / 2000)), ends = {};
-  for (const [name, which, colour] of [["largest", 2, soft], ["RMS", 1, good]]) {
-    Object.assign(pen, { strokeStyle: colour, lineWidth: 1.6 });
-    pen.beginPath();
-    for (let k = 0; k < found.length; k += every) pen[k ? "lineTo" : "moveTo"](x(found[k][0]), y(found[k][which]));
-    pen.stroke();
-    ends[name] = y(found[found.length - 1][which]);
-    label(pen, name, right + 5, ends[name] + 4 + (name == "RMS" && Math.abs(ends.RMS - ends.largest) < 11 ? 11 : 0), colour);
-  }
-  for (const n of new Set([first, Math.round((first + last) / 2), last])) label(pen, String(n), x(n), height - 6, soft, "center");
-}
-
-function drawForce() {
-  const { pen, width, height, soft, line, good, bad } = canvas("force"), [left, top, right, bottom] = [46, 8, width - 14, height - 24];
-  const found = SHOWN.force, values = [...found.map(([, force]) => force), ABOUT.force, 0];
-  if (found.length < 2) return;
-  const most = nice(1.1 * Math.max(...values, 1)), least = Math.min(0, ...values), first = found[0][0], last = found[found.length - 1][0];
-  const x = time => left + (right - left) * (time - first) / (last - first), y = force => bottom - (bottom - top) * (force - least) / (most - least);
-  for (const force of [0, most / 2, most]) {
-    Object.assign(pen, { strokeStyle: line, lineWidth: 1 });
-    pen.beginPath(); pen.moveTo(left, y(force)); pen.lineTo(right, y(force)); pen.stroke();
-    label(pen, digits(force), left - 5, y(force) + 4, soft, "right");
-  }
-  if (ABOUT.force) {
-    pen.strokeStyle = bad;
-    pen.setLineDash([6, 4]);
-    pen.beginPath(); pen.moveTo(left, y(ABOUT.force)); pen.lineTo(right, y(ABOUT.force)); pen.stroke();
-    pen.setLineDash([]);
-    label(pen, "set point", right - 4, Math.max(y(ABOUT.force) - 4, 10), bad, "right");
-  }
-  Object.assign(pen, { strokeStyle: good, lineWidth: 1.6 });
-  pen.beginPath();
-  found.forEach(([time, force], k) => {
-    const joined = k && time - found[k - 1][0] <= GAP;
-    pen[joined ? "lineTo" : "moveTo"](x(time), y(force));
-    if (!joined) pen.lineTo(x(time) + 1, y(force)); // a point
-  });
-  pen.stroke();
-  for (const time of [first, last]) label(pen, `${time.toFixed(2)} s`, x(time), height - 6, soft, time == first ? "left" : "right");
 }
 
 // ---- picture -------------------------------------------------------------------------------------------------------
@@ -252,7 +208,7 @@ $("picture").addEventListener("click", async () => {
 });
 
 async function drawn() { // the drawings of the page beside each other, as one picture
-  const shown = ["machine", "dials", ...(ABOUT.part ? ["history", "map", "waterfall"] : []), ...(SHOWN.force.length ? ["force"] : [])];
+  const shown = ["machine", "dials", ...(ABOUT.part ? ["map", "waterfall"] : []), ...($("time").hidden ? [] : ["timeline"])];
   const boxes = shown.map(id => [$(id), $(id).getBoundingClientRect()]);
   const left = Math.min(...boxes.map(([, box]) => box.left)), top = Math.min(...boxes.map(([, box]) => box.top));
   const right = Math.max(...boxes.map(([, box]) => box.right)), bottom = Math.max(...boxes.map(([, box]) => box.bottom));

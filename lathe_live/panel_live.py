@@ -32,6 +32,11 @@ class _Heard(RunView):
         """Add a line to the log."""
         self._panel.say(index, "panel", text)
 
+    def leave_out(self, index: int, count: int) -> None:
+        """Mark dropped chunks, and count them in one line beside the log."""
+        self._panel.timeline.mark(index, "lost", self.left_out(index, count))
+        self._panel.know_lost(self.left_out(index, self.pieces.lost))
+
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Show consecutive samples, and tell the page."""
         super().chunk(first, samples, dense, sparse)

@@ -2,6 +2,7 @@
 """Bag as a run of the panel: it is played instead of computed."""
 
 import tempfile
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,8 +17,11 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.reader import read_bag
 from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.blocks.ports import Sparse
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.messages import MAX_BLOCK
+from lathe_rc.messages import MAX_BLOCK, Signals
+
+_AT_ONCE = 2**20  # samples that the timeline takes at once
 
 
 class Player:
@@ -51,11 +55,14 @@ class Player:
         self.view = View(recording.types, recording.step_ns)
         said = [message for topic in recording.sparse for message in recording.messages(topic)]
         self._said = sorted(said, key=lambda message: message.index)
-        self._told = 0  # messages shown
         self._angle = next(
             (signals["angle_true"] for topic, signals in recording.dense.items() if topic == self.view.topics.encoder),
             np.empty(0),
         )
+        try:
+            self._fill_timeline()
+        except LatheError as error:
+            raise LatheError(f"{bag}: {error}") from None
         if recording.lost:
             self.view.say(self.samples, "panel", recording.lost)
         with Source(bag) as source, tempfile.TemporaryDirectory() as folder:
@@ -67,19 +74,32 @@ class Player:
                 self.view.say(self.first, "panel", f"the scenario is not known: {error}")
                 self.view.outlook = plain_outlook(name, self.step)
 
+    def _fill_timeline(self) -> None:
+        """Take the whole bag into the timeline, so that it is there before the bag is played."""
+        soundness = Soundness.of_form(self._recording.types)
+        for first in range(self.first, self.samples, _AT_ONCE):
+            samples = min(_AT_ONCE, self.samples - first)
+            dense, sparse = self._chunk(first, first + samples)
+            self.view.timeline.chunk(first, samples, dense, sparse, soundness.sound(first, samples, sparse))
+
+    def _chunk(self, first: int, end: int) -> tuple[dict[str, Signals], Mapping[str, list[Sparse]]]:
+        """Return signals and messages by topic, from sample ``first`` to before ``end``."""
+        span = slice(first - self.first, end - self.first)
+        dense = {
+            topic: {name: array[span] for name, array in signals.items()}
+            for topic, signals in self._recording.dense.items()
+        }
+        begin, stop = (bisect_left(self._said, place, key=lambda message: message.index) for place in (first, end))
+        sparse: defaultdict[str, list[Sparse]] = defaultdict(list)
+        for message in self._said[begin if first > self.first else 0 : stop]:
+            sparse[message.topic].append(message)
+        return dense, sparse
+
     def advance(self, end: int) -> None:
         """Show samples up to ``end``."""
         while self.reached < end:
             first, end_here = self.reached, min(end, self.reached + MAX_BLOCK, self.samples)
-            span = slice(first - self.first, end_here - self.first)
-            dense = {
-                topic: {name: array[span] for name, array in signals.items()}
-                for topic, signals in self._recording.dense.items()
-            }
-            sparse: defaultdict[str, list[Sparse]] = defaultdict(list)
-            while self._told < len(self._said) and self._said[self._told].index < end_here:
-                sparse[self._said[self._told].topic].append(self._said[self._told])
-                self._told += 1
+            dense, sparse = self._chunk(first, end_here)
             for sink in (self.view, self.view.lamp):
                 sink.chunk(first, end_here - first, dense, sparse)
             self.reached = end_here
@@ -98,7 +118,7 @@ class Player:
         if sample < self.reached:
             self.view.clear()
             self.view.lamp.clear()
-            self.reached, self._told = self.first, 0
+            self.reached = self.first
         self.advance(sample)
 
     def turn_end(self) -> int:

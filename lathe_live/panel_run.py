@@ -372,10 +372,11 @@ class LiveCell:
         self.events = waiting
         self.record("")
         if here:
-            self.view.say(self.reached, "panel", f"goes on with {_listed(values)}")
+            self.view.say(self.reached, "panel", f"goes on with {_listed(values)}", kind="parameter")
         else:
             self.view.clear(self._margin())
             self.view.lamp.clear()
+            self.view.timeline.clear()
         self._remark()
 
     def _waiting(self) -> dict[str, list[str]]:

@@ -18,6 +18,8 @@ import numpy as np
 from lathe_live.panel_age import Age
 from lathe_live.panel_lamp import OUT, Lamp
 from lathe_live.panel_outlook import outlook
+from lathe_live.panel_timeline import Timeline
+from lathe_live.panel_topics import Topics
 from lathe_live.panel_verdict import Evaluation
 from lathe_live.rerun_part import Outlook, Scale
 from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
@@ -34,12 +36,11 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.judge.part import RunningVerdict
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.view import machine_state
 from lathe_rc.view.form_limits import form_limits, varying_speed
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
-MOST_ROWS = 256  #: rows of the map; when it is full, every second one is dropped
+MOST_ROWS = 256  #: rows of the map, an even number; when it is full, neighbours are merged
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
 _STILL = 1.0  # [s] without a new sample from which on a run that is held is paused
@@ -50,50 +51,33 @@ _RPM = 60.0 / (2.0 * np.pi)
 
 
 @dataclass(frozen=True)
-class Topics:
-    """Topics of a cell that the panel shows, by fully qualified name; empty if there is none.
-
-    Attributes:
-        encoder, tool, cut: first topics of these kinds.
-        drives: states of the drives that move the tool.
-        slides: states of the slides, by axis.
-    """
-
-    encoder: str
-    tool: str
-    cut: str
-    drives: Sequence[str]
-    slides: Mapping[str, str]
-
-    @classmethod
-    def of(cls, types: Mapping[str, str]) -> "Topics":
-        """Return the topics of a cell, given the message type of each topic."""
-        named = {full(topic): kind for topic, kind in types.items()}
-        first = {kind: topic for topic, kind in reversed(named.items())}
-        slides = {
-            axis: topic
-            for topic, kind in named.items()
-            if kind == messages.STATE and (axis := machine_state.source(topic, kind))
-        }
-        drives = [t for t, kind in named.items() if kind == messages.STATE and t not in slides.values()]
-        return cls(
-            first.get(messages.ENCODER, ""), first.get(messages.TOOL, ""), first.get(messages.CUT, ""), drives, slides
-        )
-
-
-@dataclass(frozen=True)
 class Row:
-    """Revolution in the map.
+    """Revolution in the map, or several that are merged.
 
     Attributes:
-        revolution: its form.
+        since: number of the first revolution.
+        revolution: form of the last one.
         cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
-        out: whether the supervisor held the tool out of the part in some of it.
+        out: whether the supervisor held the tool out of the part in some of it, or in each revolution.
     """
 
+    since: int
     revolution: Revolution
     cells: list[float]
     out: bool = False
+
+    def merged(self, later: "Row") -> "Row":
+        """Return a row of these and later revolutions; of two, the one without the part does not count."""
+        if self.out != later.out:
+            cells = (later if self.out else self).cells
+        else:
+            cells = [max(pair, key=abs) for pair in zip(self.cells, later.cells, strict=True)]
+        return Row(self.since, later.revolution, cells, self.out and later.out)
+
+    def told(self) -> dict[str, Any]:
+        """Return the row as JSON data."""
+        place = {"since": self.since, "revolution": self.revolution.number}
+        return {**place, "cells": self.cells, "out": self.out, "height": round(self.revolution.height * 1e3, 6)}
 
 
 @dataclass(frozen=True)
@@ -104,9 +88,9 @@ class Snapshot:
         number: number of the snapshot, counted from 1.
         run: number of the run; lists of another run start anew.
         now: newest values, by name, in the units of the page.
-        epoch: number of times that every second row of the map was dropped.
-        rows, log: rows of the map, lines of the log.
-        history: number, RMS and largest error of each revolution [µm].
+        epoch: number of times that neighbours in the map were merged.
+        rows, log: complete rows of the map, lines of the log.
+        open: row of the map that is not complete, if there is one.
         latest: newest revolutions.
         part: evaluation of the part.
     """
@@ -116,8 +100,8 @@ class Snapshot:
     now: Mapping[str, Any]
     epoch: int
     rows: list[Row]
+    open: Row | None
     log: list[dict[str, Any]]
-    history: list[tuple[int, float, float]]
     latest: Sequence[Row]
     part: Evaluation
 
@@ -135,7 +119,7 @@ def has_memory(stage: Stage) -> bool:
 def _row(revolution: Revolution, *, out: bool) -> Row:
     parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
-    return Row(revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
+    return Row(revolution.number, revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
 
 
 class View:
@@ -151,6 +135,7 @@ class View:
         outlook: see `lathe_live.panel_outlook`; empty: unknown.
         memories: learning controllers whose memories can be cleared.
         lamp: state of the supervisor; a sink of its own, since it must not wait for the samples of a live view.
+        timeline: extremes by revolution and events; `clear` leaves it, since that of a bag is complete from the start.
         age: age of the samples shown; a live view also tells it the samples that it does not show yet.
     """
 
@@ -163,6 +148,7 @@ class View:
         self.latest: Snapshot | None = None
         self.outlook: Mapping[str, Any] = {}
         self.live, self.lamp, self.age = live, Lamp(live=live), Age()
+        self.timeline = Timeline(Topics.of({}))
         self.memories: Collection[str] = ()
         self._loops: Sequence[Loop] = ()
         self._declared: Mapping[str, Judged] = {}
@@ -176,6 +162,7 @@ class View:
         self._form: set[str] = set()  # signals that the form error is made of
         self._step_ns, self._margin = step_ns, margin
         self.learn(types)
+        self.timeline.begin(self.topics)
         self.clear(margin)
 
     def know(self, scenario: Scenario, stages: Iterable[Stage] = ()) -> None:
@@ -198,6 +185,7 @@ class View:
         self._types |= {full(topic): kind for topic, kind in types.items()}
         self._form |= fields_of(types, FORM)
         self.topics = Topics.of(self._types)
+        self.timeline.learn(self.topics)
 
     def clear(self, margin: float | None = None) -> None:
         """Begin with another run of the same cell."""
@@ -208,10 +196,11 @@ class View:
         self._now: dict[str, Any] = {"margin": self._margin if margin is None else margin, "learning": {}}
         self._is_out = False
         self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
-        self._end = 0  # sample after the last complete revolution
+        self._complete, self._end = 0, 0  # number of complete revolutions, and sample after the last one
         self._scale: Scale | None = None
-        self._epoch, self._every = 0, 1
+        self._epoch, self._joined = 0, 0  # times that rows were merged; revolutions in the open row
         self._rows: list[Row] = []
+        self._open: Row | None = None
         self._newest: list[Row] = []
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
         self._judge = None
@@ -220,7 +209,6 @@ class View:
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
-        self._history: list[tuple[int, float, float]] = []
 
     @property
     def reached(self) -> int:
@@ -283,6 +271,7 @@ class View:
         before, sound = self._soundness.why, self._soundness.sound(first, samples, sparse)
         if self._soundness.why != before:
             self.say(first + sound, "panel", f"form error {self._soundness.why}")
+        self.timeline.chunk(first, samples, named, sparse, sound)
         if encoder and tool:
             self._part(first, encoder["angle_true"], tool, sound)
 
@@ -308,14 +297,16 @@ class View:
         for revolution in complete:
             row = _row(revolution, out=revolution.end > self._out[0] and self._end < self._out[1])
             self._end = revolution.end
-            rms, largest = _short(np.array([revolution.rms, revolution.largest]) * _UM)
-            self._history.append((revolution.number, rms, largest))
+            self._complete += 1
             self._newest = [*self._newest[1 - WATERFALL :], row]
-            if (revolution.number - 1) % self._every == 0:
-                self._rows.append(row)
+            self._open, self._joined = self._open.merged(row) if self._open else row, self._joined + 1
+            if self._joined == 2**self._epoch:
+                self._rows.append(self._open)
+                self._open, self._joined = None, 0
             if len(self._rows) == MOST_ROWS:
                 # A new list: readers of older snapshots keep the old one.
-                self._rows, self._epoch, self._every = self._rows[::2], self._epoch + 1, 2 * self._every
+                pairs = zip(self._rows[::2], self._rows[1::2], strict=True)
+                self._rows, self._epoch = [one.merged(other) for one, other in pairs], self._epoch + 1
 
     def _message(self, topic: str, message: Sparse) -> None:
         if message.type == messages.LEARNING:
@@ -333,7 +324,7 @@ class View:
 
     def _evaluated(self, unjudged: str) -> Evaluation:
         """Evaluate the part as ``lathe run`` does; ``unjudged``: reason why its end cannot be judged, or empty."""
-        judge, rests_on = self._judge, (self._judge, len(self._history), unjudged)
+        judge, rests_on = self._judge, (self._judge, self._complete, unjudged)
         if judge and self._judged[0] != rests_on:
             self._judged = rests_on, Evaluation(judge.verdict(unjudged), judge.growth())
         found = self._judged[1]
@@ -360,7 +351,7 @@ class View:
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
         rows = self._newest[-LAST:]
-        if self._limits[0] != len(self._history) and rows:
+        if self._limits[0] != self._complete and rows:
             tolerance = self.outlook.get("tolerance")
             found = form_limits(
                 np.array([row.revolution.error for row in rows]) * _UM,
@@ -369,7 +360,7 @@ class View:
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
             out = ["The supervisor held the tool out of the part in the last revolutions."]
-            self._limits = len(self._history), out if any(row.out for row in rows) else [each.text for each in found]
+            self._limits = self._complete, out if any(row.out for row in rows) else [each.text for each in found]
         return [
             *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
             *self._limits[1],
@@ -385,9 +376,15 @@ class View:
             for text in (*(told for told, _ in result.judged()), *result.behaviour())
         ]
 
-    def say(self, sample: int, source: str, text: str) -> None:
-        """Add a line to the log."""
+    def say(self, sample: int, source: str, text: str, kind: str = "") -> None:
+        """Add a line to the log, and with a ``kind`` a mark of it to the timeline."""
+        if kind:
+            self.timeline.mark(sample, kind, text)
         self._log.append({"sample": sample, "source": source, "text": text[:300]})
+
+    def know_lost(self, text: str) -> None:
+        """Show how many samples were left out so far."""
+        self._now["left_out"] = text
 
     def publish(self, told: Mapping[str, Any], *, at_once: bool = False) -> None:
         """Publish a snapshot, unless the last one was a moment ago.
@@ -412,8 +409,8 @@ class View:
                 current,
                 self._epoch,
                 self._rows,
+                self._open,
                 self._log,
-                self._history,
                 tuple(self._newest),
                 self._evaluated(why),
             )
@@ -442,7 +439,7 @@ class Have:
         number: number of its newest snapshot.
         run: number of its run.
         epoch, rows: state of its map, see `Snapshot`.
-        log, history: number of lines and of revolutions.
+        log: number of lines.
         latest: newest revolution in its waterfall.
     """
 
@@ -451,7 +448,6 @@ class Have:
     epoch: int = 0
     rows: int = 0
     log: int = 0
-    history: int = 0
     latest: int = 0
 
     @classmethod
@@ -470,15 +466,11 @@ class Have:
         return cls(**found)
 
 
-def _told(row: Row) -> dict[str, Any]:
-    return {"revolution": row.revolution.number, "cells": row.cells, "out": row.out}
-
-
 def news(view: View, have: Have, patience: float) -> dict[str, Any]:
     """Return what a page lacks, as JSON data, once there is a new snapshot, or after some seconds; the lamp is current.
 
-    Rows of the map come a few at a time. A page with an older epoch first drops every second row for each later one,
-    which leaves ⌈n/2⌉ of n rows.
+    Rows of the map come a few at a time. For each epoch that it has missed, a page first merges its rows in pairs as
+    `Row.merged` does, and drops the last one of an odd number.
 
     Raises:
         LatheError: there is no snapshot yet.
@@ -486,7 +478,7 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
     snapshot = view.wait(have.number, patience)
     if have.run != snapshot.run or have.epoch > snapshot.epoch:
         have = Have(have.number)
-    had = -(-have.rows // 2 ** (snapshot.epoch - have.epoch))
+    had = have.rows >> snapshot.epoch - have.epoch
     rows = snapshot.rows[had : had + _AT_ONCE]
     latest = [row for row in snapshot.latest if row.revolution.number > have.latest]
     return {
@@ -494,10 +486,10 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         "run": snapshot.run,
         "epoch": snapshot.epoch,
         "now": view.current(snapshot),
-        "rows": [{**_told(row), "height": round(row.revolution.height * 1e3, 6)} for row in rows],
+        "rows": [row.told() for row in rows],
+        "open": snapshot.open.told() if snapshot.open else None,
         "more": had + len(rows) < len(snapshot.rows),
         "log": snapshot.log[have.log : have.log + _MOST_LINES],
-        "history": snapshot.history[have.history : have.history + _MOST_LINES],
-        "latest": [_told(row) for row in latest],
+        "latest": [row.told() for row in latest],
         "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
     }

@@ -46,6 +46,27 @@ class Revolution:
         return np.asarray(amplitude / np.sinc(np.arange(HIGHEST + 1) / ANGLES))
 
 
+def steps_of(turns: Array, first: int) -> Array:
+    """Return the steps [revolution] from sample to sample of consecutive samples, shape (n - 1,).
+
+    Args:
+        turns: true spindle angle [revolution], shape (n,).
+        first: index of the first sample.
+
+    Raises:
+        LatheError: the angle decreases, or increases faster than any spindle.
+    """
+    step = np.diff(turns)
+    possible = (step >= 0.0) & (step <= 1.0 / _FEWEST)
+    if not possible.all():
+        bad = int(np.argmin(possible))
+        raise LatheError(
+            f"the true spindle angle goes by {step[bad]:.4g} revolutions after sample {first + bad}; allowed: from "
+            f"0 to {1.0 / _FEWEST:g}"
+        )
+    return np.asarray(step)
+
+
 def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
     """Yield the revolution of samples that each cover an angle step [revolution]; none if the spindle stood still."""
     turns, error, reference, height = samples
@@ -95,14 +116,7 @@ class Revolutions:
             self._held, self._entire = np.empty((4, 0)), None
         start, self._next = first - self._held.shape[1], first + angle.size
         held = np.concatenate([self._held, np.stack([angle / (2.0 * np.pi), error, reference, height])], axis=1)
-        turns, step = held[0], np.diff(held[0])
-        possible = (step >= 0.0) & (step <= 1.0 / _FEWEST)
-        if not possible.all():
-            bad = int(np.argmin(possible))
-            raise LatheError(
-                f"the true spindle angle goes by {step[bad]:.4g} revolutions after sample {start + bad}; allowed: from "
-                f"0 to {1.0 / _FEWEST:g}"
-            )
+        turns, step = held[0], steps_of(held[0], start)
         self._held = held
         if not step.size:
             return

@@ -44,12 +44,21 @@ def scenario(name="supervised", revolutions=20, *overrides):
     return load(ROOT / "config" / f"{name}.yaml", [f"spindle_encoder.revolutions={revolutions}", *overrides])
 
 
+def joined(one, other):
+    """Two rows of the map as one, as in panel.js."""
+    if one["out"] != other["out"]:
+        cells = (other if one["out"] else one)["cells"]
+    else:
+        cells = [max(pair, key=abs) for pair in zip(one["cells"], other["cells"], strict=True)]
+    return {**other, "since": one["since"], "cells": cells, "out": one["out"] and other["out"]}
+
+
 class Panel:
     """A page without a browser: the answers of the server, and all that they told."""
 
     def __init__(self, driver, cell, site=None):
         self.cell, self.answers = cell, (site or panel.site(driver, cell)).answers
-        self.have, self.rows, self.log, self.history, self.now = Have(), [], [], [], {}
+        self.have, self.rows, self.open, self.log, self.now = Have(), [], None, [], {}
 
     def ask(self, name, **question):
         return json.loads(json.dumps(self.answers[name](question)))
@@ -58,19 +67,24 @@ class Panel:
         """Take what the page lacks, as panel.js does."""
         told = self.ask("frame", **vars(self.have))
         if told["run"] != self.have.run:
-            self.rows, self.log, self.history, epoch = [], [], [], told["epoch"]
+            self.rows, self.log, epoch = [], [], told["epoch"]
         else:
             epoch = self.have.epoch
         for _ in range(told["epoch"] - epoch):
-            self.rows = self.rows[::2]
+            self.rows = [joined(*pair) for pair in zip(self.rows[::2], self.rows[1::2])]  # noqa: B905 - one may be left
         self.rows += told["rows"]
+        self.open = told["open"]
         self.log += told["log"]
-        self.history += told["history"]
         self.now = told["now"]
-        lengths = (len(self.rows), len(self.log), len(self.history))
+        lengths = (len(self.rows), len(self.log))
         latest = max([row["revolution"] for row in told["latest"]], default=self.have.latest)
         self.have = Have(told["number"], told["run"], told["epoch"], *lengths, latest)
         return told
+
+    def largest(self):
+        """Largest form error of each revolution, from the timeline [µm]."""
+        low, high = self.ask("timeline", cells=4096)["bands"]["error"]
+        return [max(-a, b) for a, b in zip(low, high, strict=True)]
 
     def until(self, condition):
         deadline = time.monotonic() + 60.0
@@ -113,8 +127,7 @@ def test_a_run_with_the_panel_has_the_digests_of_one_without(opened, tmp_path):
     shown.until(lambda now: now["state"] == "ended")
     result = harness.run(scenario("supervised", 12))
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == result.digest
-    assert [number for number, _, _ in shown.history] == list(range(1, len(shown.history) + 1))
-    assert [rms for _, rms, _ in shown.history] == pytest.approx((result.errors.rms * 1e6).tolist(), rel=1e-3)
+    assert shown.largest()[:12] == pytest.approx((result.errors.largest * 1e6).tolist())
 
 
 @pytest.mark.parametrize(
@@ -214,12 +227,12 @@ def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_p
     for _ in range(4):
         shown.ask("step")
         shown.until(lambda now: now["state"] == "paused")
-    at, learned = shown.now["sample"], shown.history[-1][1]
+    at, learned = shown.now["sample"], shown.largest()[3]
     shown.ask("change", values={"learning_controller.learning_gain": "0.5"}, here=True)
     shown.ask("step")
     shown.until(lambda now: now["state"] == "paused" and now["sample"] > at)
     assert shown.now["begun"] == at
-    assert shown.history[-1][1] < 2 * learned  # goes on with what it has learned
+    assert shown.largest()[4] < 2 * learned  # goes on with what it has learned
     assert shown.cell.scenario.value("learning_controller.learning_gain") == 0.5
     with pytest.raises(InputError, match="goes on only with the parameters of the checkpoint"):
         shown.ask("change", values={"seed": "7"}, here=True)
@@ -227,10 +240,10 @@ def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_p
     run = shown.have.run
     shown.ask("change", values={"seed": "7"}, here=False)
     shown.take()
-    assert (shown.have.run, shown.history, shown.cell.reached) == (run + 1, [], 0)
+    assert (shown.have.run, shown.rows, shown.largest(), shown.cell.reached) == (run + 1, [], [], 0)
     shown.ask("start")
     shown.until(lambda now: now["state"] == "ended")
-    assert len(shown.history) == 12
+    assert len(shown.rows) == 12
 
 
 def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
@@ -241,7 +254,7 @@ def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
         shown.until(lambda now: now["state"] == "paused" and now["sample"])
     shown.ask("act", node="electrodynamic_actuator", action="fault coarse/command.position wrong scale=0.99")
     shown.ask("step")
-    now = shown.until(lambda now: now["state"] == "paused" and len(shown.history) == 4)
+    now = shown.until(lambda now: now["state"] == "paused" and len(shown.rows) == 4)
     assert now["faults"] == ["electrodynamic_actuator: coarse/command.position wrong scale=0.99"]
     at = now["sample"]
     shown.ask("act", node="learning_controller", action="freeze")
@@ -252,12 +265,12 @@ def test_parameters_add_up_and_are_listed_with_waiting_events(opened):
     assert (now["begun"], shown.cell.reached) == (at, at)
     assert now["events"] == f"{listed} --set 'learning_controller.events=[\"sample {at}: freeze\"]'"
     shown.ask("step")
-    shown.until(lambda _: len(shown.history) == 5)
+    shown.until(lambda _: len(shown.rows) == 5)
     assert any(line["sample"] == at and line["text"] == "freeze" for line in shown.log)
     shown.ask("act", node="electrodynamic_actuator", action="repair coarse/command.position")
     shown.ask("step")
-    shown.until(lambda now: len(shown.history) == 6 and not now["faults"])
-    assert shown.history[-1][0] > shown.history[-2][0]
+    shown.until(lambda now: len(shown.rows) == 6 and not now["faults"])
+    assert shown.rows[-1]["revolution"] > shown.rows[-2]["revolution"]
     shown.ask("change", values={}, here=False)
     assert shown.until(lambda now: not now["begun"])["events"] == listed
 
@@ -351,7 +364,7 @@ def test_pages_that_read_no_answer_delay_no_sample(opened, monkeypatch, tmp_path
         shown.until(lambda now: now["state"] == "ended")
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(scenario("piston", 24)).digest
     assert shown.have.epoch == 1
-    assert [row["revolution"] for row in shown.rows] == list(range(1, len(shown.history) + 1, 2))
+    assert [(row["since"], row["revolution"]) for row in shown.rows] == [(n, n + 1) for n in range(1, 24, 2)]
     assert all(len(row["cells"]) == 180 for row in shown.rows)
 
 
@@ -374,7 +387,7 @@ def test_only_news_are_told():
     cell = LiveCell(scenario("piston", 3))
     cell.view.publish({"state": "paused"})
     told = news(cell.view, Have(epoch=9, run=1), 1.0)
-    assert (told["rows"], told["history"], told["shape"], told["more"]) == ([], [], None, False)
+    assert (told["rows"], told["shape"], told["more"]) == ([], None, False)
 
 
 @pytest.fixture(scope="module")
@@ -392,24 +405,24 @@ def test_a_bag_is_played_with_pause_steps_and_jumps(bag):
         assert shown.ask("about")["tolerance"] == 2.0
         shown.ask("step")
         shown.until(lambda now: now["state"] == "paused" and now["sample"])
-        assert [number for number, _, _ in shown.history] == [1]
+        assert [row["revolution"] for row in shown.rows] == [1]
         shown.ask("start")
         shown.until(lambda now: now["state"] == "ended")
-        history, log, state = shown.history, shown.log, shown.now["safety"]
-        assert (len(history), state["state"]) == (8, "safe")
+        rows, log, state = shown.rows, shown.log, shown.now["safety"]
+        assert (len(rows), state["state"]) == (8, "safe")
         assert any("missed_index" in line["text"] for line in log)
         now = shown.now
         assert now["reference"] - now["error"] == pytest.approx(now["displacement"])  # where the tool is drawn
-        shown.ask("seek", sample=history[3][0] * 3900)
-        shown.until(lambda now: now["sample"] == history[3][0] * 3900)
-        assert shown.history == history[: len(shown.history)]
+        shown.ask("seek", sample=rows[3]["revolution"] * 3900)
+        shown.until(lambda now: now["sample"] == rows[3]["revolution"] * 3900)
+        assert shown.rows == rows[: len(shown.rows)]
         assert shown.now["safety"]["state"] == "nominal"
         shown.ask("seek", sample=player.samples)
         shown.until(lambda now: now["sample"] == player.samples)
-        assert (shown.history, shown.log, shown.now["safety"]) == (history, log, state)
+        assert (shown.rows, shown.log, shown.now["safety"]) == (rows, log, state)
         shown.ask("start")  # from the beginning
         shown.until(lambda now: now["state"] == "ended")
-        assert shown.history == history
+        assert shown.rows == rows
         with pytest.raises(InputError, match="sample -1; allowed: from 0 to"):
             shown.ask("seek", sample=-1)
 
@@ -480,7 +493,7 @@ def test_a_panel_under_full_load_shows_a_retraction_at_once_and_keeps_its_messag
         live.take(*message)
     live.end()
     log = news(live.view, Have(), 0.0)["log"]
-    assert any("left out" in line["text"] for line in log)
+    assert "left out" in news(live.view, Have(), 0.0)["now"]["left_out"]
     assert next(line["text"].partition(" ")[0] for line in log if line["source"] == "safety/status") == "index_pulses"
 
 
@@ -609,7 +622,7 @@ def test_the_next_step_after_a_retraction_is_the_one_that_lasts(opened):
             shown.until(lambda now, later=later: now["state"] == "paused" and now["sample"] >= later)
 
     shown.now = {"sample": 0}
-    on(lambda _: len(shown.history) >= 12)
+    on(lambda _: len(shown.rows) >= 12)
     assert (shown.now["part"]["title"], told()["text"]) == ("PART GOOD", "nothing to reset")
     shown.ask("act", node="electrodynamic_actuator", action=fault)
     on(lambda now: now["safety"]["state"] == "retracting")

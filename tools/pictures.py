@@ -81,6 +81,7 @@ TABLE = {
     "metrology.png": _script("metrology", 5),
     "panel.png": _photograph("panel_screenshot", "panel.md"),
     "panel_narrow.png": _photograph("panel_screenshot", "panel.md"),
+    "panel_timeline.png": _photograph("panel_screenshot", "panel.md"),
     "piezo.png": _script("piezo", 30, "drives"),
     "predistortion.png": _script("predistortion", 5, "force_position"),
     "compare.png": _photograph("report_screenshot", "view.md", " chromium turned"),

@@ -13,11 +13,13 @@ import pytest
 from bags import sized
 from matplotlib.image import imread
 from test_panel import attached, bag, hear, retracted, scenario
+from test_panel_timeline import spiked
 
 import lathe_rc
 from chromium import Chromium
-from lathe_live import page_server, panel, panel_lamp
+from lathe_live import page_server, panel, panel_lamp, panel_player
 from lathe_live.loop_page import LoopPage
+from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
 from lathe_live.varied_loop import VariedLoop
 from lathe_rc import harness
@@ -80,8 +82,8 @@ def test_the_whole_cell_is_run_broken_retracted_and_saved_from_the_page(page, tm
     submit(browser, "record", "button", bag=str(tmp_path / "bag"))
     browser.until("SHOWN.now.bag")
     browser.click("#step")
-    assert browser.until("SHOWN.now.state == 'paused' && SHOWN.history.length") == 1
-    while browser.run("SHOWN.history.length") < 12:
+    assert browser.until("SHOWN.now.state == 'paused' && SHOWN.rows.length") == 1
+    while browser.run("SHOWN.rows.length") < 12:
         one_revolution(browser)
     browser.click("#picture")
     picture = imread(saved(tmp_path, "supervised_full_cell.png"))
@@ -118,7 +120,7 @@ def test_the_page_fits_its_window_shows_refusals_and_has_the_loops_as_a_tab(page
     """In light and dark, wide and narrow; after a refused command the cell goes on, with other parameters."""
     browser, cell = page
     browser.click("#go")
-    browser.until("SHOWN.history.length > 5")
+    browser.until("SHOWN.rows.length > 5")
     browser.click("#go")
     for width in (1440, 420):
         for dark in (False, True):
@@ -180,6 +182,88 @@ def test_the_lamp_shows_what_was_heard_and_is_grey_when_nothing_is(retracted, tm
         browser.until(f"{read('safety')}.includes('no answer') && {colour} == 'rgb(138, 138, 138)'")
         assert re.match(r"lathe panel was not heard for \d+ s", browser.run(read("age")))
         assert browser.run("document.body.classList.contains('lost')")
+
+
+RED = """(() => {
+  const place = document.getElementById('timeline'), { width, height } = place;
+  const { data } = place.getContext('2d').getImageData(0, 0, width, height), columns = new Set();
+  const bad = [1, 3, 5].map(k => parseInt(style('--bad').slice(k, k + 2), 16));
+  for (let k = 0; k < width * height; k++) if (bad.every((part, c) => data[4 * k + c] == part)) columns.add(k % width);
+  return [...columns].sort((a, b) => a - b);
+})()"""
+READING = "document.getElementById('reading').textContent"
+
+
+def press(browser, key, **more):
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, **more)
+
+
+def test_a_spike_of_one_sample_in_a_long_bag_is_found_in_the_timeline_and_by_keyboard(tmp_path, monkeypatch):
+    """Its red mark is the only one after the first revolutions; a click there shows it, and keys keep the focus."""
+    harness.run(scenario("supervised", 800), bag=tmp_path / "bag")
+    monkeypatch.setattr(panel_player, "read_bag", spiked(tmp_path / "bag", 2_000_123, 40e-6))
+    player = Player(tmp_path / "bag")
+    turn = int(player._angle[2_000_123] / (2 * np.pi))
+    with (
+        Driver(player, 0.0) as driver,
+        page_server.serving(panel.player_site(driver, player)) as address,
+        Chromium(tmp_path) as browser,
+    ):
+        browser.look(1440, 1000)
+        browser.open(address)
+        browser.until(f"TIME.told && ABOUT.name && {RED}.length")
+        assert browser.run("TIME.told.every") == 2
+        box = browser.run("document.getElementById('timeline').getBoundingClientRect().toJSON()")
+        red = [x for x in browser.run(RED) if x > 0.1 * box["width"]]
+        assert 0 < len(red) <= 4  # one cell
+        y = browser.run("TOP + 3 * ROW + 4 + TITLE + 10")
+        browser.run("document.getElementById('timeline').scrollIntoView({ block: 'center' })")
+        box = browser.run("document.getElementById('timeline').getBoundingClientRect().toJSON()")
+        for kind in ("mousePressed", "mouseReleased"):
+            place = {"x": box["x"] + red[0] + 1, "y": box["y"] + y}
+            browser.call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
+        browser.until(f"SHOWN.rows.length && Math.max(...SHOWN.latest.map(row => row.revolution)) == {turn + 1}")
+        assert f"revolution {turn + 1}" in browser.run(READING)
+        assert "to 40" in browser.run(READING)
+        # By keyboard: a cell further, in the whole bag and zoomed in; the focus stays.
+        browser.run("document.getElementById('timeline').focus()")
+        for zoomed, step in ((0, 2), (3, 1)):
+            for _ in range(zoomed):
+                press(browser, "+")
+            browser.until(f"TIME.told.every == {step}")
+            before = browser.run("TIME.cursors[0].first")
+            press(browser, "ArrowRight")
+            browser.until(f"TIME.cursors[0].first - {before} >= 1")
+            assert browser.run("TIME.cursors[0].first") - before <= 2 * step - 1
+            browser.until("SHOWN.now.sample == TIME.cursors[0].values.sample[1] + 2")
+            assert browser.run("document.activeElement.id") == "timeline"
+            assert int(browser.run("document.activeElement.getAttribute('aria-valuenow')")) > before + 1
+        press(browser, "ArrowRight", modifiers=8)
+        browser.until("TIME.cursors[1]")
+        assert "difference: 1 revolutions" in browser.run(READING)
+        assert [line for line in browser.told if "readback" not in line] == []
+
+
+def test_a_click_in_a_run_that_goes_on_shows_what_is_kept_and_says_so(page):
+    """Curves and log up to there; machine and header are those of the newest sample, and a button returns to them."""
+    browser, cell = page
+    for _ in range(20):
+        one_revolution(browser)
+    browser.until("TIME.told.bands.error[0].length >= 20")
+    browser.run("choose(cellAt(9), 'error', false)")
+    said = browser.until(
+        "!document.getElementById('shown').hidden && document.getElementById('shown-words').textContent"
+    )
+    assert "up to revolution 10, marked in the map" in said
+    assert "Machine, state and header: the newest sample." in said
+    newest = browser.run("SHOWN.now.sample")
+    one_revolution(browser)
+    ended = f"sample {cell.reached} of {cell.samples}"
+    browser.until(f"document.getElementById('state').textContent.endsWith({ended!r})")
+    assert cell.reached > newest
+    assert browser.run("SHOWN.at.first") == 9
+    browser.click("#newest-again")
+    assert browser.run("document.getElementById('shown').hidden && SHOWN.at === null")
 
 
 def test_a_memory_is_cleared_while_the_tool_cuts_only_after_a_second_click(page):
