@@ -29,6 +29,7 @@ function merge(told) {
   if (told.run != HAVE.run) {
     Object.assign(SHOWN, { rows: [], latest: [], log: [], shape: null, ranges: {}, at: null });
     $("shown").hidden = true;
+    openCauses(false);
     HAVE.epoch = told.epoch;
   }
   for (; HAVE.epoch < told.epoch; HAVE.epoch++) SHOWN.rows = SHOWN.rows.flatMap((row, k) => k % 2 ? [joined(SHOWN.rows[k - 1], row)] : []);

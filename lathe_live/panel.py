@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from lathe_live.page_server import Answer, Page, Site
+from lathe_live.panel_causes import Causes
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
 from lathe_live.panel_view import Have, View, has_memory, news
@@ -29,7 +30,8 @@ _FILES = ("save", "load")  # events that need a file, which the page does not na
 def page() -> Page:
     """Return the page of the panel."""
     scripts = [
-        own_file(f"{name}.js", _HERE) for name in ("panel", "panel_drawings", "panel_timeline", "panel_commands")
+        own_file(f"{name}.js", _HERE)
+        for name in ("panel", "panel_drawings", "panel_timeline", "panel_causes", "panel_commands")
     ]
     return Page("panel", own_file("panel.html", _HERE), [own_file("panel.css", _HERE)], scripts)
 
@@ -159,7 +161,8 @@ def _commands(driver: Driver, cell: LiveCell) -> dict[str, Answer]:
         cell.record(bag)
 
     commands = {"about": lambda _: about(cell), "act": act, "change": change, "record": record}
-    return {name: _called(driver, command) for name, command in commands.items()}
+    causes = Causes(lambda: driver.call(cell.so_far))
+    return {"causes": causes.budget, **{name: _called(driver, command) for name, command in commands.items()}}
 
 
 def _text(question: Mapping[str, Any], name: str) -> str:
@@ -180,7 +183,7 @@ def about(cell: LiveCell) -> dict[str, Any]:
     """Return what does not change while a cell runs: its nodes, their events, knobs and faults, its parameters."""
     return {
         **cell.view.outlook,
-        "can": ["run", "command", "change", "record"],
+        "can": ["run", "command", "change", "record", "causes"],
         "nodes": [_node(stage) for stage in cell.cell.stages.values()],
         "faults": _faults(),
         "parameters": [f"{node}.{name}" for node, table in cell.scenario.nodes.items() for name in table.rows()],

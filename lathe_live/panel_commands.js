@@ -57,6 +57,7 @@ function describe() { // fills the commands from what the cell tells of itself
   $("commands").hidden = !can("command");
   for (const id of ["change", "repeat", "restart"]) $(id).hidden = !can("change");
   $("record").hidden = !can("record");
+  $("why").hidden = !can("causes") || !ABOUT.part;
   for (const [id, why] of Object.entries(cannot())) $(id).title = why;
   for (const id of ["go", "step", "pacing"]) $(id).hidden = !can("run");
   for (const id of ["retract", "reset"]) $(id).hidden = !can("command") || !supervisor();

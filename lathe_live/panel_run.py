@@ -379,6 +379,24 @@ class LiveCell:
             self.view.timeline.clear()
         self._remark()
 
+    def so_far(self) -> tuple[Scenario, int]:
+        """Return a scenario that repeats the run up to its newest complete revolution, and its number.
+
+        Raises:
+            InputError: the run began at a checkpoint, has no complete revolution, or the tool is out of the part.
+        """
+        (master,) = self.scenario.masters
+        if self.cell.first:
+            raise InputError(
+                f"the run began at a checkpoint, sample {self.cell.first}; allowed: a restart from sample 0"
+            )
+        if (turns := int(self.view.turns)) < 1:
+            raise InputError("no complete revolution yet; allowed: after the first one")
+        if self.view.was_out:
+            raise InputError("the tool was out of the part in the last ten revolutions; allowed: while it cuts")
+        told = {f"{node}.events": [*self.scenario.nodes[node].events, *texts] for node, texts in self.events.items()}
+        return self.scenario.varied({f"{master}.revolutions": float(turns), **told}), turns
+
     def _waiting(self) -> dict[str, list[str]]:
         """Return the events at the first sample not yet computed; a checkpoint holds them."""
         now = f"sample {self.reached}: "

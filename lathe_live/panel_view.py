@@ -238,6 +238,11 @@ class View:
         """Spindle angle of the newest sample [revolution]."""
         return float(self._now.get("angle", 0.0)) / (2.0 * np.pi)
 
+    @property
+    def was_out(self) -> bool:
+        """Whether the supervisor held the tool out of the part in the last revolutions."""
+        return any(row.out for row in self._newest[-LAST:])
+
     # ---- the cell's thread --------------------------------------------------------------------------
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
@@ -360,7 +365,7 @@ class View:
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
             out = ["The supervisor held the tool out of the part in the last revolutions."]
-            self._limits = self._complete, out if any(row.out for row in rows) else [each.text for each in found]
+            self._limits = self._complete, out if self.was_out else [each.text for each in found]
         return [
             *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
             *self._limits[1],

@@ -196,6 +196,8 @@ def test_events_of_the_panel_repeat_its_run(opened, tmp_path):
     assert out == sorted(out)
     assert (out[5], out[-1]) == (False, True)
     assert not any(shown.now["learning"].values())  # frozen
+    with pytest.raises(InputError, match="the tool was out of the part"):
+        shown.ask("causes")
     again = scenario("supervised", 20, *[f"{n}.events={json.dumps(e)}" for n, e in shown.cell.events.items()])
     assert set(shown.cell.events) == {"learning_controller", "spindle_encoder"}
     assert lathe_rc.read_bag(tmp_path / "bag").digests() == harness.run(again).digest
@@ -220,6 +222,29 @@ def test_a_diverging_run_is_named_as_lathe_run_names_it(opened):
     shown.ask("start")
     part = shown.until(lambda now: now["state"] == "ended")["part"]
     assert (part["mood"], part["text"].startswith(f"{result.growth.told()}; no tolerance")) == ("bad", True)
+
+
+def test_the_causes_are_those_of_lathe_budget_for_the_run_up_to_here(opened):
+    """With its commands and changed parameters; refused where the run cannot be repeated, or does not cut."""
+    shown = opened(scenario("supervised", 30, "learning_controller.events=['revolution 2: set learning_gain 0.8']"))
+    with pytest.raises(InputError, match="no complete revolution yet"):
+        shown.ask("causes")
+    for _ in range(8):
+        shown.ask("step")
+        shown.until(lambda now: now["state"] == "paused" and now["sample"])
+    shown.ask("act", node="learning_controller", action="set learning_gain 0.5")
+    at = shown.now["sample"]
+    for _ in range(6):
+        shown.ask("step")
+        shown.until(lambda now: now["state"] == "paused" and now["sample"] > at)
+    found = shown.ask("causes")
+    events = ["revolution 2: set learning_gain 0.8", f"sample {at}: set learning_gain 0.5"]
+    again = scenario("supervised", found["last"], f"learning_controller.events={json.dumps(events)}")
+    assert found == {**lathe_rc.budget(again).summary(), "last": int(shown.cell.view.turns)}
+    assert found["largest"] == pytest.approx(max(shown.largest()[found["last"] - 10 : found["last"]]), rel=0.02)
+    shown.ask("change", values={}, here=True)
+    with pytest.raises(InputError, match="began at a checkpoint"):
+        shown.ask("causes")
 
 
 def test_other_parameters_hold_from_a_checkpoint_or_from_the_start(opened, tmp_path):

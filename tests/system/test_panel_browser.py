@@ -244,6 +244,30 @@ def test_a_spike_of_one_sample_in_a_long_bag_is_found_in_the_timeline_and_by_key
         assert [line for line in browser.told if "readback" not in line] == []
 
 
+def test_the_causes_are_shown_beside_the_verdict_as_a_bar_with_their_shares(tmp_path):
+    """Refused before the first revolution, in words; a second click closes them."""
+    cell, read = LiveCell(scenario("supervised", 20)), "document.getElementById('{}').textContent".format
+    with (
+        Driver(cell, 0.0) as driver,
+        page_server.serving(panel.site(driver, cell)) as address,
+        Chromium(tmp_path) as browser,
+    ):
+        browser.open(address)
+        browser.until("SHOWN.now.state == 'paused' && ABOUT.nodes.length")
+        browser.click("#why")
+        assert "no complete revolution yet" in browser.until("document.querySelector('#causes .answer').textContent")
+        browser.click("#why")
+        browser.click("#go")
+        browser.until("SHOWN.now.state == 'ended'")
+        browser.click("#why")
+        assert browser.until("[...document.querySelectorAll('#shares span')].map(bar => bar.textContent)")[0] == "speed"
+        found = lathe_rc.budget(scenario("supervised", int(cell.view.turns)))
+        for cause in found.causes:
+            assert f"{cause.name} {float(cause.percent()):g} %" in browser.run(read("causes-of")) or cause.share < 0.005
+        browser.click("#why")
+        assert browser.run("document.getElementById('causes').hidden")
+
+
 def test_a_click_in_a_run_that_goes_on_shows_what_is_kept_and_says_so(page):
     """Curves and log up to there; machine and header are those of the newest sample, and a button returns to them."""
     browser, cell = page
