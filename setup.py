@@ -95,7 +95,7 @@ setup(
         "lathe_bagtools": ["py.typed", "__init__.pyi"],
         "lathe_commission": ["py.typed", "__init__.pyi"],
         "lathe_explore": ["py.typed", "__init__.pyi", "sweep/*.j2"],
-        "lathe_export": ["py.typed", "__init__.pyi", "templates/*/*.j2"],
+        "lathe_export": ["py.typed", "__init__.pyi", "templates/*/*.j2", "templates/*/*.h"],
         "lathe_live": ["py.typed", "*.j2", "*.css", "*.html", "*.js"],
     },
     data_files=shared_files(),

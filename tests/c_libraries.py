@@ -12,7 +12,7 @@ DONE, INPUT, STOPPED, REFUSED = range(4)
 
 def built(place: Path, *flags: str, compiler: str = "cc", main: Path | None = None) -> Path:
     """The example of an exported library, built as its CMake file does; ``flags`` go to the compiler."""
-    name = next(path.stem for path in place.glob("*.c") if path.stem not in ("lathe", "main"))
+    name = _name(place)
     example = place / f"{name}_main"
     if main is not None:
         example, flags = place / f"{name}_{main.stem}", (*flags, f"-DCELL={name}", "-include", f"{place}/{name}.h")
@@ -33,8 +33,12 @@ def hostile(place: Path, tries: int, flips: int, *flags: str) -> str:
     return done.stdout
 
 
+def _name(place: Path) -> str:
+    return next(path.stem for path in place.glob("*.h") if path.stem not in ("lathe", "kernels"))
+
+
 def _parts(place: Path, name: str) -> list[Path]:
-    return [place / "lathe.c", place / f"{name}.c", *sorted((place / "objects").glob("*.o"))]
+    return [place / "lathe.c", place / f"{name}.c", place / f"{name}_state.c", *sorted(place.glob("*_step.c"))]
 
 
 _WATCHED = """
@@ -80,7 +84,7 @@ class Loaded:
     """A shared library with one block of state."""
 
     def __init__(self, place: Path, size: int) -> None:
-        name = next(path.stem for path in place.glob("*.c") if path.stem not in ("lathe", "main"))
+        name = _name(place)
         library = place / f"lib{name}.so"
         shared = ["-shared", "-fPIC", "-Wl,-Bsymbolic", "-ftls-model=initial-exec", "-O2", "-ffp-contract=off"]
         if not library.exists():  # a library that is in use must not change

@@ -2,8 +2,10 @@
 """``lathe export c``: stages as C libraries with the bits of the engine."""
 
 import ctypes
+import re
 import subprocess
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -167,11 +169,23 @@ def test_an_input_that_is_refused_is_named(law):
         assert made.c.lathe_reason_name(made.block) == b"tool.measured_error"
 
 
-def test_the_library_needs_libm_alone(law):
-    symbols = subprocess.run(["nm", *(law.place / "objects").iterdir()], capture_output=True, text=True, check=True)
+def test_the_steps_read_as_the_kernels_do_and_need_libm_alone(law):
+    """Names, formulas and comments of the kernels; no symbol of Python."""
+    text = (law.place / "learning_controller_step.c").read_text()
+    assert "real.data[SQUARES] = squares;" in text
+    assert "/* Points to be read must already be learned, and not yet be overwritten by the next cycle. */" in text
+    assert "lathe_rc.control.angle_memory.find: Assign the grid points" in text
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    shown = re.search(r"## A step as C\n.*?```c\n(.*?)```", page, re.DOTALL)
+    assert shown[1] in text
+    assert max(map(len, text.splitlines())) <= 120
+    built(law.place)
+    subprocess.run(["cc", "-std=c99", "-c", "learning_controller_step.c"], cwd=law.place, check=True)
+    symbols = subprocess.run(
+        ["nm", law.place / "learning_controller_step.o"], capture_output=True, text=True, check=True
+    )
     wanted = {line.split()[-1] for line in symbols.stdout.splitlines() if " U " in line}
-    assert wanted <= {"lathe_take", "lathe_release", "memcpy", "memset", "sin", "cos", "sincos", "exp", "floor"}
-    assert not [word for word in ("Py", "numba", "NRT", "pickle") if word in symbols.stdout]
+    assert wanted <= {"memmove", "memcpy", "sin", "cos", "exp", "floor", "ceil", "fmod", "copysign", "rint"}
 
 
 def test_a_step_allocates_no_memory(law):

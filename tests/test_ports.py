@@ -93,7 +93,8 @@ def test_a_stage_without_inputs_follows_the_spindle_from_its_own_sample_on():
     pace = inputs.follow("/encoder", "/spindle", 16)
     for first in (0, 8, 12):
         assert pace.add(block(first)) is None
-    assert pace.add(block(16)) and pace.end == 20
+    assert pace.add(block(16)).first_index == 16
+    assert pace.end == 20
     with pytest.raises(BadBlock, match="goes from sample 20 to 24: 4 samples are missing"):
         pace.add(block(24))
 

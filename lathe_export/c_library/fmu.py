@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of a scenario as a Functional Mock-up Unit (FMI 2.0 or 3.0, co-simulation), from the same compiled steps.
+"""Stages of a scenario as a Functional Mock-up Unit (FMI 2.0 or 3.0, co-simulation), from the same printed steps.
 
-The FMU is a C library of one sample a call, with the functions of the FMI standard around it and the assembly of the
-steps among its sources, so that any C compiler for x86-64 rebuilds it.
+The FMU is a C library of one sample a call, with the functions of the FMI standard around it; any C compiler rebuilds
+it from its sources.
 """
 
-import json
 import re
 import shutil
 import subprocess
@@ -22,7 +21,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lathe_export.c_library import sources
 from lathe_export.c_library.library import Library
-from lathe_export.c_library.object_code import assembly
 from lathe_rc import __version__, extras
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
@@ -32,7 +30,6 @@ with extras.named():
     import fmpy
     from fmpy import validation
 
-_TARGET = "x86-64"
 _PLATFORMS = {2: "linux64", 3: "x86_64-linux"}  # folder of the binary, by version of FMI
 _HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
@@ -42,7 +39,7 @@ _HEADERS = {
 _INTEGERS = {2: [("Integer", "fmi2Integer", 1, 1)], 3: [("UInt8", "fmi3UInt8", 1, 0), ("Int32", "fmi3Int32", 0, 1)]}
 _FLAGS = ("-shared", "-fPIC", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-Wl,-Bsymbolic")
 _DECLARED = re.compile(r"FMI[23]_Export\s+\w+TYPE\s+(\w+);")
-_NO_CODE = re.compile(r"^\s*\.(?:file|ident|cfi_sections|addrsig)\b.*\n", re.MULTILINE)
+_BESIDE = ("main.c", "CMakeLists.txt", "README.md")  # files of a library that an FMU does not need
 
 
 class Variable(NamedTuple):
@@ -146,7 +143,7 @@ def export_fmu(
 
 def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     """Return the text files of an FMU by path."""
-    texts = sources.sources(library, scenario, _TARGET)
+    texts = sources.sources(library, scenario)
     token = sources.identity(library, texts)
     headers = {each: (Path(fmpy.__file__).parent / "c-code" / each).read_text("utf-8") for each in _HEADERS[fmi]}
     made = {
@@ -163,10 +160,7 @@ def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     written = set(re.findall(rf"\bfmi{fmi}\w+", code["fmu.c"])) | _composed(code["fmu.c"], fmi)
     missing = sorted(set(_DECLARED.findall(headers[_HEADERS[fmi][0]])) - written)
     code["unsupported.c"] = _unsupported(missing)
-    code |= {each: texts[each] for each in ("lathe.h", "lathe.c", f"{library.name}.h", f"{library.name}.c")}
-    code["words.c"] = _words(library)
-    for part in library.parts:
-        code[f"{part.stage.name}_step.c"] = _in_c(assembly(part.stage.native(), part.symbol, _TARGET))
+    code |= {name: text for name, text in texts.items() if name not in _BESIDE}
     compiled = [each for each in code if each.endswith(".c")]
     found = {f"sources/{each}": text for each, text in (code | headers).items()}
     if fmi == 3:
@@ -191,25 +185,6 @@ def _unsupported(names: Sequence[str]) -> str:
             f'__attribute__((visibility("default"))) {kind}{name}(void);\n{kind}{name}(void) {{ return {value}; }}'
         )
     return "\n".join(lines) + "\n"
-
-
-def _words(library: Library) -> str:
-    """Return the words of the block at the start that are not 0, as C."""
-    texts = [f"{word:#x}u" for word in sources.words(library).tolist()]
-    listed = ",\n    ".join(", ".join(texts[k : k + 8]) for k in range(0, len(texts), 8))
-    name = f"const uint64_t {library.name}_words[]"
-    return (
-        "#include <stdint.h>\n\n/* The block before sample 0, see lathe_init. */\n"
-        f"extern {name};\n{name} = {{\n    {listed or '0'}\n}};\n"
-    )
-
-
-def _in_c(text: str) -> str:
-    """Return assembly as a C file, which every build tool for C compiles."""
-    lines = [line for line in _NO_CODE.sub("", text).splitlines() if line.strip()]
-    quoted = [json.dumps(f"{line}\n") for line in (*lines, "\t.text")]
-    head = "/* The step as LLVM has compiled it: assembly of x86-64. */\n__asm__(\n    "
-    return head + "\n    ".join(quoted) + ");\n"
 
 
 # ---- descriptions --------------------------------------------------------------------------------------------------

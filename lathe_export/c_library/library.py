@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lathe_export.c_library.memory_image import MemoryImage
-from lathe_export.c_library.object_code import temporary_arrays
+from lathe_export.c_library.printer import printed
 from lathe_rc import messages
 from lathe_rc.blocks.columns import units
 from lathe_rc.cell import events
@@ -31,7 +31,6 @@ from lathe_rc.signals.noise import NormalStream
 
 _HEAD = 256  # [B] of the block for the position in the run, see lathe.c
 _LEAST = 512  # elements of a temporary array that any step may take
-_ARRAY_HEAD = 128  # [B] of a temporary array beside its elements
 _HUGE = 1e300  # of a parameter without a limit
 _CLOSE, _HALVINGS = 1e-3, 60  # relative accuracy of the limits that follow from checks, and steps of their search
 _STROKE = 1.0  # [m] bound on displacements of the tool and their commands
@@ -116,6 +115,8 @@ class Part:
     Attributes:
         stage: the stage, before its first sample.
         symbol: name of its function.
+        code: the function in C.
+        arrays: number of places in it that make a temporary array.
         memory, table: offsets of its memory and its address table in the block [B].
         floats: number of float64 inputs.
         reads: tape and delay of each entry of the address table after the first; tape -1: none.
@@ -124,6 +125,8 @@ class Part:
 
     stage: Stage
     symbol: str
+    code: str
+    arrays: int
     memory: int
     table: int
     floats: int
@@ -214,11 +217,11 @@ class Library:
                 if node not in self.nodes or parameter not in type(known[node].shared).rows():
                     raise InputError(f"--tune {name}; allowed: NODE.PARAM of {', '.join(sorted(self.nodes))}")
                 raise InputError(f"--tune {name}: the step does not store it as it is; allowed: export once more")
-        arrays = max(temporary_arrays(part.stage.native()) for part in self.parts)
+        arrays = max(part.arrays for part in self.parts)
         self.held = self._append(np.zeros(8 * len(self.outputs), np.uint8))
         self.image = np.concatenate(self._images)
         self.room = self._end
-        self.size = self.room + (arrays + 1) * (_ARRAY_HEAD + 8 * max(self.block, _LEAST))
+        self.size = self.room + (arrays + 1) * 8 * max(self.block, _LEAST)
 
     # ---- checks -------------------------------------------------------------------------------------
 
@@ -342,7 +345,9 @@ class Library:
         symbol = f"{self.name}_{len(self.parts)}_{stage.kind}"
         outputs = [signal.tape for signal in self.outputs]
         written = [outputs.index(tape) for tape in writes]
-        self.parts.append(Part(stage, symbol, memory, table, step.table.floats, reads, written))
+        title = f"The step of {stage.name}, printed by lathe export c from its kernels."
+        code = printed(stage, symbol, title)
+        self.parts.append(Part(stage, symbol, *code, memory, table, step.table.floats, reads, written))
 
     # ---- parameters ---------------------------------------------------------------------------------
 

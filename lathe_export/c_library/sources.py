@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a C library: header, tables, objects, an example that checks it, CMake file and README."""
+"""Files of a C library: headers, tables, steps, an example that checks it, CMake file and README."""
 
 import ctypes
 import hashlib
@@ -18,16 +18,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numba.np.random._constants import fi_double, ki_double, wi_double
 
 from lathe_export.c_library.library import Library, Parameter, Signal
-from lathe_export.c_library.object_code import TARGETS, constant_bytes, object_code
 from lathe_export.c_library.reference import Reference
 from lathe_rc import __version__
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.jit import SOURCES
 
-_IMAGE = "_image"  # object with the block at the start; no name of a node begins like this
 _GAP = 4  # zero words that are stored, so that there are fewer runs
 _OF_US = re.compile(r"`(lathe_rc\.[a-z_.]+)`")
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
@@ -48,15 +45,15 @@ stdio stdlib stdnoreturn string tgmath threads time uchar unistd wchar wctype al
 rebuild_cache fmu unsupported words
 """
 _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
+KERNELS = "kernels.h"
 
 
-def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
+def sources(library: Library, scenario: str) -> dict[str, str]:
     """Return the text files of a library by name.
 
     Args:
         library: the library.
         scenario: name of the scenario, for the comments.
-        target: processor of the objects, for the comments (see `lathe_export.c_library.object_code.TARGETS`).
     """
     runs = _runs(library.image.view(np.uint64))
     made: dict[str, Any] = {
@@ -64,10 +61,8 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
         "upper": library.name.upper(),
         "nodes": ", ".join(part.stage.name for part in library.parts),
         "scenario": scenario,
-        "target": target,
-        "compiler": TARGETS[target].compiler,
         "version": __version__,
-        "objects": [*(part.stage.name for part in library.parts), _IMAGE],
+        "steps": [f"{part.stage.name}_step.c" for part in library.parts],
         "runs": [(8 * begin, end - begin) for begin, end in runs],
         "tapes": [(tape.offset, tape.bytes, tape.length) for tape in library.tapes],
         "streams": [(stream.state, stream.values, stream.used) for stream in library.streams],
@@ -80,16 +75,28 @@ def sources(library: Library, scenario: str, target: str) -> dict[str, str]:
         "formulas": list(_formulas(part.stage for part in library.parts)),
         "identity": "",
     }
-    found = {}
+    found = {KERNELS: (_TEMPLATE_FOLDER / "c_library" / KERNELS).read_text("utf-8")}
     for name in _FIXED:
         found[name] = _TEMPLATES.get_template(f"{name}.j2").render(made)
     found[f"{library.name}.h"] = _TEMPLATES.get_template("NAME.h.j2").render(made)
     tables = _TEMPLATES.get_template("NAME.c.j2")
-    steps = "".join(part.stage.native().name for part in library.parts)
-    told = hashlib.sha256(f"{tables.render(made)}{steps}{SOURCES}".encode() + library.image.tobytes())
+    steps = {f"{part.stage.name}_step.c": part.code for part in library.parts}
+    told = hashlib.sha256(f"{tables.render(made)}{''.join(steps.values())}".encode() + library.image.tobytes())
     made["identity"] = f"0x{told.hexdigest()[:16]}"
     found[f"{library.name}.c"] = tables.render(made)
-    return found
+    return found | steps | {f"{library.name}_state.c": _state(library)}
+
+
+def _state(library: Library) -> str:
+    """Return the words of the block before the first sample that are not 0, as C."""
+    found = library.image.view(np.uint64)
+    words = np.concatenate([found[begin:end] for begin, end in _runs(found)])
+    name = f"const uint64_t {library.name}_words[]"
+    listed = _listed(f"{word:#x}u" for word in words.tolist()) or "0"
+    return (
+        "/* SPDX-License-Identifier: Apache-2.0\n *\n * The block before sample 0, see lathe_init. */\n"
+        f"#include <stdint.h>\n\nextern {name};\n{name} = {{\n    {listed}\n}};\n"
+    )
 
 
 _KEPT = (
@@ -98,22 +105,9 @@ _KEPT = (
 )  # fmt: skip
 
 
-def words(library: Library) -> np.ndarray:
-    """Return the words of the block before the first sample that are stored, shape (n,), uint64."""
-    found = library.image.view(np.uint64)
-    return np.concatenate([found[begin:end] for begin, end in _runs(found)])
-
-
 def identity(library: Library, texts: Mapping[str, str]) -> str:
     """Return the hash of a library's tables and state, from the files that `sources` returns."""
     return hashlib.sha256(texts[f"{library.name}.c"].encode() + library.image.tobytes()).hexdigest()
-
-
-def objects(library: Library, target: str) -> dict[str, bytes]:
-    """Return the object files of a library by name: its stages, and the words of the block that are not 0."""
-    content = words(library).tobytes()
-    steps = {part.stage.name: object_code(part.stage.native(), part.symbol, target) for part in library.parts}
-    return {**steps, _IMAGE: constant_bytes(content, f"{library.name}_words", target)}
 
 
 @dataclass(frozen=True)
@@ -163,7 +157,6 @@ def export_nodes(
     place: Path | None = None,
     *,
     name: str | None = None,
-    target: str = "x86-64",
     block: int | None = None,
     tune: Collection[str] = (),
     samples: int = 65536,
@@ -175,30 +168,27 @@ def export_nodes(
         nodes: names of the stages; none: all of them.
         place: folder to make; None: the name with ``-c``, in the current folder.
         name: name of the library; None: that of the only node or of the scenario.
-        target: one of `lathe_export.c_library.object_code.TARGETS`.
         block: largest number of samples in a call; None: the block size of the scenario.
         tune: see `lathe_export.c_library.library.Library`.
         samples: length of the reference [sample].
 
     Raises:
         InputError: the folder exists, the name is no identifier, or as for `lathe_export.c_library.library.Library`.
-        LatheError: a step needs more than libm, or the folder cannot be written.
+        LatheError: a step cannot be printed as C, or the folder cannot be written.
     """
     library = library_of(scenario, nodes, name, block, tune)
     name = library.name
     place = place or Path(f"{name}-c")
     if place.exists() or not place.absolute().parent.is_dir():
         raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
-    texts, made = sources(library, scenario.name, target), objects(library, target)
+    texts = sources(library, scenario.name)
     reference = Reference(library, Cell(scenario.nodes), samples)
     try:
         with tempfile.TemporaryDirectory(dir=place.absolute().parent) as made_in:
             new = Path(made_in) / name
-            (new / "objects").mkdir(parents=True)
+            new.mkdir()
             for file, text in texts.items():
                 (new / file).write_text(text, encoding="utf-8")
-            for file, content in made.items():
-                (new / "objects" / f"{file}.o").write_bytes(content)
             reference.write(new / "reference.bin")
             new.rename(place)
     except OSError as error:

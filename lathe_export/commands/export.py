@@ -12,8 +12,6 @@ from lathe_rc.errors import InputError, LossyRunError
 if TYPE_CHECKING:
     from lathe_export.c_library.library import Library
 
-_TARGETS = ("x86-64", "aarch64")  # those of lathe_export.c_library.object_code, whose import takes a second
-
 
 @click.group(cls=options.GroupWithDefault, default="bag")
 def export() -> None:
@@ -62,7 +60,6 @@ def bag(ctx: click.Context, bag: Path, kinds: tuple[str, ...], output: Path | No
 @options.overrides
 @click.option("--name", help="of the library, a C identifier; default: that of the node or, if several, the scenario")
 @click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-c, here")
-@click.option("--target", type=click.Choice(_TARGETS), default="x86-64", show_default=True, help="processor")
 @click.option("--block", type=int, help="most samples in a call, and the delay of fed-back inputs; default: block_size")
 @click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
 @click.option(

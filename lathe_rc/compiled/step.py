@@ -106,6 +106,7 @@ class CompiledStep:
     Attributes:
         name: name of the generated module.
         words: words of the memory (see `lathe_rc.compiled.struct_view.Struct`).
+        view: type of the memory.
         update: updates the layout of the memory (see `lathe_rc.compiled.struct_view.Struct.update`).
     """
 
@@ -117,7 +118,7 @@ class CompiledStep:
         outputs: Sequence[np.dtype[Any]],
     ) -> None:
         layout = Struct(memory)
-        self.words, self.update = layout.words, layout.update
+        self.words, self.update, self.view = layout.words, layout.update, layout.kind
         self._entry = _entry(step, layout.kind, tuple(inputs), tuple(outputs))
         self.name, table = self._entry.name, self._entry.table
         self._places, self._reached, self._fields = table.places, np.zeros(1, np.int64), np.zeros(table.size, np.int64)
@@ -136,14 +137,6 @@ class CompiledStep:
     def table(self) -> AddressTable:
         """Layout of the address table."""
         return self._entry.table
-
-    def intermediate_code(self) -> tuple[str, str]:
-        """Return the name of the function in Numba's optimised LLVM code, and this code.
-
-        Raises:
-            InputError: the function cannot be compiled.
-        """
-        return self._entry.intermediate_code()
 
     def __call__(self, first: int, start: int, fields: Sequence[npt.NDArray[Any]], samples: int) -> tuple[int, int]:
         """Call the step with the arrays of all fields, each of shape (samples,)."""
@@ -191,20 +184,10 @@ class Entry:
     @cached_property
     def address(self) -> int:
         """Address of the function, which is compiled on first use."""
-        return int(self._enter.address)
-
-    @property
-    def _enter(self) -> Any:
         try:
-            return _module(self.name, self._text, self._memory).enter
+            return int(_module(self.name, self._text, self._memory).enter.address)
         except NumbaError as error:
             raise InputError(_cause(str(error))) from error
-
-    def intermediate_code(self) -> tuple[str, str]:
-        """Return the name of the function in Numba's optimised LLVM code, and this code."""
-        enter = self._enter
-        # The code for linking is the whole code, also where the function comes from the cache.
-        return enter.native_name.removeprefix("cfunc."), str(enter._library._get_module_for_linking())  # noqa: SLF001
 
 
 _entry = cache(Entry)  # one entry for all calls with equal arguments

@@ -258,7 +258,8 @@ def observed(
         pass_through(low.command, command + known, low.keep, low.take)
         first, second = derivatives(low.position, low.bandwidth)
         beyond = low.position[STAGES] + m.model[0] * first + m.model[1] * second
-        beyond = inverted(m.rational, LEARNER, beyond, low.position[STAGES], first, second) - low.command[STAGES]
+        beyond = inverted(m.rational, LEARNER, beyond, low.position[STAGES], first, second)
+        beyond -= low.command[STAGES]
         low = m.identifier
         pass_through(low.position, position, low.keep, low.take)
         pass_through(low.command, command, low.keep, low.take)

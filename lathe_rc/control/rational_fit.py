@@ -288,7 +288,8 @@ def safe(m: RationalFitTable, model: Array) -> int:
 @kernel
 def better(m: RationalFitTable, model: Array, present: Array) -> bool:
     """Return whether a ``model`` errs less than the ``present`` one in the revolution that has ended."""
-    return bool(_error(m.fresh, _scale(m, 1, model)) < _BETTER * _error(m.fresh, _scale(m, 0, present)))
+    new = _error(m.fresh, _scale(m, 1, model))
+    return bool(new < _BETTER * _error(m.fresh, _scale(m, 0, present)))
 
 
 @kernel

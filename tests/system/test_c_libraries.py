@@ -106,7 +106,7 @@ def test_the_address_sanitizer_finds_nothing(tmp_path):
 )
 def test_64_bit_arm_has_the_bits_of_the_engine(name, nodes, tmp_path):
     """Cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
-    exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", target="aarch64", samples=20_000)
+    exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", samples=20_000)
     told(exported, "qemu-aarch64", built(exported.place, "-static", compiler="aarch64-linux-gnu-gcc"))
 
 
