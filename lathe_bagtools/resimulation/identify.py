@@ -84,7 +84,8 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
         missing += [f"its position: {recorded.lacks(names['state'], messages.STATE)}"] if position is None else []
         raise InputError(
             f"{recorded.path}: {node} cannot be identified without {'; nor without '.join(missing)}; the bag has "
-            f"{recorded.holdings()}; leave --identify out and give the drive's parameters with --scenario FILE"
+            f"{recorded.holdings()}; leave --identify out and give the drive's parameters with --scenario FILE (lathe "
+            f"fit drive {recorded.path} --column ... finds them in messages of any type)"
         )
     topic, field = position
     assert topic is not None, "one of the two is there"

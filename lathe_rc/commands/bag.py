@@ -20,7 +20,7 @@ from lathe_rc.bag.reading.source import Source, files_of, name_of
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
-from lathe_rc.commands import lossy, options, tables
+from lathe_rc.commands import lossy, measured, options, tables
 from lathe_rc.commands.tachogram import make as make_tachogram
 from lathe_rc.errors import InputError, LatheError, LossyRunError, shown
 from lathe_rc.judge import part
@@ -286,11 +286,14 @@ def copy_bags(
     help="greatest distance of the file's lines from a recorded speed [rpm]",
 )
 @click.option("--topic", default="", help="of the encoder; default: the only one")
+@measured.columns
 @options.as_json
-def tachogram(path: Path, output: Path | None, tolerance: float, topic: str, *, as_json: bool) -> None:
+def tachogram(
+    path: Path, output: Path | None, tolerance: float, topic: str, columns: tuple[str, ...], *, as_json: bool
+) -> None:
     """Write the recorded spindle speed as a CSV file for tachogram_file, with as few rows as the tolerance allows."""
     target = output or Path(f"{name_of(path).removesuffix('.mcap')}-tachogram.csv")
-    made = make_tachogram(path, target, tolerance, topic)
+    made = make_tachogram(path, target, tolerance, topic, columns)
     held = f"{made.points} rows for {made.samples} samples of {made.field}"
     text = [f"{held}, within {made.largest:.4g} rpm: {target}"]
     if made.stands_from is not None:

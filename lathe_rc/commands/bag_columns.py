@@ -8,6 +8,7 @@ from lathe_rc import messages
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.blocks import columns
+from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Clock, Mapped, Measurement
@@ -24,6 +25,8 @@ class BagColumns(measurement_file.Source):
     Raises:
         InputError: the path is not a bag.
     """
+
+    has_header = False
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -58,17 +61,26 @@ class BagColumns(measurement_file.Source):
 def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
     """Open a bag as a measurement; without a mapping command and response are those of the coarse drive.
 
-    A mapping of topics that have no blocks reads the messages of any type, resampled.
+    A mapping of topics that have no blocks reads the messages of any type, resampled; with ``time=log`` by their log
+    times.
 
     Raises:
         InputError: the path is not a bag, or lacks a column of the mapping.
     """
     source = BagColumns(path)
-    asked = [found.column for found in mapping.values()]
-    if not source.units or not source.units.keys() >= set(asked):
-        from lathe_rc.commands.message_columns import MessageColumns
+    by_log = mapping.get("time", Mapped("", "")).column == "log"
+    wanted = {quantity: found for quantity, found in mapping.items() if quantity != "time" or not by_log}
+    asked = [found.column for found in wanted.values()]
+    if source.units and source.units.keys() >= set(asked) and not by_log:
+        own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
+        own = {quantity: found for quantity, found in own.items() if found.column in source.units}
+        return Measurement(str(path), source, {**own, **mapping})
 
-        return Measurement(str(path), MessageColumns(path, asked), mapping)
-    own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
-    own = {quantity: found for quantity, found in own.items() if found.column in source.units}
-    return Measurement(str(path), source, {**own, **mapping})
+    from lathe_rc.commands.message_columns import MessageColumns
+
+    others = MessageColumns(path, asked, by_log=by_log)
+    blocks = [column for column in asked if column in source.units]
+    if blocks and (by_log or others.units.keys() & set(asked)):
+        raise InputError(f"{path}: {blocks[0]} is a signal of blocks; allowed: none beside messages or log times")
+    others.units = source.units | others.units
+    return Measurement(str(path), others, wanted)

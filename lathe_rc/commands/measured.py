@@ -18,7 +18,7 @@ columns = click.option(
     "columns",
     multiple=True,
     metavar="QUANTITY=COLUMN[:UNIT]",
-    help="where the file names it otherwise, such as command=u_um:um; repeatable",
+    help="where the file names it otherwise, such as command=u_um:um or response=/joint_states.position[x]; repeatable",
 )
 
 

@@ -53,9 +53,11 @@ class Source(ABC):
 
     Attributes:
         units: unit by column, in the order of the file; empty if the file states none.
+        has_header: whether a user can rename the columns.
     """
 
     units: Mapping[str, str]
+    has_header = True
 
     @abstractmethod
     def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
@@ -184,9 +186,14 @@ class Measurement:
         """Return whether the measurement has a quantity."""
         return quantity in self._columns
 
+    def column(self, quantity: str) -> str:
+        """Return the name of the column of a quantity that the measurement has."""
+        return self._columns[quantity].column
+
     def lacking(self, allowed: str) -> InputError:
         """Return the error for a measurement without the required quantities; ``allowed`` names these."""
         cure = "rename others in the header" + self._or_option("QUANTITY=COLUMN:UNIT")
+        cure = cure if self._source.has_header else "--column QUANTITY=COLUMN[:UNIT] for each"
         return InputError(f"{self.name}: columns {self._listed()}; allowed: {allowed} ({cure})")
 
     def _or_option(self, value: str) -> str:

@@ -113,7 +113,7 @@ def factor(quantity: str, unit: str) -> float | None:
     found = UNITS[quantity].get(_plain(unit))
     if found is None:
         try:
-            found = float(unit)
+            found = float(unit) * UNITS[quantity].get("rad/s", 1.0)
         except ValueError:
             return None
     return found if np.isfinite(found) and found else None
