@@ -11,7 +11,7 @@ from lathe_commission.form_correction import Revolution
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, shown
 from lathe_rc.signals import measurement_file
-from lathe_rc.signals.measurement_file import Mapped
+from lathe_rc.signals.quantities import Mapped
 
 _TURN = 2.0 * np.pi
 _WHOLE = 0.75  # least part of a revolution that a record has to cover

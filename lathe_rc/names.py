@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Name utilities: suggestions for unknown names, and ROS namespaces of cells (``/`` or ``/a/b``)."""
+"""Name utilities: options ``NAME=VALUE``, suggestions for unknown names, namespaces of cells (``/`` or ``/a/b``)."""
 
 import re
 from collections.abc import Iterable
@@ -34,6 +34,28 @@ def instead(name: str, known: Iterable[str], *, listing: str = "") -> str:
     if listing and len(names) > _MOST_LISTED:
         return f"{listing} lists what is allowed"
     return f"allowed: {', '.join(map(shown, names)) or 'none'}"
+
+
+def pairs(option: str, texts: Iterable[str], allowed: str) -> dict[str, str]:
+    """Parse the values ``NAME=VALUE`` of an option into values by name.
+
+    Args:
+        option: name of the option.
+        texts: its values.
+        allowed: description of what is allowed, for the error message.
+
+    Raises:
+        InputError: a text has another form, or a name is given twice.
+    """
+    found: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals and value):
+            raise InputError(f"{option} {text!r}; allowed: {allowed}")
+        if name in found:
+            raise InputError(f"{option} {text!r}: {name} is given twice; allowed: once")
+        found[name] = value
+    return found
 
 
 def checked_namespace(namespace: str) -> str:

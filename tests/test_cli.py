@@ -298,7 +298,7 @@ def test_commands_are_listed_without_being_imported():
     assert not [line for line in text[text.index("Commands:") :] if line.endswith("...")]  # each summary fits
 
 
-def test_a_run_prints_its_object_alone_and_imports_the_stages_that_its_cell_has():
+def test_a_run_prints_its_object_alone_and_imports_what_its_cell_has():
     code = "import sys; from lathe_rc.cli import main; main(standalone_mode=0); print(*sys.modules, file=sys.stderr)"
     words = [sys.executable, "-c", code, "run", "piston", "--revolutions", "1", "--json"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
@@ -309,6 +309,7 @@ def test_a_run_prints_its_object_alone_and_imports_the_stages_that_its_cell_has(
     imported = {module.rpartition(".")[2] for module in modules.split() if module.startswith(begin)}
     assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "form", "tool"}
     assert not imported & {"compound_controller", "cutting_process", "feed_drive", "loaded_drive", "piezo_actuator"}
+    assert not {"lathe_rc.signals.instrument_files", "scipy.io"} & set(modules.split())
 
 
 def test_stages_are_where_their_names_say():

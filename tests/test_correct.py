@@ -19,8 +19,8 @@ from lathe_commission.form_correction import align, correction, evaluate, harmon
 from lathe_rc import cli, harness
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measured_profile import read_csv as read_profile
+from lathe_rc.signals.quantities import parse_columns
 
 TURN = 2 * np.pi
 BLIND = "controller.remap=[]"  # the law learns from the drive's sensor alone
@@ -158,7 +158,7 @@ def test_columns_and_units_of_any_csv_are_mapped(tmp_path, header, given, scale,
     angle = even(360)
     radius = 1e-4 * np.sin(3 * angle)
     path = table(tmp_path / "r.csv", header, (angle * scale[0], radius * scale[1]), separator, comma=separator == ";")
-    (found,) = part_record.read(path, measurement_file.parse_mapping(given))
+    (found,) = part_record.read(path, parse_columns(given))
     assert_allclose(found.angle, angle, atol=1e-8)
     assert_allclose(found.radius, radius, atol=1e-12)
 
@@ -166,7 +166,7 @@ def test_columns_and_units_of_any_csv_are_mapped(tmp_path, header, given, scale,
 def test_revolutions_are_told_apart_by_number_height_or_angle(tmp_path):
     angle = np.degrees(np.tile(even(90), 3))
     number = np.repeat([1.0, 2.0, 3.0], 90)
-    columns = measurement_file.parse_mapping([])
+    columns = parse_columns([])
     going_on = table(tmp_path / "a.csv", "angle_deg,radius_um", (angle + 360 * (number - 1), number))
     anew = table(tmp_path / "b.csv", "angle_deg,radius_um", (angle, number))
     numbered = table(tmp_path / "c.csv", "revolution,angle_deg,radius_um", (number, angle, number))
@@ -209,7 +209,7 @@ def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, s
 def test_a_record_that_cannot_be_used_is_one_line(tmp_path, text, given, said):
     path = tmp_path / "r.csv"
     path.write_text(text)
-    assert_refused(lambda: part_record.read(path, measurement_file.parse_mapping(given)), said)
+    assert_refused(lambda: part_record.read(path, parse_columns(given)), said)
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="x3pio needs Python 3.11")

@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 from lathe_rc.cell import cells_file
 from lathe_rc.signals import measurement_file, tachogram
 from lathe_rc.signals.counts import CsvReader
+from lathe_rc.signals.quantities import Mapped, parse_columns
 
 
 @pytest.mark.parametrize("kind", user_files.KINDS)
@@ -100,11 +101,15 @@ def test_a_long_file_has_the_numbers_of_a_short_one(tmp_path):
 def test_columns_of_cells_are_mapped_to_targets(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("Grenze [µm];Nummer\n2,5;0,7\n3;8\n", encoding="cp1252")
-    columns = cells_file.parse_columns(["tool.tolerance=Grenze [µm]:1e-6"])
+    columns = parse_columns(["tool.tolerance=Grenze [µm]:1e-6"], names=())
     found = cells_file.read(path, ["Nummer"], columns)
     assert found == [{"Nummer": "0,7", "tool.tolerance": 2.5 * 1e-6}, {"Nummer": "8", "tool.tolerance": 3.0 * 1e-6}]
-    for given, said in ((["a=b:c"], r"allowed: TARGET=COLUMN\[:FACTOR\]"), (["=b"], "allowed: TARGET=COLUMN")):
-        assert_refused(lambda given=given: cells_file.parse_columns(given), said)
+    for given, said in (
+        (["a=b:c"], "no unit 'c' of a; allowed: a number"),
+        (["=b"], "allowed: TARGET=COLUMN"),
+        (["a=b", "a=c"], "a is given twice"),
+    ):
+        assert_refused(lambda given=given: parse_columns(given, names=()), said)
     assert_refused(
-        lambda: cells_file.read(path, [], {"a.b": ("c", 1.0)}), r"a.csv: row 1: 'c' is missing \(--column a.b=c\)"
+        lambda: cells_file.read(path, [], {"a.b": Mapped("c")}), r"a.csv: row 1: 'c' is missing \(--column a.b=c\)"
     )

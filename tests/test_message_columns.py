@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy import signal
 
 from lathe_rc.cli import main
+from lathe_rc.commands import measured
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 COMMANDS, STATES = "std_msgs/msg/Float64MultiArray", "sensor_msgs/msg/JointState"
@@ -89,23 +90,25 @@ def test_what_cannot_be_resampled_is_refused_in_one_line(changes, columns, messa
 
 
 @pytest.mark.parametrize(("changes", "more"), [({"stamped": False}, []), ({"late": 10**11}, ["time=log"])])
-def test_without_header_times_or_if_asked_for_those_of_the_log_are_used(changes, more, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    record(tmp_path / "rc2", samples=6000, **changes)
-    done = fit(tmp_path / "rc2", COMMAND, RESPONSE, *more)
-    assert done.exit_code == 0, done.output
-    assert "/joint_states.position[x] by log time every 1 ms (uneven by up to 0.1 ms)\n" in done.stderr
+def test_without_header_times_or_if_asked_for_those_of_the_log_are_used(changes, more, tmp_path, capsys):
+    record(tmp_path / "rc2", samples=2000, **changes)
+    found = measured.opened(tmp_path / "rc2", [COMMAND, RESPONSE, *more])
+    assert found.clock(None, "command", "response").step == pytest.approx(1e-3, rel=1e-4)
+    assert "position[x] by log time every 1.00003 ms (uneven by up to 0.1 ms)\n" in capsys.readouterr().err
 
 
-def test_slower_and_later_messages_are_resampled_and_said(tmp_path, monkeypatch):
+def test_slower_and_later_messages_are_resampled_and_said(tmp_path, capsys):
     """The slower column gives the interval; the warning says from which frequency on the faster one is aliased."""
-    monkeypatch.chdir(tmp_path)
-    record(tmp_path / "rc2", keep=lambda k: k % 4 == 0 and k >= 2000, samples=8000)
-    done = fit(tmp_path / "rc2", COMMAND, RESPONSE)
-    assert done.exit_code == 0, done.output
-    assert "resampled every 4 ms over 5.996 s" in done.stderr
-    assert "every 1 ms (uneven by up to 0 ms, without the first 2 s" in done.stderr
-    assert "/controller/commands.data[0] is resampled to 4 ms: its content above 125 Hz" in done.stderr
+    record(tmp_path / "rc2", samples=2000, keep=lambda k: k % 4 == 0 and k >= 1000)
+    found = measured.opened(tmp_path / "rc2", [COMMAND, "response=/joint_states.velocity[x]"])
+    command, response = found.read("command", "response")
+    assert found.clock(None, "command", "response").step == pytest.approx(4e-3)
+    assert command.size == response.size == 250
+    assert np.all(response == 100.0)
+    told = capsys.readouterr().err
+    assert "resampled every 4 ms over 0.996 s" in told
+    assert "every 1 ms (uneven by up to 0 ms, without the first 1 s and the last 0.003 s)" in told
+    assert "/controller/commands.data[0] is resampled to 4 ms: its content above 125 Hz" in told
 
 
 def test_a_tachogram_is_made_of_the_velocity_of_a_joint(tmp_path, monkeypatch):

@@ -29,6 +29,7 @@ from lathe_rc.cli import main
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.errors import InputError
 from lathe_rc.signals import measurement_file
+from lathe_rc.signals.quantities import parse_columns
 
 TRUE = ModalDrive(
     TURN * 165.0, 0.8, 7 * STEP, (TURN * 905.0, TURN * 1620.0), (0.02, 0.018), (0.012, -0.02)
@@ -452,7 +453,7 @@ def test_formats_are_read_as_their_libraries_write_them(tmp_path, kind, columns)
     random = np.random.default_rng(9)
     time, command, response = np.arange(50) * STEP, *(1e-5 * random.normal(size=(2, 50)))
     path = written(tmp_path, kind, time, command, response)
-    found = measurement_file.read(path, measurement_file.parse_mapping(columns))
+    found = measurement_file.read(path, parse_columns(columns))
     for values, wanted in zip(found.read("command", "response"), (command, response), strict=True):
         assert_allclose(values, wanted, rtol=1e-12)
     assert found.clock(None, "command", "response").step == pytest.approx(STEP)
@@ -495,7 +496,7 @@ def test_columns_that_begin_at_different_times_are_refused(tmp_path, kind, late,
     """A record of a response, and pairs of command and displacement without a time; columns of one start are read."""
     suffix = {"mat": ("u.u", "x.x")}.get(kind, ("u", "x"))
     for response in ("response", "displacement"):
-        columns = measurement_file.parse_mapping([f"command={suffix[0]}:m", f"{response}={suffix[1]}:m"])
+        columns = parse_columns([f"command={suffix[0]}:m", f"{response}={suffix[1]}:m"])
         together = measurement_file.read(starting(tmp_path, kind, 0.0, first), columns)
         assert len(together.read("command", response)) == 2
         assert together.clock(None, "command", response).step == pytest.approx(STEP)

@@ -19,6 +19,7 @@ from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError
+from lathe_rc.names import pairs
 
 _DIFFERENT = 1  # exit code if the results of an unchanged run differ from the recording
 _UNITS = {"natural_frequency": ("rad/s", 1.0), "damping": ("1", 1.0), "delay": ("ms", 1e3)}  # unit and factor
@@ -78,12 +79,11 @@ def _drive_summary(drive: Identified) -> dict[str, Any]:
 
 
 def _topics(given: Sequence[str]) -> dict[str, str]:
-    found = {}
-    for text in given:
-        name, equals, topic = text.partition("=")
-        if not equals or not name or not topic.startswith("/"):
-            raise InputError(f"--topic {text!r}; allowed: NAME=/TOPIC, like encoder=/spindle/encoder")
-        found[name.lstrip("/")] = topic
+    allowed = "NAME=/TOPIC, like encoder=/spindle/encoder"
+    found = pairs("--topic", [text.lstrip("/") for text in given], allowed)
+    for name, topic in found.items():
+        if not topic.startswith("/"):
+            raise InputError(f"--topic {name}={topic}; allowed: {allowed}")
     return found
 
 

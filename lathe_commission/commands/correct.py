@@ -24,8 +24,8 @@ from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.judge import part
-from lathe_rc.signals import measurement_file
 from lathe_rc.signals.profile import Profile
+from lathe_rc.signals.quantities import parse_columns
 from lathe_rc.stages.tool.form import FormParameters
 
 _TURN = 2.0 * np.pi
@@ -148,7 +148,7 @@ def _read(
     topic: str | None,
 ) -> _Read:
     """Read the records and turn them to the part's angle; angles in degrees."""
-    mapping = measurement_file.parse_mapping(columns)
+    mapping = parse_columns(columns)
     if search is None:
         search = 180.0 if offset is None else 0.0
     around, within, sense = np.radians(offset or 0.0), np.radians(search), -1.0 if reverse else 1.0

@@ -15,6 +15,7 @@ from lathe_explore.commands import options as many
 from lathe_rc import extras
 from lathe_rc.commands import completers, options
 from lathe_rc.errors import InputError, LatheError
+from lathe_rc.names import pairs
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -45,19 +46,6 @@ def sweep() -> None:
     """Compute many variations of a scenario into a table: lathe sweep SCENARIO --vary NODE.PARAM=LOW:HIGH:COUNT."""
 
 
-def pairs(option: str, texts: Sequence[str], allowed: str) -> dict[str, str]:
-    """Parse strings ``TARGET=VALUE`` into values by target."""
-    found: dict[str, str] = {}
-    for text in texts:
-        target, equals, value = (part.strip() for part in text.partition("="))
-        if not (target and equals and value):
-            raise InputError(f"{option} {text!r}; allowed: {allowed}")
-        if target in found:
-            raise InputError(f"{option} {text!r}: {target} is given twice; allowed: once")
-        found[target] = value
-    return found
-
-
 def space_of(
     vary: Sequence[str],
     draw: Sequence[str],
@@ -71,6 +59,7 @@ def space_of(
     """Return the space given by options; with a sample, ranges without a count are sampled."""
     from lathe_explore.sweep.space import Space
     from lathe_rc.cell import cells_file
+    from lathe_rc.signals.quantities import parse_columns
 
     varied = pairs("--vary", vary, "NODE.PARAM=LOW:HIGH:COUNT, =LOW:HIGH:COUNT:log, =A,B,C, or =LOW:HIGH of a --sample")
     drawn = pairs("--draw", draw, "NODE.PARAM=normal:DEVIATION, =normal:MEAN:DEVIATION or =uniform:LOW:HIGH")
@@ -87,7 +76,7 @@ def space_of(
         sample=sample,
         sample_seed=sample_seed,
         seeds=seeds,
-        given=cells_file.read(cells, carry, cells_file.parse_columns(columns)) if cells else (),
+        given=cells_file.read(cells, carry, parse_columns(columns, names=())) if cells else (),
         carried=carry,
     )
 

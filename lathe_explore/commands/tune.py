@@ -11,10 +11,11 @@ import click
 
 import lathe_explore
 from lathe_explore.commands import options as many
-from lathe_explore.commands.sweep import check_crew, pairs, space_of
+from lathe_explore.commands.sweep import check_crew, space_of
 from lathe_explore.sweep import BATCH, NUMBERS, SAMPLERS
 from lathe_rc.commands import options
 from lathe_rc.errors import InputError
+from lathe_rc.names import pairs
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

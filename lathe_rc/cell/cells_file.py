@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells given by a file, each with values of some parameters."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError
+from lathe_rc.signals.quantities import Mapped
 from lathe_rc.signals.table import Table, read_text
 
 
 def read(
-    path: Path, carried: Collection[str] = (), columns: Mapping[str, tuple[str, float]] | None = None
+    path: Path, carried: Collection[str] = (), columns: Mapping[str, Mapped] | None = None
 ) -> list[dict[str, Value]]:
     """Read cells from a file: CSV with targets in its first row, or a YAML list of ``{TARGET: VALUE, ...}``.
 
     Args:
         path: the file.
         carried: names of columns that are no targets; their values stay text.
-        columns: names of columns in the file and factors of their numbers, by target.
+        columns: columns that are named otherwise in the file, by target; their units are factors.
 
     Raises:
         InputError: the file cannot be read, is in neither format, has no cells, or lacks a column.
@@ -27,34 +28,15 @@ def read(
     if not cells:
         raise InputError(f"{path}: no cells; allowed: one or more rows below a header of targets")
     for number, cell in enumerate(cells, 1):
-        for target, (name, factor) in (columns or {}).items():
+        for target, (name, unit) in (columns or {}).items():
             value = cell.pop(name, None)
             if target in cell:
                 raise InputError(f"{path}: a column {target} beside --column {target}={name}; allowed: one of them")
-            if value is None or (factor != 1.0 and not isinstance(value, int | float)):
+            if value is None or (unit and not isinstance(value, int | float)):
                 reason = f"is {value!r}; allowed: a number" if name in cells[0] else "is missing"
                 raise InputError(f"{path}: row {number}: {name!r} {reason} (--column {target}={name})")
-            cell[target] = value * factor if isinstance(value, int | float) and factor != 1.0 else value
+            cell[target] = value * float(unit) if unit and isinstance(value, int | float) else value
     return cells
-
-
-def parse_columns(given: Iterable[str]) -> dict[str, tuple[str, float]]:
-    """Parse ``TARGET=COLUMN[:FACTOR]``.
-
-    Raises:
-        InputError: the text has another form, or the factor is no number.
-    """
-    found = {}
-    for text in given:
-        target, _, column = text.partition("=")
-        name, _, factor = column.rpartition(":") if ":" in column else (column, "", "1")
-        try:
-            found[target] = name, float(factor)
-        except ValueError:
-            name = ""
-        if not target or not name:
-            raise InputError(f"--column {text!r}; allowed: TARGET=COLUMN[:FACTOR], FACTOR a number")
-    return found
 
 
 def _of_yaml(path: Path, carried: Collection[str]) -> list[dict[str, Value]]:

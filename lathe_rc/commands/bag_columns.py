@@ -10,13 +10,15 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.blocks import columns
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples
-from lathe_rc.signals import measurement_file
-from lathe_rc.signals.measurement_file import Clock, Mapped, Measurement
+from lathe_rc.signals import measurement_source
+from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_source import Clock
+from lathe_rc.signals.quantities import Mapped
 
 _DRIVE = {"command": "coarse/command.position", "response": "coarse/state.measured_position"}
 
 
-class BagColumns(measurement_file.Source):
+class BagColumns(measurement_source.Source):
     """Columns of a bag, for `lathe_rc.signals.measurement_file.Measurement`.
 
     Args:
@@ -68,11 +70,11 @@ def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
         InputError: the path is not a bag, or lacks a column of the mapping.
     """
     source = BagColumns(path)
-    by_log = mapping.get("time", Mapped("", "")).column == "log"
+    by_log = mapping.get("time", Mapped("")).column == "log"
     wanted = {quantity: found for quantity, found in mapping.items() if quantity != "time" or not by_log}
     asked = [found.column for found in wanted.values()]
     if source.units and source.units.keys() >= set(asked) and not by_log:
-        own = {quantity: Mapped(f"{source.namespace}/{column}", "") for quantity, column in _DRIVE.items()}
+        own = {quantity: Mapped(f"{source.namespace}/{column}") for quantity, column in _DRIVE.items()}
         own = {quantity: found for quantity, found in own.items() if found.column in source.units}
         return Measurement(str(path), source, {**own, **mapping})
 

@@ -9,6 +9,7 @@ import click
 from lathe_rc.commands import lossy, options
 from lathe_rc.signals import measurement_file
 from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.quantities import parse_columns
 
 _BAGS = (".mcap", ".db3", ".zstd")
 
@@ -44,7 +45,7 @@ def opened(path: Path, given: Sequence[str]) -> Measurement:
         InputError: the path has no measurement, or an option names no column of it.
         LatheError: the package that reads the format is not installed.
     """
-    mapping = measurement_file.parse_mapping(given)
+    mapping = parse_columns(given)
     if is_bag(path):
         lossy.tell([path])
         from lathe_rc.commands import bag_columns

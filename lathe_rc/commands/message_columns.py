@@ -19,8 +19,8 @@ from lathe_rc.bag.reading.source import Source
 from lathe_rc.blocks.columns import TEXT, flattened
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
-from lathe_rc.signals import measurement_file
-from lathe_rc.signals.measurement_file import Clock
+from lathe_rc.signals import measurement_source
+from lathe_rc.signals.measurement_source import Clock
 
 _SI = "1"  # unit: ROS messages have SI units (REP 103)
 _GAP = 10.0  # intervals between messages, over which nothing is known
@@ -35,7 +35,7 @@ class _Series(NamedTuple):
     clock: str
 
 
-class MessageColumns(measurement_file.Source):
+class MessageColumns(measurement_source.Source):
     """Columns of messages; those that are asked for are resampled, linear between messages, which is said on stderr.
 
     Args:

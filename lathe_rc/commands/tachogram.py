@@ -133,7 +133,5 @@ def _chosen(source: Source, topic: str) -> str:
     if not topic and not found:
         raise measured.opened(source.path, ()).lacking("an encoder, or speed")
     if not topic and len(found) != 1:
-        raise InputError(
-            f"{source.path}: {len(found)} encoders ({', '.join(found)}); allowed: one, or --topic TOPIC"
-        )
+        raise InputError(f"{source.path}: {len(found)} encoders ({', '.join(found)}); allowed: one, or --topic TOPIC")
     return topic or found[0]

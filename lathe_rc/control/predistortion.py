@@ -182,7 +182,7 @@ class Predistortion:
         Raises:
             InputError: the file is missing or malformed, or its values are not a valid path.
         """
-        from lathe_rc.signals import measurement_file  # with SciPy, which a cell without files need not import
+        from lathe_rc.signals import measurement_file  # which a cell without files need not import
 
         heights, offsets = measurement_file.read(path).read("height", "offset")
         try:

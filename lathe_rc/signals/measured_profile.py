@@ -10,7 +10,6 @@ import scipy
 
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-from lathe_rc.signals import measurement_file
 
 _TURN = 2.0 * np.pi
 _FLATTEST = 0.01  # [µm] smallest peak-to-valley height other than 0: no lathe turns a flatter form
@@ -144,6 +143,8 @@ def read_csv(path: Path) -> Measured:
 @lru_cache(maxsize=8)
 def _measured(path: Path, _: tuple[int, int, int] | None) -> Measured:
     """Read a profile; cached, since reading takes longer than some cells run."""
+    from lathe_rc.signals import measurement_file  # which a cell without files need not import
+
     found = measurement_file.read(path)
     if "revolution" in found:
         raise InputError(f"{path}: a column of revolutions; allowed: one revolution, or one for each height")

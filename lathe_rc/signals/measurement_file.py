@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements by quantity, in SI units, from text tables, Parquet, MATLAB, TDMS and MDF files.
+"""Measurements by quantity, in SI units, from text tables and files of instruments.
 
 All readers of numbers use one format of columns, see `lathe_rc.signals.quantities`. Without a unit in its name a column
 has the unit that the file states for it, otherwise the SI unit; lengths along a part need a unit. A mapping of columns
@@ -8,20 +8,18 @@ gives names and units that differ.
 
 import shlex
 import warnings
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
-from lathe_rc import extras
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.signals.quantities import UNITS, factor, is_decibel, is_quantity, rank, unit_of
+from lathe_rc.signals.measurement_source import Clock, Source, even_clock
+from lathe_rc.signals.quantities import UNITS, Mapped, factor, is_decibel, is_quantity, rank, unit_of
 from lathe_rc.signals.table import Table
 
 _SAME_START = 1e-8  # [s] two columns that begin within it begin together
@@ -39,99 +37,6 @@ def _readable(what: str) -> Iterator[None]:
         raise
     except Exception as error:  # noqa: BLE001 - the libraries can raise any exception on damaged bytes
         raise InputError(f"{what} ({shown(error)})") from None
-
-
-class Clock(NamedTuple):
-    """Sampling of a column of a file that states it: time of the first value and step [s]."""
-
-    start: float
-    step: float
-
-
-class Source(ABC):
-    """Opened measurement: columns by name.
-
-    Attributes:
-        units: unit by column, in the order of the file; empty if the file states none.
-        has_header: whether a user can rename the columns.
-    """
-
-    units: Mapping[str, str]
-    has_header = True
-
-    @abstractmethod
-    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        """Return columns by name, shape (n,) each; ``gaps``: those in which a missing value is NaN."""
-
-    def since_first(self, name: str) -> Array:
-        """Return a column less its first value, shape (n,)."""
-        values = self.read([name])[name]
-        return np.asarray(values - values[:1], np.float64)
-
-    def clock(self, name: str) -> Clock | None:
-        """Return the sampling of a column; None if the file does not state it."""
-        return None
-
-    def start(self, name: str) -> float | None:
-        """Return the time of the first value of a column [s]; None if the file does not state it."""
-        clock = self.clock(name)
-        return clock.start if clock else None
-
-
-class Mapped(NamedTuple):
-    """Column of a quantity as a user names it; an empty unit: that of the column."""
-
-    column: str
-    unit: str
-
-
-def parse_mapping(given: Iterable[str]) -> dict[str, Mapped]:
-    """Parse ``QUANTITY=COLUMN[:UNIT]``; the unit may be a number, the SI value of 1.
-
-    Raises:
-        InputError: the text has another form, the quantity or the unit is unknown, or a quantity is given twice.
-    """
-    mapping: dict[str, Mapped] = {}
-    for text in given:
-        quantity, equals, column = text.partition("=")
-        if not equals or quantity not in UNITS or not column:
-            raise InputError(f"--column {text!r}; allowed: QUANTITY=COLUMN[:UNIT], QUANTITY of {', '.join(UNITS)}")
-        if quantity in mapping:
-            raise InputError(f"--column {text!r}: {quantity} is given twice; allowed: once")
-        name, colon, unit = column.rpartition(":")
-        if not colon:
-            name, unit = column, ""
-        elif factor(quantity, unit) is None:
-            known = ", ".join(unit for unit in UNITS[quantity] if unit)
-            raise InputError(
-                f"--column {text!r}: no unit {unit!r} of {quantity}; allowed: {known}, or a number, the SI value of 1"
-            )
-        mapping[quantity] = Mapped(name, unit)
-    return mapping
-
-
-def even_clock(time: Array, what: str, cure: str = "resample the record") -> Clock:
-    """Return start and step of evenly spaced times.
-
-    Args:
-        time: times [s], shape (n,), n at least 2.
-        what: description of the times for error messages.
-        cure: remedy for times that are not even.
-
-    Raises:
-        InputError: the times are not even.
-    """
-    if time.size < 2:
-        raise InputError(f"{what}: {time.size} samples; allowed: 2 or more")
-    step = float(time[-1] - time[0]) / (time.size - 1)
-    off = np.abs(time - (time[0] + step * np.arange(time.size)))
-    if step <= 0.0 or off.max() > 0.1 * step:
-        at = int(off.argmax())
-        raise InputError(
-            f"{what}: not in even steps, {time[at]:.9g} s at sample {at} is {off[at]:.3g} s off; allowed: even steps "
-            f"({cure})"
-        )
-    return Clock(float(time[0]), step)
 
 
 def check_rising(time: Array, path: Path) -> None:
@@ -324,9 +229,6 @@ class Measurement:
         return stated[0][1]
 
 
-# --- formats
-
-
 class _Text(Source):
     """Text table (see `lathe_rc.signals.table`)."""
 
@@ -342,144 +244,14 @@ class _Text(Source):
         return self._table.numbers([name], since_first=name)[name]
 
 
-class _Parquet(Source):
-    """Parquet file; the metadata ``unit`` of a field is the unit of the column."""
-
-    def __init__(self, path: Path) -> None:
-        from pyarrow import parquet
-
-        self._file = parquet.ParquetFile(path)
-        schema = self._file.schema_arrow
-        self.units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
-
-    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        table = self._file.read(columns=list(names))
-        return {name: table.column(name).to_numpy() for name in names}
-
-
-class _Mat(Source):
-    """MATLAB file; a field of a structure is ``NAME.FIELD``; a field ``time`` states the sampling of its structure."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            variables = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
-        except NotImplementedError:
-            raise InputError(f"{path}: MATLAB 7.3; allowed: up to 7 (save it with '-v7' in MATLAB)") from None
-        self._arrays: dict[str, npt.NDArray[Any]] = {}
-        for name, value in variables.items():
-            if not name.startswith("__"):
-                self._collect(name, value)
-        self.units = dict.fromkeys(self._arrays, "")
-
-    def _collect(self, name: str, value: Any) -> None:
-        if hasattr(value, "_fieldnames"):
-            for field in value._fieldnames:  # noqa: SLF001 - the documented way to list the fields
-                self._collect(f"{name}.{field}", getattr(value, field))
-        elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiuc":
-            self._arrays[name] = value
-
-    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        return {name: self._arrays[name] for name in names}
-
-    def _time(self, name: str) -> Array | None:
-        """Return the times beside a field [s]; None if there are none."""
-        structure = name
-        while structure := structure.rpartition(".")[0]:
-            for field, time in self._arrays.items():
-                place, _, last = field.rpartition(".")
-                if place == structure and rank("time", last) and time.size == self._arrays[name].size:
-                    return time * (factor("time", unit_of("time", last) or "") or 1.0)
-        return None
-
-    def clock(self, name: str) -> Clock | None:
-        time = self._time(name)
-        return None if time is None else even_clock(time, f"the time beside {name}")
-
-    def start(self, name: str) -> float | None:
-        time = self._time(name)
-        return None if time is None or not time.size else float(time[0])
-
-
-def _since(start: Any, seconds: int) -> float:
-    """Return the time of a TDMS time stamp after whole seconds since 1904 [s]; of none: that of 1904."""
-    return float(start.seconds - seconds + start.second_fractions / 2**64) if start else float(-seconds)
-
-
-class _Tdms(Source):
-    """TDMS file: ``CHANNEL``, or ``GROUP/CHANNEL`` where the name of the channel alone is not unique."""
-
-    def __init__(self, path: Path) -> None:
-        with extras.named():
-            import nptdms
-
-        self._path = path
-        with nptdms.TdmsFile.read_metadata(path, raw_timestamps=True) as file:
-            channels = [channel for group in file.groups() for channel in group.channels()]
-            names = [channel.name for channel in channels]
-            self._places = {
-                channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}": (
-                    channel.group_name,
-                    channel.name,
-                )
-                for channel in channels
-            }
-            about = dict(zip(self._places, (channel.properties for channel in channels), strict=True))
-        self.units = {name: str(found.get("unit_string", "")) for name, found in about.items()}
-        starts = {name: found["wf_start_time"] for name, found in about.items() if "wf_start_time" in found}
-        newest = max((start.seconds for start in starts.values()), default=0)  # a double resolves times since it
-        self._clocks = {
-            name: Clock(
-                float(found.get("wf_start_offset", 0.0)) + _since(starts.get(name), newest),
-                float(found["wf_increment"]),
-            )
-            for name, found in about.items()
-            if found.get("wf_increment")
-        }
-
-    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        import nptdms
-
-        with nptdms.TdmsFile.open(self._path) as file:
-            return {name: file[group][channel][:] for name in names for group, channel in [self._places[name]]}
-
-    def clock(self, name: str) -> Clock | None:
-        return self._clocks.get(name)
-
-
-class _Mdf(Source):
-    """MDF file (versions 2 to 4): channels by name, the first of each."""
-
-    def __init__(self, path: Path) -> None:
-        with extras.named():
-            import asammdf
-
-        self._file = asammdf.MDF(path)
-        self._places = {
-            name: places[0]
-            for name, places in self._file.channels_db.items()
-            if self._file.masters_db.get(places[0][0]) != places[0][1]
-        }
-        self.units = {name: self._file.get_channel_unit(name, *place) for name, place in self._places.items()}
-
-    def read(self, names: Sequence[str], gaps: Collection[str] = ()) -> Mapping[str, npt.NDArray[Any]]:
-        return {name: self._file.get(name, *self._places[name], samples_only=True)[0] for name in names}
-
-    def clock(self, name: str) -> Clock | None:
-        time = self._file.get_master(self._places[name][0])
-        return even_clock(np.asarray(time, np.float64), name)
-
-    def start(self, name: str) -> float | None:
-        time = self._file.get_master(self._places[name][0])
-        return float(time[0]) if time.size else None
-
-
-_FORMATS: Mapping[str, tuple[str, Callable[[Path], Source]]] = {
-    ".parquet": ("Parquet", _Parquet),
-    ".mat": ("MATLAB", _Mat),
-    ".tdms": ("TDMS", _Tdms),
-    ".mf4": ("MDF", _Mdf),
-    ".mdf": ("MDF", _Mdf),
-    ".dat": ("MDF", _Mdf),
+#: Formats of instruments, by ending; `lathe_rc.signals.instrument_files` reads them.
+_INSTRUMENTS = {
+    ".parquet": "Parquet",
+    ".mat": "MATLAB",
+    ".tdms": "TDMS",
+    ".mf4": "MDF",
+    ".mdf": "MDF",
+    ".dat": "MDF",
 }
 
 
@@ -493,7 +265,10 @@ def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> Measurement
     if not path.is_file():
         reason = "a folder" if path.is_dir() else "not a file" if path.exists() else "no such file"
         raise InputError(f"{path}: cannot be read ({reason}); check the path")
-    name, opened = _FORMATS.get(path.suffix.lower(), ("CSV", None))
-    with _readable(f"{path}: no readable {name} file"):
-        source = opened(path) if opened else _Text(path, {column for column, _ in (mapping or {}).values()})
-    return Measurement(str(path), source, mapping)
+    name = _INSTRUMENTS.get(path.suffix.lower())
+    with _readable(f"{path}: no readable {name or 'CSV'} file"):
+        if name is None:
+            return Measurement(str(path), _Text(path, {column for column, _ in (mapping or {}).values()}), mapping)
+        from lathe_rc.signals import instrument_files  # with SciPy, which text does not need
+
+        return Measurement(str(path), instrument_files.FORMATS[name](path), mapping)

@@ -6,9 +6,13 @@ A column is named by its quantity, or by another name that laboratories use, wit
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
+
+from lathe_rc.errors import InputError
+from lathe_rc.names import pairs
 
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 25.4e-3}
 _LENGTH = {**_LENGTHS, "": 1.0, "1": 1.0}
@@ -109,11 +113,12 @@ def is_unit(text: str) -> bool:
 
 
 def factor(quantity: str, unit: str) -> float | None:
-    """Return the SI value of 1 in a unit: one of `UNITS` or a number; None for another text."""
-    found = UNITS[quantity].get(_plain(unit))
+    """Return the value of 1 in a unit: one of `UNITS`, or a number, the SI value of 1; None for another text."""
+    units = UNITS.get(quantity, {})
+    found = units.get(_plain(unit))
     if found is None:
         try:
-            found = float(unit) * UNITS[quantity].get("rad/s", 1.0)
+            found = float(unit) * units.get("rad/s", 1.0)
         except ValueError:
             return None
     return found if np.isfinite(found) and found else None
@@ -122,3 +127,35 @@ def factor(quantity: str, unit: str) -> float | None:
 def is_decibel(unit: str) -> bool:
     """Return whether a unit is a logarithmic ratio."""
     return _plain(unit) == _DECIBEL
+
+
+class Mapped(NamedTuple):
+    """Column of a quantity as a user names it; an empty unit: that of the column."""
+
+    column: str
+    unit: str = ""
+
+
+def parse_columns(given: Iterable[str], names: Collection[str] = UNITS) -> dict[str, Mapped]:
+    """Parse the values ``NAME=COLUMN[:UNIT]`` of ``--column``; the unit may be a number, the SI value of 1.
+
+    Args:
+        given: values of the option.
+        names: quantities that are allowed; empty: any name, with numbers as units.
+
+    Raises:
+        InputError: a text has another form, a name or a unit is unknown, or a name is given twice.
+    """
+    form = f"QUANTITY=COLUMN[:UNIT], QUANTITY of {', '.join(names)}" if names else "TARGET=COLUMN[:FACTOR]"
+    found = {}
+    for name, text in pairs("--column", given, form).items():
+        column, colon, unit = text.rpartition(":")
+        option = f"--column {f'{name}={text}'!r}"
+        if (names and name not in names) or (colon and not column):
+            raise InputError(f"{option}; allowed: {form}")
+        if colon and factor(name, unit) is None:
+            units = [each for each in UNITS.get(name, ()) if each]
+            known = f"{', '.join(units)}, or a number, the SI value of 1" if units else "a number"
+            raise InputError(f"{option}: no unit {unit!r} of {name}; allowed: {known}")
+        found[name] = Mapped(column, unit) if colon else Mapped(text)
+    return found

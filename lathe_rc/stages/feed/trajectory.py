@@ -91,7 +91,7 @@ class Trajectory:
         if self._kind == "csv":
             if not parameters.trajectory_file:
                 raise InputError(f"{node}.trajectory_file is empty; name the CSV file of the trajectory")
-            from lathe_rc.signals import measurement_file  # with SciPy, which a cell without files need not import
+            from lathe_rc.signals import measurement_file  # which a cell without files need not import
 
             path = resources.find(Path(parameters.trajectory_file))
             force = type(parameters).rows()["set_point"].unit == "N"
