@@ -2,6 +2,7 @@
 """Set-up behind ./lathe: its refusals, the steps that it repeats, and its reports of failed steps."""
 
 import fcntl
+import importlib.util
 import json
 import os
 import re
@@ -91,7 +92,7 @@ def test_python_missing(copy):
 
 
 def test_python_unsupported(copy, tmp_path):
-    pretend = "import runpy, sys; sys.version_info = (3, 9, 2); runpy.run_path(sys.argv[1])"
+    pretend = "import runpy, sys; sys.version_info = (3, 9, 2); runpy.run_path(sys.argv[-1])"
     old = fake_python(tmp_path, f"exec {workplace.BASE_PYTHON} -c '{pretend}' \"$@\"")
     assert_refused(lathe(copy, LATHE_PYTHON=old), copy, "Python 3.9", "3.10 to 3.14", "LATHE_PYTHON=")
 
@@ -103,15 +104,41 @@ def test_entry_has_nothing_that_an_old_python_cannot_parse():
     assert 'f"' not in entry.read_text()
 
 
-def test_path_with_a_space(tmp_path):
-    copy = copy_to(tmp_path / "my lathe")
-    assert_refused(lathe(copy, "setup"), copy, "my lathe", "' '")
+def test_path_that_lists_of_paths_cannot_carry(tmp_path):
+    copy = copy_to(tmp_path / "my$lathe")
+    assert_refused(lathe(copy, "setup"), copy, "my$lathe", "'$'")
 
 
-@pytest.mark.parametrize("name", ["Müller", "日本"])
-def test_path_beyond_ascii(name):
-    with pytest.raises(workplace.RefusalError, match=f"{name}.* is not in ASCII, which CMake needs"):
-        preconditions.check_path(Path("/home", name, "lathe_rc"))
+@pytest.mark.parametrize("name", ["Müller", "日本", "my lathe", "it's", "a[1]"])
+def test_a_strange_path_is_set_up_in_the_cache(name, tmp_path, monkeypatch):
+    """The folder is that of the path, and the link in the checkout keeps it if the cache is another one later."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    root = tmp_path / name
+    home = workplace.home_of(root)
+    preconditions.check_path(root, home)
+    assert (home.parents[2], home.name) == (tmp_path / "cache", ".lathe")
+    assert workplace.home_of(tmp_path / "other é") != home
+    root.mkdir()
+    (root / ".lathe").symlink_to(home)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "é"))
+    assert workplace.home_of(root) == home
+    (tmp_path / "moved é").mkdir()
+    (tmp_path / "moved é" / ".lathe").mkdir()
+    with pytest.raises(workplace.RefusalError, match=r"moved é/.lathe is in the way of a link .* remove it"):
+        preconditions.check_path(tmp_path / "moved é", home)
+    with pytest.raises(workplace.RefusalError, match="XDG_CACHE_HOME=/path"):
+        preconditions.check_path(root, workplace.home_of(tmp_path / "é"))
+
+
+def test_library_that_would_be_loaded_in_place_of_the_machines(tmp_path):
+    """A broken one, and one that loads but has other symbols; the message names it and its folder."""
+    library, environ = tmp_path / "libstdc++.so.6", {"LD_LIBRARY_PATH": f"/nowhere:{tmp_path}"}
+    preconditions.check_libraries(environ)
+    other = Path(importlib.util.find_spec("_ctypes").origin)
+    for content, said in ((b"", "file too short"), (other.read_bytes(), "lacks GLIBCXX_3.4.24")):
+        library.write_bytes(content)
+        with pytest.raises(workplace.RefusalError, match=rf"libstdc.*{said}: take {tmp_path} out of LD_LIBRARY_PATH"):
+            preconditions.check_libraries(environ)
 
 
 @pytest.mark.parametrize("module", ["yaml.py", "numpy/", "random.py"])
@@ -339,21 +366,33 @@ def test_setup_of_an_unknown_group_is_refused(copy):
     assert_refused(lathe(copy, "setup", "viewer"), copy, f"setup viewer; allowed: {allowed}")
 
 
-def test_no_setting_of_pip_installs_elsewhere(monkeypatch):
-    monkeypatch.setenv("PIP_TARGET", "/elsewhere")
-    assert "PIP_TARGET" not in environment.build_environment(None)
-    assert "--no-user" in installer.pip("uv")
-
-
-def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
-    config = """\
+CONFIG = """\
 :env:.timeout='180'
+:env:.user='1'
 global.find-links='/opt/wheels'
+global.constraint='/etc/constraints.txt'
+install.target='/elsewhere'
 install.index-url='https://mirror.invalid/simple'
 global.index-url='https://other.invalid/simple'
 global.extra-index-url='\\nhttps://a.invalid\\nhttps://b.invalid'
 """
-    found = installer.uv_environment(config, {"UV_FIND_LINKS": "/mine", "HOME": "/root"})
+
+
+def test_settings_of_pip_turn_no_installation():
+    """Those of indexes and of the network hold; places and constraints, of a file or the environment, do not."""
+    environ = {"PIP_USER": "1", "PIP_TIMEOUT": "180", "PIP_CONFIG_FILE": "/mine", "HOME": "/root"}
+    assert installer.pip_environment(installer.pip_settings(CONFIG), environ) == {
+        "HOME": "/root",
+        "PIP_CONFIG_FILE": os.devnull,
+        "PIP_TIMEOUT": "180",
+        "PIP_FIND_LINKS": "/opt/wheels",
+        "PIP_INDEX_URL": "https://mirror.invalid/simple",
+        "PIP_EXTRA_INDEX_URL": "https://a.invalid https://b.invalid",
+    }
+
+
+def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
+    found = installer.uv_environment(installer.pip_settings(CONFIG), {"UV_FIND_LINKS": "/mine", "HOME": "/root"})
     assert found["UV_DEFAULT_INDEX"] == "https://mirror.invalid/simple"
     assert found["UV_INDEX"] == "https://a.invalid https://b.invalid"
     assert found["UV_FIND_LINKS"] == "/mine"

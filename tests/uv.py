@@ -16,6 +16,6 @@ def uv(*words: str | Path, check: bool = True) -> str:
     listed = subprocess.run(
         [workplace.PYTHON, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True
     )
-    settings = installer.uv_environment(listed.stdout, os.environ)
+    settings = installer.uv_environment(installer.pip_settings(listed.stdout), os.environ)
     settings["UV_LINK_MODE"] = "hardlink"  # nothing here is changed, and copies of 500 MB take their time
     return subprocess.run([UV, *words], env=settings, stdout=subprocess.PIPE, text=True, check=check).stdout

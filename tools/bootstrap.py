@@ -37,9 +37,13 @@ def main(arguments: Sequence[str]) -> int:
             return complete(Recipe(ros).ready([]))
         if is_help(arguments):
             return show_help(Recipe(ros).ready([]), arguments)
-        if ros is None and PYTHON.exists():
-            preconditions.check_python_path(os.environ)
+        if ros is None:
+            preconditions.check_libraries(os.environ)
+            if PYTHON.exists():
+                preconditions.check_python_path(os.environ)
         wanted = set_up(ros, needed(arguments))
+        if ros is None and arguments[:1] != ["setup"]:
+            preconditions.check_python_path(os.environ)  # again: now the packages are there
     except RefusalError as refusal:
         say(str(refusal))
         return 2
@@ -131,7 +135,7 @@ def command(arguments: Sequence[str]) -> list[str]:
 def change_to(python: Path) -> None:
     """Start over in another interpreter, unless it is the one that runs this."""
     if python.resolve() != Path(sys.executable).resolve():
-        os.execv(python, [str(python), *sys.argv])
+        os.execv(python, [str(python), "-E", *sys.argv])
 
 
 def settled(environ: Mapping[str, str]) -> Path | None:

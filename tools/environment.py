@@ -13,8 +13,6 @@ from workplace import ROOT, VENV
 
 # The settings of DDS that lathe's own nodes give themselves, for nodes in plain rclpy beside them.
 DDS = ROOT / "lathe_rc" / "nodes" / "dds.py"
-# Settings by which pip would install elsewhere, or not at all.
-_ELSEWHERE = frozenset({"PIP_PREFIX", "PIP_REQUIRE_VIRTUALENV", "PIP_ROOT", "PIP_TARGET"})
 # What a shell sets for itself.
 SHELL_OWN = frozenset({"_", "OLDPWD", "PWD", "SHLVL"})
 
@@ -42,7 +40,7 @@ def build_environment(ros: SourcedRos | None) -> dict[str, str]:
 
     Without a sourced ROS 2, whatever other packages the user's shell points at must not get in.
     """
-    environ = {name: value for name, value in os.environ.items() if name not in _ELSEWHERE}
+    environ = dict(os.environ)
     if ros is None:
         for name in ("CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "CONDA_PREFIX", "PYTHONHOME", "PYTHONPATH"):
             environ.pop(name, None)

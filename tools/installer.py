@@ -2,6 +2,7 @@
 """Installing packages with uv, which reads settings of its own: those that the user has made for pip hold here, too."""
 
 import ast
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,14 +19,15 @@ _SETTINGS = {
     "proxy": ("ALL_PROXY", " "),
     "trusted-host": ("UV_INSECURE_HOST", " "),
 }
+# Settings that pip itself keeps beside those: all others, such as user, target or constraint, would turn the set-up.
+_OF_PIP = {"cache-dir", "client-cert", "default-timeout", "keyring-provider", "no-cache-dir", "retries", "timeout"}
 # pip looks for a package at all indexes that it knows. What we mend must not be changed in the cache as well: no links.
 _ALIKE = {"UV_INDEX_STRATEGY": "unsafe-best-match", "UV_LINK_MODE": "copy", "UV_PYTHON_DOWNLOADS": "never"}
 
 
 def pip(*options: str | Path) -> list[str | Path]:
     """Return a command line of pip that installs."""
-    # --no-user: a user's setting of pip would install elsewhere
-    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-user", "--no-warn-script-location", *options]
+    return [PYTHON, "-m", "pip", "install", "--no-input", "--no-warn-script-location", *options]
 
 
 def uv(lists: Iterable[str], locks: Iterable[str]) -> list[str | Path]:
@@ -50,22 +52,32 @@ def npm() -> list[str | Path]:
     return [PYTHON.with_name("npm"), "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefix", NODE]
 
 
-def uv_environment(pip_config: str, environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of uv.
+def pip_settings(pip_config: str) -> dict[str, str]:
+    """Return those of the user's settings of pip that hold here, by name.
 
     Args:
         pip_config: what ``pip config list`` prints.
-        environ: the user's; what it says to uv itself comes first.
     """
-    said: dict[str, str] = {}
     lines = [line.partition("=") for line in pip_config.splitlines() if "=" in line]
+    said = {}
     for key, _, value in sorted(lines, key=lambda line: _rank(line[0])):
-        said[key.rpartition(".")[2]] = str(ast.literal_eval(value))
+        said[key.rpartition(".")[2]] = " ".join(str(ast.literal_eval(value)).split())
+    return {name: value for name, value in said.items() if name in _SETTINGS.keys() | _OF_PIP}
+
+
+def pip_environment(settings: Mapping[str, str], environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment of pip, with these settings and no others."""
+    found = {f"PIP_{name.upper().replace('-', '_')}": value for name, value in settings.items()}
+    rest = {name: value for name, value in environ.items() if not name.startswith("PIP_")}
+    return rest | found | {"PIP_CONFIG_FILE": os.devnull}
+
+
+def uv_environment(settings: Mapping[str, str], environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment of uv; settings that the user's environment has for uv itself come first."""
     found = {}
-    for name, value in said.items():
-        if name in _SETTINGS:
-            variable, separator = _SETTINGS[name]
-            found[variable] = separator.join(value.split())
+    for name, (variable, separator) in _SETTINGS.items():
+        if name in settings:
+            found[variable] = separator.join(settings[name].split())
     return _ALIKE | found | dict(environ)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conditions of the set-up, checked before anything is made; each that is not met gets one clear line."""
 
+import ctypes
 import importlib.util
 import os
 import platform
@@ -12,10 +13,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ros import SourcedRos, site_packages, split_own
-from workplace import ROOT, RefusalError
+from workplace import HOME, ROOT, RefusalError, is_plain, linked_home
 
-# Scripts' first lines, setup.bash and PATH-like lists cannot carry these.
-UNSAFE = re.compile(r"[\s:;'\"$`\\]")
+# setup.bash and PATH-like lists cannot carry these.
+UNSAFE = re.compile(r"[^\S ]|[:;\"$`\\]")
+# Libraries of C++ that others bring, and the symbols that the wheels (manylinux_2_28) need of them.
+_LIBRARIES = {"libgcc_s.so.1": b"GCC_4.3.0", "libstdc++.so.6": b"GLIBCXX_3.4.24"}
 
 
 def check(ros: SourcedRos | None) -> None:
@@ -24,18 +27,43 @@ def check(ros: SourcedRos | None) -> None:
     Raises:
         RefusalError: one is not met.
     """
-    check_path(ROOT)
+    check_path(ROOT, HOME)
     if ros is None:
         check_wheels_fit()
     check_packages()
 
 
-def check_path(root: Path) -> None:
-    """Refuse a checkout whose path would break the scripts made in it."""
+def check_path(root: Path, home: Path) -> None:
+    """Refuse a checkout whose path, or that of its set-up, would break the scripts made there or cannot be written."""
     if unsafe := UNSAFE.search(str(root)):
         raise RefusalError(f"{str(root)!r} has a {unsafe[0]!r} in it, which ROS 2 cannot handle: move it")
-    if not str(root).isascii():
-        raise RefusalError(f"{str(root)!r} is not in ASCII, which CMake needs to build messages: move it")
+    if not is_plain(home):
+        raise RefusalError(
+            f"{str(root)!r} needs a folder for its set-up with a path of plain ASCII, and {str(home.parents[2])!r} has "
+            "none: XDG_CACHE_HOME=/path ./lathe ..., or move the checkout"
+        )
+    own = root / ".lathe"
+    if own != home and own.exists() and linked_home(root) is None:
+        raise RefusalError(f"{own} is in the way of a link to {home}, since ROS 2 cannot handle its path: remove it")
+    for folder in (root, home):
+        there = next(each for each in (folder, *folder.parents) if each.exists())
+        if not os.access(there, os.W_OK):
+            raise RefusalError(f"{there} cannot be written, and the set-up is made there: copy the checkout elsewhere")
+
+
+def check_libraries(environ: Mapping[str, str]) -> None:
+    """Refuse a folder of LD_LIBRARY_PATH with a library of C++ that is broken, or older than the packages need."""
+    for folder in split_own(environ.get("LD_LIBRARY_PATH", "")):
+        for name, symbol in _LIBRARIES.items():
+            if not (path := Path(folder, name)).is_file():
+                continue
+            reason = "" if symbol in path.read_bytes() else f"lacks {symbol.decode()}"
+            try:
+                ctypes.CDLL(str(path))
+            except OSError as error:
+                reason = str(error).removeprefix(f"{path}: ")
+            if reason:
+                raise RefusalError(f"{path} {reason}: take {folder} out of LD_LIBRARY_PATH")
 
 
 def check_python_path(environ: Mapping[str, str]) -> None:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -27,7 +28,7 @@ MESSAGES_STAMP = INSTALL / "messages.stamp"
 SIMULATION = Path("third_party", "simulation_interfaces")  # in ROOT
 ENVIRONMENT = INSTALL / "environment.json"  # also the stamp of the package, the last thing made
 
-CHECK_NETWORK = "check the network and the free disk space, then call again"
+CHECK_NETWORK = "correct the fault in the lines above (often the network, or a full disk), then call again"
 MESSAGES_LIST = "../msg_defs/requirements.in"  # as seen from requirements/
 
 
@@ -155,7 +156,9 @@ class Recipe:
             else:
                 text = (REQUIREMENTS / "python.lock").read_text(encoding="utf-8")
                 CONSTRAINTS.write_text(pinned("uv", text), encoding="utf-8")
-                step.run(*installer.pip("-r", CONSTRAINTS), environ=build_environment(self._ros))
+                step.run(
+                    *installer.pip("-r", CONSTRAINTS), environ=installer.pip_environment(*self._pip_settings(step))
+                )
                 self._install(step, "ros.in", MESSAGES_LIST, "runtime.in", "build.in")
                 mend_cmake_paths(VENV, site_packages())
 
@@ -167,22 +170,34 @@ class Recipe:
 
     def _install(self, step: Step, *lists: str) -> None:
         """Install what files in requirements/ list: beside a sourced ROS 2 with pip, which knows its packages."""
-        environ = build_environment(self._ros)
+        settings, environ = self._pip_settings(step)
         if self._ros:
             files = [word for name in lists for word in ("-r", REQUIREMENTS / name)]
+            environ = installer.pip_environment(settings, environ)
             step.run(*installer.pip(*files, "--constraint", CONSTRAINTS), environ=environ)
         else:
-            settings = step.run(PYTHON, "-m", "pip", "config", "list", environ=environ)
             locked = installer.uv(lists, ["ros.lock", "python.lock"])
             step.run(*locked, environ=installer.uv_environment(settings, environ))
+
+    def _pip_settings(self, step: Step) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the user's settings of pip, and the environment of the set-up."""
+        environ = build_environment(self._ros)
+        listed = step.run(PYTHON, "-m", "pip", "config", "list", environ=environ)
+        return installer.pip_settings(listed), environ
 
     def _build_messages(self, lock: int) -> None:
         advice = "correct msg_defs/, or remove .lathe/, then call again"
         # Beside a sourced ROS 2 that has the whole package there must be no second one of its name.
         there = self._ros and any(Path(prefix, "share", SIMULATION.name).exists() for prefix in self._ros.prefixes)
+        sources = [Path("msg_defs"), *([] if there else [SIMULATION])]
         with Step("messages", "90 s", advice, lock) as step:
+            place = ROOT
+            if HOME.parent != ROOT:  # CMake cannot handle the path of the checkout
+                place = BUILD / "source"
+                for folder in sources:
+                    shutil.copytree(ROOT / folder, place / folder)
             step.run(
-                *colcon("--paths", ROOT / "msg_defs", *([] if there else [ROOT / SIMULATION])),
+                *colcon("--paths", *(place / folder for folder in sources)),
                 *("--cmake-args", *cmake_options(PYTHON), *(() if self._ros else (PYTHON_ALONE,))),
                 environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )

@@ -14,7 +14,7 @@ from itertools import cycle
 from pathlib import Path
 from types import TracebackType
 
-from workplace import HOME, LOG, ROOT, StepError, say
+from workplace import HOME, LOG, ROOT, StepError, linked_home, say
 
 TAIL = 15
 TICK = 0.1
@@ -27,7 +27,12 @@ def exclusive() -> Iterator[int]:
     Each command of a step inherits it: if ./lathe is killed, the lock is held until that command has ended,
     and the next call does not tread on its feet.
     """
-    HOME.mkdir(exist_ok=True)
+    link = ROOT / ".lathe"  # where ./lathe looks
+    if linked_home(ROOT) not in (None, HOME):  # of another path, from which the checkout was moved or copied
+        link.unlink()
+    HOME.mkdir(parents=True, exist_ok=True)
+    if not link.exists():
+        link.symlink_to(HOME)
     with (HOME / "lock").open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
