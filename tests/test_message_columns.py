@@ -66,7 +66,7 @@ def test_a_drive_is_identified_from_commands_and_joint_states(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("changes", "columns", "message"),
     [
-        ({}, [], "columns '/controller/commands.layout.data_offset', '/controller/commands.data[0]'"),
+        ({}, [], "'/controller/commands.data[0]', '/joint_states.position[0, 1, other, x]', '/joint_states.velocity[0"),
         ({}, [], "or frequency with magnitude and phase (--column QUANTITY=COLUMN[:UNIT] for each)"),
         ({}, [COMMAND, "response=/joint_states.position[z]"], "no such column"),
         ({"keep": lambda k: not 500 < k < 600}, [COMMAND, RESPONSE], "[x] for 0.1 s from 0.5 s on; allowed: up to 10"),
@@ -126,7 +126,7 @@ def test_a_tachogram_without_a_column_is_refused_with_those_of_the_bag(tmp_path,
     monkeypatch.chdir(tmp_path)
     record(tmp_path / "rc2", samples=2000)
     for words, told in (
-        ([], "'/joint_states.velocity[x]' and 2 more; allowed: an encoder, or speed (--column"),
+        ([], "'/joint_states.effort[0, 1, other, x]'; allowed: an encoder, or speed (--column"),
         (["--column", "speed=/joint_states.position[x]"], "from -"),
         (["--column", "speed=/joint_states.velocity[x]", "--topic", "/a"], "--topic /a beside --column"),
     ):

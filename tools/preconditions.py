@@ -45,7 +45,7 @@ def check_path(root: Path, home: Path) -> None:
     own = root / ".lathe"
     if own != home and own.exists() and linked_home(root) is None:
         raise RefusalError(f"{own} is in the way of a link to {home}, since ROS 2 cannot handle its path: remove it")
-    for folder in (root, home):
+    for folder in (own, home):
         there = next(each for each in (folder, *folder.parents) if each.exists())
         if not os.access(there, os.W_OK):
             raise RefusalError(f"{there} cannot be written, and the set-up is made there: copy the checkout elsewhere")
@@ -53,17 +53,16 @@ def check_path(root: Path, home: Path) -> None:
 
 def check_libraries(environ: Mapping[str, str]) -> None:
     """Refuse a folder of LD_LIBRARY_PATH with a library of C++ that is broken, or older than the packages need."""
-    for folder in split_own(environ.get("LD_LIBRARY_PATH", "")):
-        for name, symbol in _LIBRARIES.items():
-            if not (path := Path(folder, name)).is_file():
-                continue
+    for name, symbol in _LIBRARIES.items():
+        there = [Path(folder, name) for folder in split_own(environ.get("LD_LIBRARY_PATH", ""))]
+        for path in [path for path in there if path.is_file()][:1]:  # the first one is loaded
             reason = "" if symbol in path.read_bytes() else f"lacks {symbol.decode()}"
             try:
                 ctypes.CDLL(str(path))
             except OSError as error:
                 reason = str(error).removeprefix(f"{path}: ")
             if reason:
-                raise RefusalError(f"{path} {reason}: take {folder} out of LD_LIBRARY_PATH")
+                raise RefusalError(f"{path} {reason}: take {path.parent} out of LD_LIBRARY_PATH")
 
 
 def check_python_path(environ: Mapping[str, str]) -> None:

@@ -182,22 +182,23 @@ class Recipe:
     def _pip_settings(self, step: Step) -> tuple[dict[str, str], dict[str, str]]:
         """Return the user's settings of pip, and the environment of the set-up."""
         environ = build_environment(self._ros)
-        listed = step.run(PYTHON, "-m", "pip", "config", "list", environ=environ)
+        # To "config list", too, PIP_USER and "user = true" of a file mean --user: the user's own file alone.
+        listed = step.run(PYTHON, "-m", "pip", "config", "list", environ=environ | {"PIP_USER": "0"})
         return installer.pip_settings(listed), environ
 
     def _build_messages(self, lock: int) -> None:
         advice = "correct msg_defs/, or remove .lathe/, then call again"
         # Beside a sourced ROS 2 that has the whole package there must be no second one of its name.
         there = self._ros and any(Path(prefix, "share", SIMULATION.name).exists() for prefix in self._ros.prefixes)
-        sources = [Path("msg_defs"), *([] if there else [SIMULATION])]
+        folders = [Path("msg_defs"), *([] if there else [SIMULATION])]
         with Step("messages", "90 s", advice, lock) as step:
             place = ROOT
             if HOME.parent != ROOT:  # CMake cannot handle the path of the checkout
                 place = BUILD / "source"
-                for folder in sources:
+                for folder in folders:
                     shutil.copytree(ROOT / folder, place / folder)
             step.run(
-                *colcon("--paths", *(place / folder for folder in sources)),
+                *colcon("--paths", *(place / folder for folder in folders)),
                 *("--cmake-args", *cmake_options(PYTHON), *(() if self._ros else (PYTHON_ALONE,))),
                 environ=self._colcon_environment() | ({} if self._ros else FAST_DDS_ALONE),
             )

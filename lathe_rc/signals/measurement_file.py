@@ -8,7 +8,7 @@ gives names and units that differ.
 
 import shlex
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,18 @@ def _readable(what: str) -> Iterator[None]:
         raise
     except Exception as error:  # noqa: BLE001 - the libraries can raise any exception on damaged bytes
         raise InputError(f"{what} ({shown(error)})") from None
+
+
+def _elements(columns: Iterable[str]) -> list[str]:
+    """Return the columns of a bag, those of the elements of one array together: ``/joint_states.position[0, x]``."""
+    arrays: dict[str, list[str]] = {}
+    for column in columns:
+        array, _, element = column[:-1].rpartition("[") if column.endswith("]") else (column, "", "")
+        arrays.setdefault(array, []).append(element)
+    for found in arrays.values():
+        if len(found) > _MOST_COLUMNS:
+            found[2:-1] = ["..."]
+    return [f"{array}[{', '.join(found)}]" if found != [""] else array for array, found in arrays.items()]
 
 
 def check_rising(time: Array, path: Path) -> None:
@@ -83,7 +95,7 @@ class Measurement:
                 self._doubles[quantity] = fitting
 
     def _listed(self) -> str:
-        names = list(self._source.units)
+        names = list(self._source.units) if self._source.has_header else _elements(self._source.units)
         more = f" and {len(names) - _MOST_COLUMNS} more" if len(names) > _MOST_COLUMNS else ""
         return (", ".join(map(repr, names[:_MOST_COLUMNS])) or "no columns of numbers") + more
 
