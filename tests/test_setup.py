@@ -251,6 +251,12 @@ def test_a_change_remakes_what_depends_on_it_and_no_more(monkeypatch, copy, chan
     assert [one == other for one, other in zip(before, after, strict=True)] == [n < kept for n in range(3)]
 
 
+def test_a_moved_or_copied_checkout_remakes_all(monkeypatch, copy, tmp_path):
+    before = keys(monkeypatch, copy)
+    assert not set(before) & set(keys(monkeypatch, copy_to(tmp_path / "copied")))
+    assert not set(before) & set(keys(monkeypatch, copy.rename(tmp_path / "moved")))
+
+
 def test_another_source_of_ros_remakes_all(monkeypatch, copy):
     jazzy = keys(monkeypatch, copy, ros.SourcedRos("jazzy", ("/opt/ros/jazzy",)))
     assert not set(jazzy) & set(keys(monkeypatch, copy))
@@ -392,11 +398,15 @@ def test_settings_of_pip_turn_no_installation():
 
 
 def test_what_is_set_for_pip_holds_for_uv_and_the_environment_comes_first():
-    found = installer.uv_environment(installer.pip_settings(CONFIG), {"UV_FIND_LINKS": "/mine", "HOME": "/root"})
+    """Of the variables of uv, too, those of indexes and of the network hold, and a uv.toml with a target does not."""
+    environ = {"UV_FIND_LINKS": "/mine", "UV_CONSTRAINT": "/c.txt", "UV_CONFIG_FILE": "/uv.toml", "HOME": "/root"}
+    found = installer.uv_environment(installer.pip_settings(CONFIG), environ)
     assert found["UV_DEFAULT_INDEX"] == "https://mirror.invalid/simple"
     assert found["UV_INDEX"] == "https://a.invalid https://b.invalid"
     assert found["UV_FIND_LINKS"] == "/mine"
     assert found["HOME"] == "/root"
+    assert found["UV_NO_CONFIG"] == "1"
+    assert not {"UV_CONSTRAINT", "UV_CONFIG_FILE"} & found.keys()
 
 
 def test_every_package_of_every_list_is_in_a_lock():

@@ -3,6 +3,7 @@
 
 import ast
 import os
+import re
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,6 +22,11 @@ _SETTINGS = {
 }
 # Settings that pip itself keeps beside those: all others, such as user, target or constraint, would turn the set-up.
 _OF_PIP = {"cache-dir", "client-cert", "default-timeout", "keyring-provider", "no-cache-dir", "retries", "timeout"}
+# Variables of uv that do the same.
+_OF_UV = re.compile(
+    r"UV_(CACHE_DIR|CONCURRENT_\w+|DEFAULT_INDEX|EXTRA_INDEX_URL|FIND_LINKS|HTTP_\w+|INDEX\w*|INSECURE_HOST"
+    r"|KEYRING_PROVIDER|NATIVE_TLS|NO_CACHE|NO_INDEX|OFFLINE|REQUEST_TIMEOUT|SYSTEM_CERTS)"
+)
 # pip looks for a package at all indexes that it knows. What we mend must not be changed in the cache as well: no links.
 _ALIKE = {"UV_INDEX_STRATEGY": "unsafe-best-match", "UV_LINK_MODE": "copy", "UV_PYTHON_DOWNLOADS": "never"}
 
@@ -73,12 +79,13 @@ def pip_environment(settings: Mapping[str, str], environ: Mapping[str, str]) -> 
 
 
 def uv_environment(settings: Mapping[str, str], environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of uv; settings that the user's environment has for uv itself come first."""
+    """Return the environment of uv, without files of settings; what the user's environment has for uv comes first."""
     found = {}
     for name, (variable, separator) in _SETTINGS.items():
         if name in settings:
             found[variable] = separator.join(settings[name].split())
-    return _ALIKE | found | dict(environ)
+    rest = {name: value for name, value in environ.items() if not name.startswith("UV_") or _OF_UV.fullmatch(name)}
+    return _ALIKE | found | rest | {"UV_NO_CONFIG": "1"}
 
 
 def _rank(key: str) -> int:

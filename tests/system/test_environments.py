@@ -119,11 +119,14 @@ def test_a_set_up_withstands_all_of_it_at_once_and_its_own_death(tmp_path, broug
     shutil.copytree(workplace.ROOT, root, symlinks=True, ignore=NOT_COPIED)
     (root / ".git").write_text("gitdir: /nowhere\n")  # as in a copied worktree
     (tmp_path / "pip.conf").write_text("[global]\nuser = true\n[install]\ntarget = /nowhere\n")
+    (tmp_path / "config" / "uv").mkdir(parents=True)
+    (tmp_path / "config" / "uv" / "uv.toml").write_text('[pip]\ntarget = "/nowhere"\n')
     spoiled = [changes for changes, refusal in SPOILED.values() if not refusal and "PATH" not in changes]
     environ = {"PATH": os.environ["PATH"], **SOURCES}
     for changes in spoiled:
         environ |= {name: value.format(brought) for name, value in changes.items()}
-    environ |= {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PIP_CONFIG_FILE": str(tmp_path / "pip.conf")}
+    environ |= {f"XDG_{name.upper()}_HOME": str(tmp_path / name) for name in ("cache", "config")}
+    environ["PIP_CONFIG_FILE"] = str(tmp_path / "pip.conf")
     environ.setdefault("UV_CACHE_DIR", str(Path(os.environ["HOME"], ".cache", "uv")))
     program = "import rclpy, lathe_rc_msgs.msg as m; m.BlockInfo.__import_type_support__(); print(m.__file__)"
 
