@@ -144,3 +144,4 @@ def test_a_set_up_withstands_all_of_it_at_once_and_its_own_death(tmp_path, broug
         (tmp_path / "bin" / name).symlink_to(shutil.which(name))
     done = lathe(*RUN, root=moved, **environ | {"PATH": str(tmp_path / "bin")})
     assert (done.returncode, "no C++ compiler" in done.stderr) == (2, True), "the set-up of another path serves none"
+    shutil.rmtree(tmp_path / "cache")  # a gigabyte
