@@ -325,7 +325,7 @@ class LiveCell:
         """Return the status of the run, for its snapshots."""
         return {
             "bag": self._bag if self.recording else "",
-            "events": " ".join(filter(None, [_parameters(self._changed), as_options(self.events)])),
+            "events": " ".join(filter(None, [_parameters(self._changed), as_options(self._all_events())])),
             "begun": self.cell.first,
             "version": self._version,
         }
@@ -394,8 +394,12 @@ class LiveCell:
             raise InputError("no complete revolution yet; allowed: after the first one")
         if self.view.was_out:
             raise InputError("the tool was out of the part in the last ten revolutions; allowed: while it cuts")
-        told = {f"{node}.events": [*self.scenario.nodes[node].events, *texts] for node, texts in self.events.items()}
+        told = {f"{node}.events": texts for node, texts in self._all_events().items()}
         return self.scenario.varied({f"{master}.revolutions": float(turns), **told}), turns
+
+    def _all_events(self) -> dict[str, list[str]]:
+        """Return the events of each node that the panel has asked something of, those of the scenario first."""
+        return {node: [*self.scenario.nodes[node].events, *texts] for node, texts in self.events.items()}
 
     def _waiting(self) -> dict[str, list[str]]:
         """Return the events at the first sample not yet computed; a checkpoint holds them."""

@@ -239,6 +239,7 @@ def test_the_causes_are_those_of_lathe_budget_for_the_run_up_to_here(opened):
         shown.until(lambda now: now["state"] == "paused" and now["sample"] > at)
     found = shown.ask("causes")
     events = ["revolution 2: set learning_gain 0.8", f"sample {at}: set learning_gain 0.5"]
+    assert shown.now["events"] == f"--set 'learning_controller.events={json.dumps(events)}'"
     again = scenario("supervised", found["last"], f"learning_controller.events={json.dumps(events)}")
     assert found == {**lathe_rc.budget(again).summary(), "last": int(shown.cell.view.turns)}
     assert found["largest"] == pytest.approx(max(shown.largest()[found["last"] - 10 : found["last"]]), rel=0.02)
