@@ -100,7 +100,7 @@ class Player:
         while self.reached < end:
             first, end_here = self.reached, min(end, self.reached + MAX_BLOCK, self.samples)
             dense, sparse = self._chunk(first, end_here)
-            for sink in (self.view, self.view.lamp):
+            for sink in (self.view.lamp, self.view):
                 sink.chunk(first, end_here - first, dense, sparse)
             self.reached = end_here
             if end_here == self.samples:

@@ -309,7 +309,8 @@ class LiveCell:
 
     def advance(self, end: int) -> None:
         """Compute the samples before ``end``."""
-        sinks: list[Sink] = [self.view, self.view.lamp, *([self._recorder] if self._recorder else [])]
+        # The lamp first: it is never older than the samples beside it.
+        sinks: list[Sink] = [self.view.lamp, self.view, *([self._recorder] if self._recorder else [])]
         self._engine.advance(min(end, self.reached + self._engine.piece), sinks)
         if self.reached >= self.samples:
             self.view.finish()

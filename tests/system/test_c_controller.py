@@ -28,7 +28,7 @@ def test_a_c_program_gives_the_command_of_the_cell(domain, tmp_path, monkeypatch
     """The program of examples/c_controller, over UDP: the bits of our controller; it reports how late blocks were."""
     nodes = {"learning_controller": LAW, "spindle_encoder": {"revolutions": 5.0, "speed_factor": 1.0}}
     exported = export_nodes(scenario(**nodes), ["learning_controller"], tmp_path / "law", block=3200, samples=1)
-    sources = [FOLDER / "controller.c", *exported.place.glob("l*.c"), *(exported.place / "objects").iterdir()]
+    sources = [FOLDER / "controller.c", *exported.place.glob("l*.c")]
     program = tmp_path / "controller"
     flags = ["-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-I", exported.place]
     subprocess.run(["cc", *flags, "-o", program, *sources, "-lm"], check=True)

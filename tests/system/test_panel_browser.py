@@ -336,7 +336,8 @@ def _stepped_at_random(browser, driver, cell, choice):
         driver.call(lambda node=node, command=command: cell.act(node, command))
         for _ in range(choice.choice([1, 2, 2, 6])):
             one_revolution(browser)
-        browser.until(f"SHOWN.now.sample == {cell.reached}")
+        # Its text tells that the page is drawn, which it is a frame after the answer.
+        browser.until(f"document.getElementById('state').textContent.includes('sample {cell.reached} of')")
         if command == "reset" and effective:
             log = [line["text"].partition(":")[0] for line in cell.view.latest.log if line["sample"] == at]
             assert ("reset" if carried_out else "reset refused") in log[1:], log
