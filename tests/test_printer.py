@@ -106,11 +106,15 @@ def arrays(values, out):
         own -= 2.0
         first = _made(own, 0.5)[0]
         own = own - first
-        out[k] = own[1] + np.zeros(3)[1] + np.full(4, 2.5)[3]
-    held = own
-    own = own + held * 2.0
-    out[100 : 100 + own.size] = own
-    out[120] = np.sum(np.concatenate((held, own))[:6])
+        zeros, full = np.zeros(3), np.full(4, 2.5)
+        out[k] = own[1] + zeros[1] + full[3]
+    whole = values.copy()
+    held = whole
+    whole = whole + held * 2.0
+    out[100 : 100 + whole.size] = whole
+    both = np.concatenate((held, whole))
+    out[120] = np.sum(both[:6])
+    put(out[130:138], whole[:8].copy())
 
 
 @kernel
@@ -176,6 +180,17 @@ def test_a_printed_kernel_has_the_bits_of_the_compiled_one(made, tmp_path):
     assert head[2] == 0
 
 
+def test_nothing_is_written_once_the_memory_is_used_up(tmp_path):
+    run, _ = built(arrays, tmp_path)
+    out, room = np.arange(400.0), np.full(400, 7.0)
+    begin = room.ctypes.data
+    for size in range(0, 64, 8):
+        head = (ctypes.c_int64 * 3)(begin, begin + 8 * size, 0)
+        run(head, *(_Array(each.ctypes.data, each.size) for each in (VALUES, out)))
+        assert head[2] & 1
+        assert np.all(room[size:] == 7.0)
+
+
 @kernel
 def by_text(values, out):
     out[0] = len(f"{values[0]}")
@@ -198,6 +213,15 @@ def in_any_order(values, out):
 
 
 @kernel
+def from_a_loop(values, out):
+    own = values
+    for _ in range(3):
+        put(out[:2], own)
+        own = values.copy()
+    put(out[:4], own)
+
+
+@kernel
 def of_two_types(values, out):
     one = 1.0
     if values[0] > 0.0:
@@ -211,6 +235,7 @@ def of_two_types(values, out):
         (by_text, r"^test_printer, line \d+: f'\{values\[0\]\}' cannot be printed as C$"),
         (by_unknown, r"^test_printer, line \d+: np.median\(values\) cannot be printed as C$"),
         (in_any_order, r"line \d+: _counted\(out\) - 2.0 \* _counted\(out\), whose order C leaves open, cannot be"),
+        (from_a_loop, r"line \d+: own, an array of a turn before, cannot be printed as C$"),
         (of_two_types, r"line \d+: one for values of types .* in one place cannot be printed as C$"),
     ],
 )

@@ -61,7 +61,7 @@ class CFunction:
         )
         keeps = not self.types.takes_room or isinstance(self.types.result, ArrayType)
         if not keeps:
-            yield "    const lathe_room before = *room;"
+            yield "    char *const before = room->next;"
         self._frees = not keeps
         self._line = self.types.tree.lineno
         body = self.types.tree.body[1:] if told else self.types.tree.body
@@ -69,7 +69,7 @@ class CFunction:
             self._line = self.types.tree.body[0].end_lineno or 0
         yield from self._block(body)
         if not keeps and not isinstance(body[-1], ast.Return):
-            yield "    *room = before;"
+            yield "    room->next = before;"
         yield "}"
 
     def _block(self, nodes: Sequence[ast.stmt]) -> Iterator[str]:
@@ -83,6 +83,8 @@ class CFunction:
                 raise self.types.unknown(node, ast.unparse(node).partition("\n")[0])
             self._check_order(node)
             lines = list(found(node))
+            if not hasattr(node, "body") and not isinstance(node, ast.Return) and self._may_fill(node):
+                lines += ["if (room->full)", f"    return{self._nothing()};"]
             if lines and not hasattr(node, "body") and self._line in self._comments:
                 lines[-1] += f" /* {self._comments[self._line]} */"
             yield from (f"    {line}" for line in lines)
@@ -104,6 +106,32 @@ class CFunction:
         """Return whether an expression is an element of an array; parts of arrays and tuples are no loads."""
         return isinstance(node, ast.Subscript) and isinstance(self.types.kind(node), str)
 
+    def _may_fill(self, node: ast.stmt) -> bool:
+        """Return whether a statement takes memory, which may be used up: nothing must be written to an array then.
+
+        Raises:
+            UnprintableError: it makes an array that has no name.
+        """
+        value = getattr(node, "value", None)
+        named = [value.body, value.orelse] if isinstance(value, ast.IfExp) else [value]
+        named += value.elts if isinstance(value, ast.Tuple) else []
+        if isinstance(node, ast.Expr) and isinstance(value, ast.Call):
+            named += value.args
+        made = [each for each in ast.walk(node) if self.types.takes_memory(each)]
+        parts = [each for sum_of in made if isinstance(sum_of, ast.BinOp) for each in (sum_of.left, sum_of.right)]
+        for each in made:
+            if each not in named and not (isinstance(each, ast.BinOp) and each in parts):
+                raise self.types.unknown(node, f"{ast.unparse(each)}, an array without a name,")
+        called = (self.types.called(each) for each in ast.walk(node) if isinstance(each, ast.Call))
+        return bool(made) or any(each is not None and each.takes_room for each in called)
+
+    def _nothing(self) -> str:
+        """Return what the function returns when the memory is used up."""
+        kind = self.types.result
+        if kind == NONE:
+            return ""
+        return " 0" if isinstance(kind, str) else f" ({self._names.declared(kind)}){{0}}"
+
     def _do_pass(self, _node: ast.Pass) -> Iterator[str]:
         yield ";"
 
@@ -114,25 +142,40 @@ class CFunction:
         yield "continue;"
 
     def _do_expr(self, node: ast.Expr) -> Iterator[str]:
-        if not isinstance(node.value, ast.Constant):
+        if isinstance(node.value, ast.Constant):
+            return
+        made = [each for each in getattr(node.value, "args", ()) if self.types.takes_memory(each)]
+        if not made:
             yield f"{self._in_c.text(node.value)};"
+            return
+        assert isinstance(node.value, ast.Call), "it has arguments"
+        yield "{"
+        for place, each in enumerate(made):
+            name = f"made_{place}"
+            yield f"    const {self._names.declared(self.types.kind(each))} {name} = {self._in_c.text(each)};"
+            self.types.kinds[name] = self.types.kind(each)
+            node.value.args[node.value.args.index(each)] = ast.copy_location(ast.Name(name, ast.Load()), each)
+        yield "    if (room->full)"
+        yield f"        return{self._nothing()};"
+        yield f"    {self._in_c.text(node.value)};"
+        yield "}"
 
     def _do_return(self, node: ast.Return) -> Iterator[str]:
         if node.value is None:
             if self._frees:
-                yield "*room = before;"
+                yield "room->next = before;"
             yield "return;"
             return
         text = self._converted(node.value, self.types.result)
         if self._frees and not text.replace("_", "").isalnum():
             yield "{"
             yield f"    const {self._names.declared(self.types.result)} result = {text};"
-            yield "    *room = before;"
+            yield "    room->next = before;"
             yield "    return result;"
             yield "}"
             return
         if self._frees:
-            yield "*room = before;"
+            yield "room->next = before;"
         yield f"return {text};"
 
     def _converted(self, node: ast.expr, kind: Type) -> str:
@@ -282,10 +325,24 @@ class CFunction:
         """Yield the body of a loop, after which its temporary arrays are given back."""
         takes = any(self._keeps_array(each) for each in ast.walk(node) if isinstance(each, ast.Call | ast.BinOp))
         if takes:
-            yield "    const lathe_room within = *room;"
+            self._check_kept(node)
+            yield "    char *const within = room->next;"
         yield from self._block(node.body)
         if takes:
-            yield "    *room = within;"
+            yield "    room->next = within;"
+
+    def _check_kept(self, node: ast.For | ast.While) -> None:
+        """Refuse an array that is made in a loop and read after it, or in its next turn: its memory is given back."""
+        stored = {name for inner in node.body for name in stored_in(inner)}
+        inside = [each for inner in node.body for each in ast.walk(inner) if isinstance(each, ast.Name)]
+        for each in ast.walk(self.types.tree):
+            if not isinstance(each, ast.Name) or each.id not in stored or not isinstance(each.ctx, ast.Load):
+                continue
+            stores = (other for other in inside if other.id == each.id and isinstance(other.ctx, ast.Store))
+            first = min(other.lineno for other in stores)
+            kept = each.lineno <= first if each in inside else each.lineno > node.lineno
+            if kept and isinstance(self.types.kinds[each.id], ArrayType):
+                raise self.types.unknown(each, f"{each.id}, an array of a turn before,")
 
     def _keeps_array(self, node: ast.AST) -> bool:
         """Return whether an expression makes a temporary array, itself or by a kernel that returns it."""
