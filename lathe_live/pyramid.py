@@ -48,7 +48,7 @@ class Pyramid:
         self.every = 1
         self._filled = 0  # cells of the finest level
         # Level by level: smallest values, and largest with the other sign, so that both are merged by minima; shape
-        # (cells, 2, channels). Levels above the finest one are computed when somebody asks, from the cell `_changed`.
+        # (cells, 2, channels). Levels above the finest one are computed on a query, from the cell `_changed`.
         self._levels = [np.full((1, 2, channels), np.nan)]
         self._changed = 0
 

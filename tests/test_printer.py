@@ -213,6 +213,40 @@ def in_any_order(values, out):
 
 
 @kernel
+def one_of_two(values, out):
+    number = values.size and out.size
+    out[0] = number
+
+
+@kernel
+def by_else(values, out):
+    for k in range(3):
+        if values[k] > 0.0:
+            break
+    else:
+        out[3] = 1.0
+
+
+@kernel
+def left_early(values, out):
+    for value in (values[0], values[1]):
+        if value > 0.0:
+            break
+        out[0] = value
+
+
+@kernel
+def by_inverse(values, out):
+    out[0] = values[0] ** -1
+
+
+@kernel
+def called_twice(values, out):
+    if 0.0 < _counted(out) < 2.0:
+        out[2] = values[0]
+
+
+@kernel
 def from_a_loop(values, out):
     own = values
     for _ in range(3):
@@ -235,6 +269,11 @@ def of_two_types(values, out):
         (by_text, r"^test_printer, line \d+: f'\{values\[0\]\}' cannot be printed as C$"),
         (by_unknown, r"^test_printer, line \d+: np.median\(values\) cannot be printed as C$"),
         (in_any_order, r"line \d+: _counted\(out\) - 2.0 \* _counted\(out\), whose order C leaves open, cannot be"),
+        (one_of_two, r"line \d+: values.size and out.size as a value cannot be printed as C$"),
+        (by_else, r"line \d+: the else of a loop cannot be printed as C$"),
+        (left_early, r"line \d+: a loop over single values that is left early cannot be printed as C$"),
+        (by_inverse, r"line \d+: values\[0\] \*\* \(-1\) cannot be printed as C$"),
+        (called_twice, r"line \d+: 0.0 < _counted\(out\) < 2.0, which C would call twice, cannot be printed as C$"),
         (from_a_loop, r"line \d+: own, an array of a turn before, cannot be printed as C$"),
         (of_two_types, r"line \d+: one for values of types .* in one place cannot be printed as C$"),
     ],

@@ -27,6 +27,7 @@ OPERATORS: dict[type[ast.AST], tuple[str, int]] = {
     ast.And: ("&&", 5), ast.Or: ("||", 4), ast.Is: ("==", 9), ast.IsNot: ("!=", 9),
 }  # fmt: skip
 _COMPLEX = {"+": "sum", "-": "difference", "*": "product", "/": "quotient"}
+_POWERS = {("real", 2), ("real", 3), ("real", 4), ("int", 2)}  # functions of kernels.h
 PREFIX, LEAST = 14, 0  # precedences
 _ATOM, _CHOICE = 16, 3
 
@@ -114,9 +115,13 @@ class Expressions:
     def _power(self, node: ast.BinOp) -> str:
         exponent = self._types.constant(node.right)
         base = self.text(node.left)
-        if isinstance(exponent, int) and not isinstance(exponent, bool) and 0 <= exponent < 8:
+        if isinstance(exponent, int):
             kind = "real" if self._types.kind(node.left) == FLOAT else "int"
+            if (kind, exponent) not in _POWERS:
+                raise self._types.unknown(node, ast.unparse(node))
             return f"{kind}_power_{exponent}({base})"
+        if self._types.kind(node) != FLOAT:
+            raise self._types.unknown(node, ast.unparse(node))
         return f"pow({base}, {self.text(node.right)})"
 
     def _print_unaryop(self, node: ast.UnaryOp) -> tuple[str, int]:
@@ -125,6 +130,10 @@ class Expressions:
 
     def _print_compare(self, node: ast.Compare) -> tuple[str, int]:
         parts, left = [], node.left
+        repeated = [*node.comparators[:-1], *([node.left] if isinstance(node.ops[0], ast.In | ast.NotIn) else [])]
+        calls = (each for part in repeated for each in ast.walk(part) if isinstance(each, ast.Call))
+        if any(called.writes for called in map(self._types.called, calls) if called is not None):
+            raise self._types.unknown(node, f"{ast.unparse(node)}, which C would call twice,")
         for operator, right in zip(node.ops, node.comparators, strict=True):
             if isinstance(operator, ast.In | ast.NotIn):
                 known = self._types.constant(right)
@@ -144,6 +153,11 @@ class Expressions:
         if self._types.kind(node) != BOOL and not all(self._types.kind(each) in (BOOL, INT) for each in node.values):
             raise self._types.unknown(node, ast.unparse(node))
         return f" {sign} ".join(self.text(each, 9) for each in node.values), binds
+
+    def refuse_choice(self, node: ast.expr) -> None:
+        """Refuse ``a and b`` of numbers as a value: it is one of them in Python, and 0 or 1 in C."""
+        if isinstance(node, ast.BoolOp) and self._types.kind(node) != BOOL:
+            raise self._types.unknown(node, f"{ast.unparse(node)} as a value")
 
     def _print_ifexp(self, node: ast.IfExp) -> tuple[str, int]:
         return f"{self.text(node.test, 4)} ? {self.text(node.body, 4)} : {self.text(node.orelse, 3)}", _CHOICE
@@ -259,6 +273,7 @@ class Expressions:
 
     def _argument(self, node: ast.expr) -> str:
         """Return an argument of a kernel; a struct within another is given by its address."""
+        self.refuse_choice(node)
         text = self.text(node)
         return f"&{text}" if isinstance(self._types.kind(node), StructView) and not isinstance(node, ast.Name) else text
 

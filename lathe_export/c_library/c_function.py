@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from lathe_export.c_library import c_types
 from lathe_export.c_library.c_expressions import LEAST, OPERATORS, PREFIX, Expressions, Names, number, safe
 from lathe_export.c_library.c_types import NONE, ArrayType, TupleType, Type
-from lathe_export.c_library.kernel_types import MISSING, KernelTypes, names_in
+from lathe_export.c_library.kernel_types import MISSING, KernelTypes, names_in, operation
 from lathe_rc.compiled.struct_view import StructView
 
 _WIDTH = 112  # of a line
@@ -185,11 +185,12 @@ class CFunction:
             return f"({self._names.declared(kind)}){{{'{' + inner + '}' if kind.alike else inner}}}"
         if isinstance(kind, TupleType) and self.types.kind(node) != kind:
             raise self.types.unknown(node, f"{ast.unparse(node)} of other types")
+        self._in_c.refuse_choice(node)
         return self._in_c.text(node)
 
     def _do_assign(self, node: ast.Assign) -> Iterator[str]:
         if len(node.targets) > 1:
-            if isinstance(node.targets[0], ast.Tuple):
+            if isinstance(node.targets[0], ast.Tuple) or len({self.types.kind(each) for each in node.targets}) > 1:
                 raise self.types.unknown(node, ast.unparse(node))
             if any(isinstance(self.types.kind(target), ArrayType) for target in node.targets):
                 for target in node.targets:
@@ -273,14 +274,14 @@ class CFunction:
             if not isinstance(self.types.kind(node), ArrayType):
                 return self._in_c.text(node, least)
             if isinstance(node, ast.BinOp):
-                sign, binds = OPERATORS[type(node.op)]
+                sign, binds = self._operator(node, node.op)
                 text = f"{element(node.left, binds)} {sign} {element(node.right, binds + 1)}"
                 return f"({text})" if binds < least else text
             arrays.append(self._in_c.text(node))
             return f"value_{len(arrays) - 1}.data[n]"
 
         text = element(value, LEAST)
-        sign = "" if operator is None else OPERATORS[type(operator)][0]
+        sign = "" if operator is None else self._operator(target, operator)[0]
         yield "{"
         for place, array in enumerate(arrays):
             yield f"    const {kind.name} value_{place} = {array};"
@@ -291,14 +292,18 @@ class CFunction:
             yield f"    {self._in_c.text(target)} = into;"
         yield "}"
 
+    def _operator(self, node: ast.AST, operator: ast.operator) -> tuple[str, int]:
+        if type(operator) not in OPERATORS:
+            raise self.types.unknown(node, f"{type(operator).__name__} of arrays")
+        return OPERATORS[type(operator)]
+
     def _do_augassign(self, node: ast.AugAssign) -> Iterator[str]:
         if isinstance(self.types.kind(node.target), ArrayType):
             yield from self._store_array(node.target, node.op, node.value)
             return
         target = self._in_c.text(node.target)
-        if isinstance(node.op, ast.Mod | ast.FloorDiv | ast.Pow):
-            load = ast.parse(ast.unparse(node.target), mode="eval").body
-            yield f"{target} = {self._in_c.text(ast.copy_location(ast.BinOp(load, node.op, node.value), node))};"
+        if isinstance(node.op, ast.Div | ast.Mod | ast.FloorDiv | ast.Pow):
+            yield f"{target} = {self._in_c.text(operation(node))};"
             return
         sign, _ = OPERATORS[type(node.op)]
         yield f"{target} {sign}= {self._in_c.text(node.value)};"
@@ -323,6 +328,8 @@ class CFunction:
 
     def _inner(self, node: ast.For | ast.While) -> Iterator[str]:
         """Yield the body of a loop, after which its temporary arrays are given back."""
+        if node.orelse:
+            raise self.types.unknown(node.orelse[0], "the else of a loop")
         takes = any(self._keeps_array(each) for each in ast.walk(node) if isinstance(each, ast.Call | ast.BinOp))
         if takes:
             self._check_kept(node)
@@ -353,11 +360,7 @@ class CFunction:
 
     def _do_for(self, node: ast.For) -> Iterator[str]:
         value = node.iter
-        if not (
-            isinstance(value, ast.Call)
-            and self.types.constant(value.func) is range
-            and isinstance(node.target, ast.Name)
-        ):
+        if not (self.types.is_call(value, range) and isinstance(node.target, ast.Name)):
             yield from self._for_each(node)
             return
         name, arguments = safe(node.target.id), value.args
@@ -367,7 +370,11 @@ class CFunction:
         start, stop = self._in_c.text(begin), self._in_c.text(end, 11)
         changed = {each for inner in node.body for each in stored_in(inner)}
         reads = {each.id for each in ast.walk(end) if isinstance(each, ast.Name)}
-        simple = not reads & changed and not any(isinstance(each, ast.Subscript | ast.Call) for each in ast.walk(end))
+        if len(arguments) == 3 and changed & {each.id for each in ast.walk(arguments[2]) if isinstance(each, ast.Name)}:
+            raise self.types.unknown(node, "a range by a step that the loop changes")
+        simple = not reads & {*changed, node.target.id} and not any(
+            isinstance(each, ast.Subscript | ast.Call) for each in ast.walk(end)
+        )
         held = name != "_" and (node.target.id in changed or self._is_read_after(node))
         count = "again" if name == "_" else f"{name}_count" if held else name
         first = f"{count} = {start}" if count == name else f"int64_t {count} = {start}"
@@ -407,15 +414,13 @@ class CFunction:
         value, target = node.iter, node.target
         count = "n"
         if isinstance(value, ast.Tuple):
+            if any(isinstance(each, ast.Break | ast.Continue) for each in ast.walk(node)):
+                raise self.types.unknown(node, "a loop over single values that is left early")
             for each in value.elts:
                 yield from self._store(target, each)
                 yield from self._inner(node)
             return
-        if (
-            isinstance(value, ast.Call)
-            and self.types.constant(value.func) is enumerate
-            and isinstance(target, ast.Tuple)
-        ):
+        if self.types.is_call(value, enumerate) and isinstance(target, ast.Tuple):
             assert isinstance(target.elts[0], ast.Name)
             count, value, target = safe(target.elts[0].id), value.args[0], target.elts[1]
         kind, name = self.types.kind(value), self._in_c.text(target)

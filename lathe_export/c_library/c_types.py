@@ -115,8 +115,6 @@ def of_value(value: object) -> Type | None:
         return NONE
     if isinstance(value, tuple) and value and all(of_value(part) for part in value):
         return TupleType(tuple(of_value(part) for part in value))
-    if isinstance(value, np.ndarray) and value.ndim <= 2 and of_value(value.flat[0]):
-        return ArrayType(str(of_value(value.flat[0].item())), value.ndim)
     return None
 
 

@@ -10,7 +10,7 @@ import inspect
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 
@@ -139,7 +139,7 @@ class KernelTypes:
             for target in node.targets:
                 self._assign(target, node.value)
         elif isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Name):
-            self._hold(node.target, self._operated(node, node.op, node.target, node.value))
+            self._hold(node.target, self.maybe(operation(node)))
         elif isinstance(node, ast.For):
             self._loop(node)
         elif isinstance(node, ast.Return) and node.value is not None and (kind := self.maybe(node.value)) is not None:
@@ -182,14 +182,10 @@ class KernelTypes:
 
     def _loop(self, node: ast.For) -> None:
         value = node.iter
-        if isinstance(value, ast.Call) and self.constant(value.func) is range:
+        if self.is_call(value, range):
             self._assign(node.target, ast.copy_location(ast.Constant(0), node))
             return
-        if (
-            isinstance(value, ast.Call)
-            and self.constant(value.func) is enumerate
-            and isinstance(node.target, ast.Tuple)
-        ):
+        if self.is_call(value, enumerate) and isinstance(node.target, ast.Tuple):
             count, each = node.target.elts
             self._hold(count, INT)  # type: ignore[arg-type]
             self._hold(each, self._element(value.args[0]))  # type: ignore[arg-type]
@@ -202,6 +198,10 @@ class KernelTypes:
             self._hold(node.target, self._element(value))
             return
         raise self.unknown(node, "this loop")
+
+    def is_call(self, node: ast.AST, function: object) -> TypeGuard[ast.Call]:
+        """Return whether an expression calls a function of Python, such as range."""
+        return isinstance(node, ast.Call) and self.constant(node.func) is function
 
     def _element(self, node: ast.expr) -> Type | None:
         kind = self.maybe(node)
@@ -228,7 +228,7 @@ class KernelTypes:
             return MISSING if owner is MISSING else getattr(owner, node.attr)
         if isinstance(node, ast.Subscript) and not isinstance(node.slice, ast.Slice):
             owner, place = self.constant(node.value), self.constant(node.slice)
-            return MISSING if MISSING in (owner, place) or not isinstance(owner, tuple) else owner[place]
+            return owner[place] if isinstance(owner, tuple) and place is not MISSING else MISSING
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
             value = self.constant(node.operand)
             return MISSING if value is MISSING else -value
@@ -272,19 +272,16 @@ class KernelTypes:
         return c_types.joined([self.kind(node.body), self.kind(node.orelse)])
 
     def _kind_binop(self, node: ast.BinOp) -> Type:
-        return self._operated(node, node.op, node.left, node.right) or self.kinds[""]
-
-    def _operated(self, node: ast.AST, operator: ast.operator, left: ast.expr, right: ast.expr) -> Type | None:
-        one, other = self.maybe(left), self.maybe(right)
-        if one is None or other is None:
-            return None
+        one, other = self.kind(node.left), self.kind(node.right)
         if isinstance(one, ArrayType) or isinstance(other, ArrayType):
+            if {getattr(kind, "element", FLOAT) for kind in (one, other)} != {FLOAT}:
+                raise self.unknown(node, f"{ast.unparse(node)} of other numbers than float64")
             return one if isinstance(one, ArrayType) else other
-        if WORD in (one, other) and one != other and not isinstance(operator, ast.LShift | ast.RShift):
+        if WORD in (one, other) and one != other and not isinstance(node.op, ast.LShift | ast.RShift):
             raise self.unknown(node, f"{one} beside {other}")
-        if isinstance(operator, ast.Div):
+        if isinstance(node.op, ast.Div):
             return c_types.joined([one, other, FLOAT])
-        bits = isinstance(operator, ast.BitAnd | ast.BitOr | ast.BitXor)
+        bits = isinstance(node.op, ast.BitAnd | ast.BitOr | ast.BitXor)
         found = c_types.joined([one, other])
         return found if bits or found not in (BOOL, OCTET) else INT
 
@@ -455,7 +452,7 @@ class KernelTypes:
             elif isinstance(node, ast.For):
                 for name in names_in(node.target):
                     start = None
-                    if isinstance(node.iter, ast.Call) and self.constant(node.iter.func) is range:
+                    if self.is_call(node.iter, range):
                         arguments = node.iter.args
                         start = (
                             arguments[0] if len(arguments) == 2 else ast.Constant(0) if len(arguments) == 1 else None
@@ -520,6 +517,12 @@ class _Pruned(ast.NodeTransformer):
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.stmt:
         assert node.value is not None, "it has a value"
         return ast.copy_location(ast.Assign([node.target], node.value), node)
+
+
+def operation(node: ast.AugAssign) -> ast.BinOp:
+    """Return the operation of an assignment such as ``a += b``."""
+    load = ast.parse(ast.unparse(node.target), mode="eval").body
+    return ast.copy_location(ast.BinOp(load, node.op, node.value), node)
 
 
 def is_copy(node: ast.Call) -> bool:
