@@ -290,7 +290,7 @@ def test_a_bridge_that_is_stuck_delays_no_member(offline, tmp_path):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv(dds.PROFILES, str(small))
             bridges = [stack.enter_context(watching(domain, folder)) for folder in folders]
-        # So slow that the bridges show something before they are stopped, beside other tests too.
+        # So slow that the bridges have time to show something before they are stopped; nothing is right as well.
         with cell(tmp_path, domain, "spindle_encoder.speed_factor=0.1") as (processes, begin):
             for bridge in bridges:
                 listens(bridge)

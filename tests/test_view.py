@@ -67,7 +67,8 @@ class View:
     def scalars(self, entity):
         """Time [ns], revolution and value of a curve."""
         values = [value for (value,) in self.column(entity, "Scalars:scalars")]
-        return tuple(np.array(one) for one in (self.column(entity, "time"), self.column(entity, "revolution"), values))
+        # of a curve without a sample too, the times count samples
+        return np.array(self.column(entity, "time"), int), np.array(self.column(entity, "revolution")), np.array(values)
 
     def entities(self, component):
         return {chunk.entity_path for chunk in self.chunks if component in chunk.to_record_batch().schema.names}
