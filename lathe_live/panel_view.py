@@ -29,12 +29,13 @@ from lathe_rc.arrays import Array
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
-from lathe_rc.judge.part import RunningVerdict
+from lathe_rc.judge.part import Limits, error_growth
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.form_limits import form_limits, varying_speed
 
@@ -152,8 +153,9 @@ class View:
         self.memories: Collection[str] = ()
         self._loops: Sequence[Loop] = ()
         self._declared: Mapping[str, Judged] = {}
-        self._doubt = 0.0  # about the form, see `RunningVerdict`
-        self._judge: RunningVerdict | None = None  # from the first sample of the part on
+        self._doubt = 0.0  # about the form, see `Limits`
+        self._part: RunningForm | None = None  # from the first sample of the part on
+        self._allowed = Limits()
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -174,7 +176,7 @@ class View:
         """
         self.memories = [stage.name for stage in stages if has_memory(stage)]
         self._declared, self._doubt = judged(scenario.nodes), form_doubt(scenario.nodes)
-        self._judge = None
+        self._part = None
         self.outlook, self._loops = outlook(scenario), loops(self._declared)
         self._watches = watches(self._loops, self._types)
         for loop in self._loops:
@@ -203,7 +205,7 @@ class View:
         self._open: Row | None = None
         self._newest: list[Row] = []
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
-        self._judge = None
+        self._part = None
         self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
         self._conditions = event_log.Conditions()
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
@@ -278,9 +280,9 @@ class View:
             self.say(first + sound, "panel", f"form error {self._soundness.why}")
         self.timeline.chunk(first, samples, named, sparse, sound)
         if encoder and tool:
-            self._part(first, encoder["angle_true"], tool, sound)
+            self._cut(first, encoder["angle_true"], tool, sound)
 
-    def _part(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:
+    def _cut(self, first: int, angle: Samples, tool: Signals, sound: int) -> None:
         if self._scale is None:
             self._scale = Scale.of(Outlook(), tool["reference"])
         self._now |= {
@@ -288,9 +290,10 @@ class View:
         }
         self._now["height"] = float(tool["height"][-1]) * 1e3
         if sound:
-            if self._judge is None:
-                self._judge = RunningVerdict(self._declared, self.topics.tool, self._doubt)
-            self._judge.add(first, angle[:sound], {name: signal[:sound] for name, signal in tool.items()})
+            if self._part is None:
+                self._allowed = Limits.of(self._declared, self.topics.tool, self._doubt)
+                self._part = RunningForm(self.topics.encoder, self.topics.tool, self._soundness, self._allowed.zones)
+            self._part.add(first, angle[:sound], {name: signal[:sound] for name, signal in tool.items()})
             fields = (tool[name][:sound] for name in ("error", "reference", "height"))
             self._add(self._revolutions.add(first, angle[:sound], *fields))
 
@@ -329,9 +332,9 @@ class View:
 
     def _evaluated(self, unjudged: str) -> Evaluation:
         """Evaluate the part as ``lathe run`` does; ``unjudged``: reason why its end cannot be judged, or empty."""
-        judge, rests_on = self._judge, (self._judge, self._complete, unjudged)
-        if judge and self._judged[0] != rests_on:
-            self._judged = rests_on, Evaluation(judge.verdict(unjudged), judge.growth())
+        form, rests_on = self._part, (self._part, self._complete, unjudged)
+        if form and self._judged[0] != rests_on:
+            self._judged = rests_on, Evaluation(self._allowed.verdict(form, unjudged), error_growth(form))
         found = self._judged[1]
         results = [watch.result() for watch in self._watches]
         told = [(f"{each.loop.node}: {text}", good) for each in results for text, good in each.judged()]
@@ -340,17 +343,16 @@ class View:
 
     def _missing(self, verdict: Verdict | None) -> str:
         """Return which of the revolutions up to now are not judged, or why none is."""
-        judge = self._judge
         if not self.topics.tool:
             return "no tool in this cell"
         if not self._declared:
             return "the scenario, and so the tolerance, is not known"
-        if judge is None:
+        if self._part is None:
             return "no sample of the part yet"
         if verdict is None:
             node = next((node for node, each in self._declared.items() if each.quantity == "form"), "tool")
             return f"no tolerance: {node}.tolerance = 0"
-        last, turns = judge.before + verdict.revolutions, math.floor(self.turns)
+        last, turns = self._part.before + verdict.revolutions, math.floor(self.turns)
         return f"revolutions {last + 1} to {turns} were not received" if turns > last and not verdict.unjudged else ""
 
     def _limiting(self) -> list[str]:

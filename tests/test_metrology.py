@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc import cli, harness
+from lathe_rc import cli, harness, messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import (
     POINTS,
@@ -24,6 +24,7 @@ from lathe_rc.analysis.metrology import (
     roundness,
     undulations,
 )
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.form_errors import RunningErrors, form_errors, that_count
@@ -69,6 +70,22 @@ def test_last_sample_before_the_end_completes_a_revolution():
         part = angle[: angle.size - missing]
         assert form_errors(part, part).rms.size == revolutions
         assert evenly(part, part, 64).shape == (revolutions, 64)
+
+
+@pytest.mark.parametrize("begin", [0.3, 2.5])
+def test_a_snapshot_begins_with_its_first_complete_revolution(begin):
+    """Also one that begins in the first, and after missing samples."""
+    angle, at = steady(6), round(begin * 1000)
+    error, types = np.sin(np.arange(angle.size) ** 2.0), {"encoder": messages.ENCODER, "tool": messages.TOOL}
+    whole = form_errors(angle, error)
+    for pieces in ([(at, 6000)], [(0, at - 100), (at, 4000), (4000, 6000)]):
+        form = RunningForm.of(types)
+        for first, end in pieces:
+            piece = slice(first, end)
+            dense = {"encoder": {"angle_true": angle[piece]}, "tool": {"error": error[piece]}}
+            form.chunk(first, end - first, dense, {})
+        assert form.before == math.ceil(begin)
+        assert_array_equal(form.largest, whole.largest[form.before :])
 
 
 def test_revolution_without_a_sample_is_refused():

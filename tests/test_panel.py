@@ -31,6 +31,7 @@ from lathe_rc import event_log, harness, messages
 from lathe_rc.analysis.tolerance import growth, judge
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell.parameters import form_doubt, judged
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
 from lathe_rc.judge import part
@@ -563,8 +564,8 @@ def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
     )
     recording, declared = harness.run(loaded).recording, judged(loaded.nodes)
     angle, tool = recording.of_type(messages.ENCODER)["angle_true"], recording.dense["/tool"]
-    running = part.RunningVerdict(declared, "/tool", form_doubt(loaded.nodes))
-    late = part.RunningVerdict(declared, "/tool", form_doubt(loaded.nodes))
+    limits = part.Limits.of(declared, "/tool", form_doubt(loaded.nodes))
+    running, late = (RunningForm.of(recording.types, limits.zones) for _ in range(2))
     size = recording.samples // 9
     for first in range(0, recording.samples, size):
         piece = slice(first, first + size)
@@ -573,12 +574,12 @@ def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
                 each.add(first, angle[piece], {field: signal[piece] for field, signal in tool.items()})
         cut = {topic: {n: s[: piece.stop] for n, s in fields.items()} for topic, fields in recording.dense.items()}
         found = part.verdict(loaded, replace(recording, dense=cut))
-        assert running.verdict() == found or found.revolutions == 0
-        assert running.verdict().told() == found.told()
-    assert 3 < late.before == found.revolutions - late.verdict().revolutions
-    assert late.verdict().in_tolerance
-    assert late.verdict().since == late.before + 1  # no word about revolutions that were not seen
-    assert running.growth() == part.error_growth(recording)
+        assert limits.verdict(running) == found or found.revolutions == 0
+        assert limits.verdict(running).told() == found.told()
+    assert 3 < late.before == found.revolutions - limits.verdict(late).revolutions
+    assert limits.verdict(late).in_tolerance
+    assert limits.verdict(late).since == late.before + 1  # no word about revolutions that were not seen
+    assert part.error_growth(running) == part.error_growth(recording.form())
 
 
 def _evaluated(errors, doubt=0.0, **more):

@@ -263,7 +263,8 @@ class TestForm:
         ("angle", "reason"),
         [
             ([0.2, 0.1], "the angle falls"),
-            ([0.0, 1e300], "more than a third of a turn"),
+            ([0.0, 3.0], "more than a third of a turn"),
+            ([0.0, 1e300], "has no sample"),
             ([1e9, 1e9 + 0.1], "begins at"),
             ([0.0, np.nan], "not finite"),
             (np.linspace(0.0, 5.0, 2**22 + 1), "longer than"),

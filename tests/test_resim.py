@@ -17,9 +17,9 @@ from lathe_rc.bag import provenance, reader
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.bag.reading.stream import feed
 from lathe_rc.cell import scenario as scenarios
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
-from lathe_rc.judge.part import ErrorsByRevolution
 from lathe_rc.signals.form_errors import form_errors
 
 EVENTS = {"events": ["revolution 5.5: freeze", "second 0.3: learn"]}
@@ -153,11 +153,11 @@ def test_a_lone_file_has_the_scenario_and_a_bag_without_one_says_what_is_missing
 def test_errors_by_revolution_and_the_first_and_last_are_those_of_the_whole(nodes, piece, together, monkeypatch):
     path, result = nodes
     monkeypatch.setattr(part, "_TOGETHER", together)
-    ends, errors = part.FirstAndLast(result.recording.types), ErrorsByRevolution(result.recording.types)
+    ends, errors = part.FirstAndLast(result.recording.types), RunningForm.of(result.recording.types)
     feed(path, [ends, errors], piece=piece)
     told, whole = ends.numbers(), part.measured(result.recording)
     angle = result.recording.dense["/encoder"]["angle_true"]
-    assert np.array_equal(errors.rms(), form_errors(angle, result.recording.dense["/tool"]["error"]).rms)
+    assert np.array_equal(errors.found().rms, form_errors(angle, result.recording.dense["/tool"]["error"]).rms)
     assert told["revolutions"] == whole.form.rms.size
     for name, revolution in (("first", 0), ("last", -1)):
         for key, value in part.numbers(whole, revolution).items():

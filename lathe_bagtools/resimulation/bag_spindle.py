@@ -16,18 +16,19 @@ from lathe_rc.bag.reading.stream import SampleReader, first_of
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import Trigger
 from lathe_rc.cell.parameters import remapped
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import Scenario
+from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage import DONE, Fields, Reached
 from lathe_rc.cell.time_master import TimeMaster
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
-from lathe_rc.judge.part import ErrorsByRevolution
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.encoder import EncoderSamples
 from lathe_rc.stages.tool.tool import Tool
 
-_TYPES = {"/encoder": messages.ENCODER, "/tool": messages.TOOL}
+_TYPES = {"encoder": messages.ENCODER, "tool": messages.TOOL}
 
 
 class Memory(NamedTuple):
@@ -161,22 +162,22 @@ class Comparison:
         self._encoder = remapped(cell.master.shared, "encoder")
         self._tool = remapped(tool.shared, tool.outputs[0].topic)
         self._readers = [(SampleReader(recorded.source, topic, cell.first), field) for topic, field in topics]
-        self._recorded, self._between = ErrorsByRevolution(_TYPES), ErrorsByRevolution(_TYPES)
+        self._recorded, self._between = RunningForm("", "", Soundness(())), RunningForm("", "", Soundness(()))
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add the errors of a chunk."""
         tool, encoder = dense[self._tool], dense[self._encoder]
         between: Samples = tool["displacement"] - sum(reader.take(samples)[field] for reader, field in self._readers)
-        for sink, error in ((self._recorded, tool["error"] + between), (self._between, between)):
-            sink.chunk(first, samples, {"encoder": encoder, "tool": {"error": error}}, {})
+        for form, error in ((self._recorded, tool["error"] + between), (self._between, between)):
+            form.add(first, encoder["angle_true"], {"error": error})
 
     def recorded_rms(self) -> Samples:
         """Return the RMS form error of the recorded position for each revolution [m], shape (revolutions,)."""
-        return self._recorded.rms()
+        return self._recorded.found().rms
 
     def between_rms(self) -> Samples:
         """Return the RMS difference between the two positions for each revolution [m], shape (revolutions,)."""
-        return self._between.rms()
+        return self._between.found().rms
 
 
 Events = dict[str, list[tuple[int, str]]]  #: sample and action of each event, by node

@@ -35,11 +35,11 @@ from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import TABLES, Scenario, kind_of
 from lathe_rc.cell.time_master import START_FROM
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, UnpublishedError
-from lathe_rc.judge.part import ErrorsByRevolution
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.names import instead
 
@@ -223,7 +223,7 @@ def resimulate(
                 stage.replay(action, index)
         first = cell.first
         digests = _Digests(cell.master.shared.step_ns, cell.sparse)
-        errors = ErrorsByRevolution({f"/{name}": said.type for name, said in cell.dense.items()})
+        errors = RunningForm.of({name: said.type for name, said in cell.dense.items()})
         samples = cell.master.samples
         assert samples is not None, "a bag has an end"
         writer = begin(output, chosen) if output is not None else None
@@ -246,13 +246,13 @@ def resimulate(
         scenario=chosen,
         changed=changed,
         first=first,
-        turns_before=errors.turns_before,
+        turns_before=errors.before,
         samples=samples - first,
         wall_s=wall,
         digest=digest,
         recorded=digest_of_bag,
-        rms=errors.rms(),
-        recorded_rms=compared.recorded_rms() if compared else before.rms(),
+        rms=errors.found().rms,
+        recorded_rms=compared.recorded_rms() if compared else before.found().rms,
         between_rms=compared.between_rms() if compared else np.empty(0),
         positions=compared.topics if compared else [],
         drives=drives,
@@ -356,9 +356,9 @@ def _digests_from(path: Path, cell: Cell) -> dict[str, str]:
     return rest.result()
 
 
-def _errors_from(path: Path, first: int) -> ErrorsByRevolution:
+def _errors_from(path: Path, first: int) -> RunningForm:
     """Return the recorded form errors of a bag from a sample on."""
     with Source(path) as source:
-        errors = ErrorsByRevolution({name: said.type for name, said in source.topics.items()})
+        errors = RunningForm.of({name: said.type for name, said in source.topics.items()})
     feed(path, [From(errors, first)])
     return errors

@@ -28,6 +28,7 @@ import subprocess
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,7 +41,6 @@ from numpy.typing import NDArray
 
 from lathe_explore.sweep import NUMBERS
 from lathe_rc import __version__, allowed_code, messages
-from lathe_rc.analysis.tolerance import judge_zones
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.batch import CellRunner, Errors, Topics
 from lathe_rc.cell.events import LIMITED, OUT_OF_REACH, parse
@@ -51,10 +51,10 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.extensions import attribute
 from lathe_rc.judge.loops import FIGURES, loops, watches
+from lathe_rc.judge.part import Limits
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
-from lathe_rc.signals.zones import ZoneErrors
 
 if TYPE_CHECKING:
     from lathe_explore.sweep.description import Target
@@ -214,7 +214,13 @@ class _Keeper(Errors):
     """Sink that collects the form error, the limited nodes, and the measured signals of a run."""
 
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
-        super().__init__(cell, samples)
+        parameters = {name: stage.shared for name, stage in cell.stages.items()}
+        tool = next((topic for topic, source in cell.dense.items() if source.type == messages.TOOL), "")
+        self._limits = Limits.of(judged(parameters), f"/{tool}")
+        super().__init__(cell, samples, self._limits.zones)
+        if self._limits.tolerance:
+            self._limits = replace(self._limits, doubt=form_doubt(parameters))
+        self._first = cell.first
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self._functions = [each.statistic for each in measures if not each.topic]
         self._whole = Topics(cell, samples, [*cell.dense, *cell.sparse]) if self._functions else None
@@ -227,17 +233,10 @@ class _Keeper(Errors):
         if self._whole:
             self.heard = self._whole.heard
         self._limited: set[str] = set()
-        parameters = {name: stage.shared for name, stage in cell.stages.items()}
-        forms = [each for each in judged(parameters).values() if each.quantity == "form"]
-        self._tolerance = forms[0].tolerance if forms else 0.0
-        self._doubt = form_doubt(parameters) if self._tolerance else 0.0
-        self._zones = forms[0].zones if forms else ()
-        self._by_zone: ZoneErrors | None = None
-        self.heard = [*self.heard, *([f"{self._tool}.height"] if self._zones else [])]
         self._measures = measures
         # The digest of a cell without a tool is that of what is measured.
         self._signals = {
-            (each.topic, each.field): np.empty(samples) for each in measures if not (each.node and self._tool)
+            (each.topic, each.field): np.empty(samples) for each in measures if not (each.node and self.form.tool)
         }
         self._turns = RunningErrors()  # a cell without a tool has no form error, but revolutions all the same
         self._hash = xxhash.xxh3_128()
@@ -250,27 +249,17 @@ class _Keeper(Errors):
         for topic, said in sparse.items():
             if topic in self._events and any(parse(message.values["action"]).verb in LIMITS for message in said):
                 self._limited.add(topic.removesuffix("/events"))
-        if self._tool:
-            self._hash.update(_bytes(dense[self._tool]["error"]))
-            if self._zones:
-                self._add_zones(dense, self.soundness.sound(first, samples, sparse))
-        elif self._measures and self._encoder:
-            angle = dense[self._encoder]["angle_true"]
+        if self.form.tool:
+            self._hash.update(_bytes(dense[self.form.tool]["error"]))
+        elif self._measures and self.form.encoder:
+            angle = dense[self.form.encoder]["angle_true"]
             if first == self._first > 0:
-                self._turns = RunningErrors(turns_before(angle))
+                self._turns = RunningErrors(turns_before(angle, first))
             self._turns.add(angle, angle)
         for (topic, field), kept in self._signals.items():
             kept[first - self._first :][:samples] = dense[topic][field]
         for watch in self._loops:
             watch.chunk(first, samples, dense, sparse)
-
-    def _add_zones(self, dense: Mapping[str, Signals], sound: int) -> None:
-        """Add the first ``sound`` samples of a chunk to the errors by zone."""
-        assert self._encoder, "a tool needs one"
-        assert self._tool, "as before"
-        self._by_zone = self._by_zone or ZoneErrors(self._zones, self._before)
-        tool, angle = dense[self._tool], dense[self._encoder]["angle_true"]
-        self._by_zone.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
 
     def row(self, errors: FormErrors) -> dict[str, Any]:
         """Return the result columns of a completed run.
@@ -278,12 +267,12 @@ class _Keeper(Errors):
         Raises:
             LatheError: a function of the recording has no finite value.
         """
-        starts = (errors if self._tool else self._turns.found()).starts
+        starts = (errors if self.form.tool else self._turns.found()).starts
         last = slice(*starts[-2:]) if starts.size > 1 else slice(None)  # all, without a complete revolution
         found: dict[str, Any] = {
             "limits": ", ".join(sorted(self._limited)),
             "revolutions": errors.rms.size,
-            "digest": _told(self._hash) if self._tool else _digest(list(self._signals.values())),
+            "digest": _told(self._hash) if self.form.tool else _digest(list(self._signals.values())),
         }
         results = {watch.loop.node: watch.result() for watch in self._loops}
         for each in self._measures:
@@ -291,7 +280,7 @@ class _Keeper(Errors):
                 found[each.name] = STATISTICS[each.statistic](self._signals[each.topic, each.field][last])
             elif (result := results[each.node]).found.errors.rms.size and not result.why:
                 found[each.name] = FIGURES[each.statistic][0](result)
-        if errors.rms.size and not self.soundness.why:
+        if errors.rms.size and not self.form.soundness.why:
             for name, values in (("max", errors.largest), ("rms", errors.rms)):
                 found |= {f"tool.first_{name}_error": values[0], f"tool.{name}_error": values[-1]}
                 found[f"tool.{name}_errors"] = values
@@ -301,11 +290,7 @@ class _Keeper(Errors):
                 found[name] = value = float(function(name)(recording))
                 if not math.isfinite(value):
                     raise LatheError(f"{name} is {value}; allowed: a finite number")
-        if self._tolerance and not self.soundness.why:
-            by_zone = self._by_zone.largest() if self._by_zone else []
-            verdict = judge_zones(
-                errors.largest, by_zone, self._tolerance, self._zones, self._before, doubt=self._doubt
-            )
+        if not self.form.soundness.why and (verdict := self._limits.verdict(self.form)):
             found["tool.in_tolerance_from"] = verdict.since or None
         return found
 

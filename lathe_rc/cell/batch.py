@@ -24,13 +24,14 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.collect import Collector
 from lathe_rc.cell.engine import Engine, Sink
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import Scenario, of_load
-from lathe_rc.cell.soundness import Soundness
 from lathe_rc.cell.stage_cache import StageCache
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import Signals
-from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
+from lathe_rc.signals.form_errors import FormErrors
+from lathe_rc.signals.zones import Zone
 
 K_co = TypeVar("K_co", covariant=True)
 
@@ -171,31 +172,23 @@ def _outcome(scenario: Scenario, keep: Make[K_co], idle: deque[CellRunner]) -> O
 
 
 class Errors:
-    """Keeper of the form error by revolution, up to a fault of a signal that it is made of (`soundness`)."""
+    """Keeper of the form error by revolution (``form``), by zones if there are some."""
 
-    def __init__(self, cell: Cell, samples: int) -> None:
-        named = {source.type: topic for topic, source in reversed(cell.dense.items())}
-        self._encoder, self._tool = named.get(messages.ENCODER), named.get(messages.TOOL)
-        read = {self._encoder: "angle_true", self._tool: "error"}
-        self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read.items() if topic]
-        types = {topic: source.type for topic, source in cell.dense.items()}
-        self.soundness = Soundness.of_form(types)
+    def __init__(self, cell: Cell, samples: int, zones: Sequence[Zone] = ()) -> None:
+        self.form = RunningForm.of({topic: source.type for topic, source in cell.dense.items()}, zones)
+        encoder, tool = self.form.encoder, self.form.tool
+        read = [(encoder, "angle_true"), (tool, "error"), *([(tool, "height")] if zones else [])]
+        self.heard: Collection[str] = [f"{topic}.{field}" for topic, field in read if topic]
         if any(stage.shared.faults for stage in cell.stages.values()):
             self.heard = [*self.heard, *(t for t, source in cell.sparse.items() if source.type == messages.EVENT)]
-        self._errors, self._first, self._before = RunningErrors(), cell.first, 0
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Process a chunk of the run, as a sink of the engine."""
-        if self._encoder and self._tool:
-            if first == self._first > 0:
-                self._before = turns_before(dense[self._encoder]["angle_true"])
-                self._errors = RunningErrors(self._before)
-            sound = self.soundness.sound(first, samples, sparse)
-            self._errors.add(dense[self._encoder]["angle_true"][:sound], dense[self._tool]["error"][:sound])
+        self.form.chunk(first, samples, dense, sparse)
 
     def kept(self) -> FormErrors:
         """Return the form error of each complete revolution; empty if the scenario has no tool."""
-        return self._errors.found()
+        return self.form.found()
 
 
 class Topics(Collector):

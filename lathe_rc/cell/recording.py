@@ -13,11 +13,13 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.blocks.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.blocks.ports import Sparse
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError
 from lathe_rc.messages import START_NS, Samples, Signals, full, signals_of
-from lathe_rc.signals.form_errors import FormErrors, form_errors, turns_at_end, turns_before
+from lathe_rc.signals.form_errors import FormErrors, turns_at_end, turns_before
+from lathe_rc.signals.zones import Zone
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -110,7 +112,7 @@ class Recording:
     @property
     def turns_before(self) -> int:
         """Number of revolutions before the first complete one, as in a snapshot; needs a recorded encoder."""
-        return turns_before(self.of_type(messages.ENCODER)["angle_true"])
+        return turns_before(self.of_type(messages.ENCODER)["angle_true"], self.first)
 
     @property
     def samples(self) -> int:
@@ -128,11 +130,13 @@ class Recording:
     @cached_property
     def errors(self) -> FormErrors:
         """Form error of each complete revolution; empty if there is no tool."""
-        if not {messages.ENCODER, messages.TOOL} <= {self.types[topic] for topic in self.dense}:
-            return form_errors(np.empty(0), np.empty(0))
-        sound, _ = self.sound_form
-        angle = self.of_type(messages.ENCODER)["angle_true"][:sound]
-        return form_errors(angle, self.of_type(messages.TOOL)["error"][:sound], turns_before(angle))
+        return self.form().found()
+
+    def form(self, zones: Sequence[Zone] = ()) -> RunningForm:
+        """Return the form of the part by revolution, and by zones with tolerances of their own."""
+        form = RunningForm.of(self.types, zones)
+        form.chunk(self.first, self.samples, self.dense, self.events)
+        return form
 
     @cached_property
     def sound_form(self) -> tuple[int, str]:

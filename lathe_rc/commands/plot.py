@@ -8,8 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from lathe_rc import harness, messages
-from lathe_rc.signals.form_errors import turns_before
+from lathe_rc import harness
 
 _ROWS = 12  # approximate height of the plot without frame and ticks [lines]
 _FRAME = 3  # lines of frame and ticks
@@ -37,8 +36,7 @@ def drawn(result: harness.Result, width: int) -> Text | None:
     rms, largest = np.asarray(result.errors.rms) * 1e6, np.asarray(result.errors.largest) * 1e6
     if rms.size < 2 or not (np.isfinite(largest).all() and rms.all()):
         return None
-    encoders = [topic for topic, kind in result.recording.types.items() if kind == messages.ENCODER]
-    first = turns_before(result.recording.dense[encoders[0]]["angle_true"]) + 1
+    first = result.recording.turns_before + 1
     groups = np.array_split(np.arange(rms.size), min(rms.size, _POINTS * width))
     revolution = [first + int(group[-1]) for group in groups]
     curves = [("largest", "gray+", largest), ("RMS", "cyan+", rms)]

@@ -154,7 +154,7 @@ class Result:
     @property
     def growth(self) -> Growth | None:
         """Growth of a diverging or otherwise growing form error; None if it does not grow."""
-        return part.error_growth(self.recording)
+        return part.error_growth(self.recording.form())
 
     @cached_property
     def loops(self) -> "dict[str, LoopResult]":

@@ -248,7 +248,7 @@ class LoopWatch:
         sound = self._soundness.sound(first, dense[encoder]["angle_true"].size, sparse)
         angle, servo = dense[encoder]["angle_true"][:sound], dense[topic]
         if self._running is None:
-            self._before = turns_before(angle)
+            self._before = turns_before(angle, first)
             self._running = self.loop.running(self._before)
         if sound:
             self._running.add(angle, *(servo[name][:sound] for name in ("set_point", "error", "command")))

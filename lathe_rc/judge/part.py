@@ -2,6 +2,7 @@
 """Metrology of the turned part: form errors, roughness and tolerance from a recording of a run."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,12 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
 from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.recording import Recording
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
-from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.signals.form_errors import RunningErrors, that_count, turns_before
-from lathe_rc.signals.zones import Zone, ZoneErrors
+from lathe_rc.messages import Signals, full
+from lathe_rc.signals.form_errors import that_count, turns_before
+from lathe_rc.signals.zones import Zone
 
 _CUTOFF = 50.0  # cutoff of the roundness and roughness filters [undulations per revolution]
 _TOGETHER = 16  # number of revolutions evaluated together
@@ -43,7 +44,8 @@ def measured(recording: Recording, *, cutoff: float = _CUTOFF) -> Measurement:
         recording.of_type(kind)[field][:sound]
         for kind, field in ((messages.ENCODER, "angle_true"), (messages.TOOL, "error"))
     )
-    found = measure(angle - 2.0 * np.pi * turns_before(angle), error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
+    angle = angle - 2.0 * np.pi * recording.turns_before
+    found = measure(angle, error, roundness_cutoff=cutoff, roughness_cutoff=cutoff)
     if not found.form.rms.size:
         why = f": {reason}" if reason else "; let it run longer"
         raise InputError(f"nothing to measure: the recording has no complete revolution{why}")
@@ -61,11 +63,43 @@ def zones(declared: Mapping[str, Judged]) -> dict[str, tuple[Zone, ...]]:
     return {each.topic: each.zones for each in declared.values() if each.zones}
 
 
-def limits(declared: Mapping[str, Judged], topic: str) -> tuple[float, tuple[Zone, ...]]:
-    """Return the tolerance [m] that is declared for a tool, by its fully qualified topic, and its zones; 0: none."""
-    own = [each for each in declared.values() if topic.endswith(f"/{each.topic}")]
-    allowed = next((each.tolerance for each in own if each.quantity == "form" and each.tolerance), 0.0)
-    return allowed, next((each.zones for each in own if each.zones), ())
+@dataclass(frozen=True)
+class Limits:
+    """What the form of a part is judged by.
+
+    Attributes:
+        tolerance: allowed form error to each side [m]; 0: the tool has no tolerance.
+        zones: parts of the surface with tolerances of their own.
+        doubt: how far the desired form may be off between the points of its table [m].
+    """
+
+    tolerance: float = 0.0
+    zones: tuple[Zone, ...] = ()
+    doubt: float = 0.0
+
+    @classmethod
+    def of(cls, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> "Limits":
+        """Return what nodes declare for the tool of a fully qualified topic."""
+        own = [each for each in declared.values() if topic.endswith(f"/{each.topic}")]
+        allowed = next((each.tolerance for each in own if each.quantity == "form" and each.tolerance), 0.0)
+        return cls(allowed, next((each.zones for each in own if each.zones), ()), doubt)
+
+    def verdict(self, form: RunningForm, unjudged: str = "") -> Verdict | None:
+        """Judge a form, measured by the same zones, as if the run ended after the samples so far.
+
+        Args:
+            form: the form.
+            unjudged: reason why the end of the run cannot be judged; empty if it can.
+
+        Returns:
+            None without a tolerance.
+        """
+        if not self.tolerance:
+            return None
+        by_zone, before = form.by_zone, form.before
+        return judge_zones(
+            form.largest, by_zone, self.tolerance, self.zones, before, unjudged=unjudged, doubt=self.doubt
+        )
 
 
 def strictest(declared: Mapping[str, Judged]) -> float:
@@ -82,80 +116,13 @@ def nose_radius(declared: Mapping[str, Judged]) -> float:
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
-    allowed, by_zone = limits(judged(scenario.nodes), topic)
-    if not allowed:
-        return None
-    (sound, why), doubt, before = recording.sound_form, form_doubt(scenario.nodes), _turns_before(recording)
-    errors, tool = ZoneErrors(by_zone, before), recording.dense[topic]
-    angle = recording.of_type(messages.ENCODER)["angle_true"]
-    errors.add(angle[:sound], tool["height"][:sound], tool["error"][:sound])
-    largest = recording.errors.largest
-    return judge_zones(largest, errors.largest(), allowed, by_zone, before, unjudged=why, doubt=doubt)
+    limits = Limits.of(judged(scenario.nodes), topic, form_doubt(scenario.nodes))
+    return limits.verdict(recording.form(limits.zones), recording.sound_form[1])
 
 
-class RunningVerdict:
-    """Verdict on the form of a part and growth of its error, chunk by chunk.
-
-    Where samples are missing, it begins anew, as for a snapshot: it is about the complete revolutions since then.
-
-    Args:
-        declared: declarations of the nodes by name.
-        topic: fully qualified topic of the tool.
-        doubt: how far the desired form may be off between the points of its table [m].
-
-    Attributes:
-        tolerance: allowed error to each side [m]; 0: the tool has no tolerance.
-        before: number of revolutions before the first one evaluated.
-    """
-
-    def __init__(self, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> None:
-        self.tolerance, self._zones = limits(declared, topic)
-        self._doubt, self._next = doubt, -1
-        self._begin(0)
-
-    def _begin(self, before: int) -> None:
-        self.before = before
-        self._errors, self._by_zone = RunningErrors(before), ZoneErrors(self._zones, before)
-
-    def add(self, first: int, angle: Samples, tool: Signals) -> None:
-        """Add samples from index ``first`` on: true spindle angle [rad], shape (n,), and the signals of the tool."""
-        if first != self._next and angle.size:
-            self._begin(int(np.ceil(angle[0] / (2.0 * np.pi))) if first else turns_before(angle))
-        self._next = first + angle.size
-        self._errors.add(angle, tool["error"])
-        self._by_zone.add(angle, tool["height"], tool["error"])
-
-    @property
-    def largest(self) -> np.ndarray:
-        """Largest form error of each complete revolution [m], shape (revolutions,)."""
-        return self._errors.largest()
-
-    def verdict(self, unjudged: str = "") -> Verdict | None:
-        """Judge the part as if the run ended after the samples so far; None without a tolerance.
-
-        Args:
-            unjudged: reason why the end of the run cannot be judged; empty if it can.
-        """
-        if not self.tolerance:
-            return None
-        by_zone = self._by_zone.largest()
-        return judge_zones(
-            self.largest, by_zone, self.tolerance, self._zones, self.before, unjudged=unjudged, doubt=self._doubt
-        )
-
-    def growth(self) -> Growth | None:
-        """Return the growth of the form error."""
-        return growth(self.largest, self.before)
-
-
-def error_growth(recording: Recording) -> Growth | None:
-    """Return the growth of a run's form error (see `lathe_rc.analysis.tolerance.growth`)."""
-    return growth(recording.errors.largest, _turns_before(recording))
-
-
-def _turns_before(recording: Recording) -> int:
-    """Return the number of revolutions before the first form error."""
-    return recording.turns_before if recording.errors.rms.size else 0
+def error_growth(form: RunningForm) -> Growth | None:
+    """Return the growth of a form error (see `lathe_rc.analysis.tolerance.growth`)."""
+    return growth(form.largest, form.before)
 
 
 def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay:
@@ -168,7 +135,7 @@ def surface(recording: Recording, found: Measurement, nose_radius: float) -> Lay
     """
     sound, _ = recording.sound_form
     angle, height = recording.of_type(messages.ENCODER)["angle_true"], recording.of_type(messages.TOOL)["height"]
-    height = evenly(angle[:sound] - 2.0 * np.pi * turns_before(angle), height[:sound])
+    height = evenly(angle[:sound] - 2.0 * np.pi * recording.turns_before, height[:sound])
     return lay(found.profile, height, nose_radius)
 
 
@@ -215,46 +182,6 @@ def numbers(found: Measurement, revolution: int) -> dict[str, Any]:
     }
 
 
-def _encoder_and_tool(types: Mapping[str, str]) -> list[str | None]:
-    """Return the first encoder topic and the first tool topic; None for a missing one."""
-    kinds = (messages.ENCODER, messages.TOOL)
-    return [next((topic for topic, found in types.items() if found == kind), None) for kind in kinds]
-
-
-class ErrorsByRevolution:
-    """Form error of each revolution, collected chunk by chunk; a sink of the engine and `lathe_rc.bag.reading.stream`.
-
-    Args:
-        types: message type by fully qualified topic.
-
-    Attributes:
-        turns_before: number of revolutions before the first one.
-        soundness: end of the samples on which the form error may rest.
-    """
-
-    def __init__(self, types: Mapping[str, str]) -> None:
-        self._topics, self.soundness = _encoder_and_tool(types), Soundness.of_form(types)
-        self._errors: RunningErrors | None = None
-        self.turns_before = 0
-
-    def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
-        """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
-        encoder, tool = self._topics
-        if encoder is None or tool is None:
-            return
-        named = {full(topic): signals for topic, signals in dense.items()}
-        angle, error = named[encoder]["angle_true"], named[tool]["error"]
-        if self._errors is None:
-            self.turns_before = turns_before(angle)
-            self._errors = RunningErrors(self.turns_before)
-        sound = self.soundness.sound(first, samples, sparse)
-        self._errors.add(angle[:sound], error[:sound])
-
-    def rms(self) -> np.ndarray:
-        """Return the RMS form error of each complete revolution so far [m], shape (revolutions,)."""
-        return (self._errors or RunningErrors()).found().rms
-
-
 class FirstAndLast:
     """Sink of the engine that collects the first and the last revolutions of a run, chunk by chunk.
 
@@ -266,10 +193,8 @@ class FirstAndLast:
     """
 
     def __init__(self, types: Mapping[str, str]) -> None:
-        encoder, tool = _encoder_and_tool(types)
-        assert encoder is not None, "its caller has looked"
-        assert tool is not None, "its caller has looked"
-        self._encoder, self._tool, self.soundness = encoder, tool, Soundness.of_form(types)
+        form = RunningForm.of(types)
+        self._encoder, self._tool, self.soundness = form.encoder, form.tool, form.soundness
         self._head = self._tail = np.empty((2, 0))  # angle and error
         self._start = 0.0  # angle at the start of the first revolution [rad]
         self._before = 0  # revolutions before the tail
@@ -283,7 +208,7 @@ class FirstAndLast:
         angle, error = named[self._encoder]["angle_true"][:sound], named[self._tool]["error"][:sound]
         piece = np.stack([angle, error])[:, that_count(angle, error)]
         if not self._tail.size:
-            self._before = turns_before(piece[0])
+            self._before = turns_before(piece[0], first)
             self._start = 2.0 * np.pi * self._before
         if self._head.size == 0 or np.ptp(self._head[0]) < _TOGETHER * 2.0 * np.pi:
             self._head = np.concatenate([self._head, piece], axis=1)

@@ -50,13 +50,15 @@ class FormErrors:
         return [f"{error} {' to '.join(ends)} {unit} RMS"] if ends else []
 
 
-def turns_before(angle: Array) -> int:
+def turns_before(angle: Array, first: int) -> int:
     """Return the number of revolutions before the first complete one: 0 for a run, more for a snapshot.
 
     Args:
         angle: true spindle angle [rad], shape (n,).
+        first: index of the first sample.
     """
-    return int(np.ceil(angle[0] / _TURN)) if angle.size and angle[0] >= _TURN else 0
+    within = angle.size and (first or angle[0] >= _TURN)  # a run counts its first revolution from wherever it begins
+    return max(int(np.ceil(angle[0] / _TURN)), 0) if within else 0
 
 
 def turns_at_end(before: float, last: float) -> int:

@@ -62,7 +62,7 @@ class ZoneErrors:
     """Largest form error of each revolution outside of all zones and in each zone, fed chunk by chunk.
 
     Args:
-        zones: the zones; without any, there is nothing to feed.
+        zones: the zones; without any, there is nothing to add.
         first: number of revolutions before the first evaluated one.
     """
 
@@ -72,8 +72,6 @@ class ZoneErrors:
 
     def add(self, angle: Array, height: Array, error: Array) -> None:
         """Process a chunk: true angle [rad], height [m] and form error [m], shape (n,)."""
-        if not self._zones:
-            return
         place = zone_at(self._zones, angle, height)
         for number, running in enumerate(self._running):
             running.add(angle, np.where(place == number, error, 0.0))

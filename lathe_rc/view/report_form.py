@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Form of the part from a stream of samples; each revolution is measured as soon as it is complete."""
 
-from array import array
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -11,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from lathe_rc.analysis.metrology import POINTS, Lay, Measurement, evenly, lay, measure
-from lathe_rc.analysis.tolerance import LAST, Growth, Verdict, growth, judge_zones
+from lathe_rc.analysis.tolerance import LAST, Growth, Verdict
 from lathe_rc.blocks.ports import Sparse
+from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.soundness import Soundness
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.form_errors import that_count
-from lathe_rc.signals.zones import Zone, ZoneErrors
 from lathe_rc.view.report_series import Envelope, MeanRows
 
 ACROSS = 512  #: number of angles in the map
@@ -51,14 +50,12 @@ class Form:
     Args:
         encoder: topic with the angle.
         tool: topic with the form error.
-        tolerance: allowed form error in either direction [m]; 0: no tolerance.
+        limits: what the form is judged by.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
         types: message types of the bag by topic, for the signals that the form error is made of.
-        doubt: how far the desired form may be off between the points of its table [m].
-        zones: parts of the surface with tolerances of their own.
 
     Attributes:
-        tool, tolerance, zones: see the arguments.
+        tool, limits: see the arguments.
         first, last, best: first, last and best (by RMS) revolution; None until one is measured.
         rms, largest: envelopes over the revolutions [m].
         map: radius deviation [m], by revolution and angle.
@@ -71,21 +68,16 @@ class Form:
         self,
         encoder: str,
         tool: str,
-        tolerance: float = 0.0,
+        limits: part.Limits = part.Limits(),  # noqa: B008 - it never changes
         nose_radius: float = 0.0,
-        doubt: float = 0.0,
         types: Mapping[str, str] = MappingProxyType({}),
-        zones: Sequence[Zone] = (),
     ) -> None:
-        self._soundness = Soundness.of_form(types)
-        self._encoder, self.tool, self.tolerance, self.doubt = encoder, tool, tolerance, doubt
-        self._nose_radius = nose_radius
-        self._largest, self._before = array("d"), 0  # form error [m] of each revolution; number of previous revolutions
+        self._part = RunningForm(encoder, tool, Soundness.of_form(types), limits.zones)
+        self._encoder, self.tool, self.limits, self._nose_radius = encoder, tool, limits, nose_radius
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
         self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
         self.surface: Lay | str | None = None
-        self.zones, self._by_zone = zones, ZoneErrors(zones)
         self._done = 0  # revolutions measured
         self.first: Revolution | None = None
         self.last: Revolution | None = None
@@ -99,36 +91,36 @@ class Form:
         """Add consecutive samples; revolutions are measured as soon as they are complete."""
         if self.refused:
             return
-        sound = self._soundness.sound(first, samples, sparse)
+        soundness = self._part.soundness
+        sound = soundness.sound(first, samples, sparse)
         if not sound:
-            self._refuse(self._soundness.why)
+            self._refuse(soundness.why)
             return
         angle = dense[self._encoder]["angle_true"][:sound]
         tool = {name: array[:sound] for name, array in dense[self.tool].items()}
+        try:
+            self._part.add(first, angle, tool)
+        except InputError as error:
+            self._refuse(str(error))
+            return
         if first and not self._held.size and not self._done:  # a snapshot begins in the middle of a revolution
-            self._done = self._before = int(np.ceil(angle[0] / _TURN))
-            self._by_zone = ZoneErrors(self.zones, self._before)
-        if self.zones:
-            self._by_zone.add(angle, tool["height"], tool["error"])
+            self._done = self._part.before
         height = tool["height"] if self._nose_radius else np.zeros(sound)
         new = np.stack([angle, tool["error"], height])[:, that_count(angle, tool["error"])]
         self._held = np.concatenate([self._held, new], axis=1)
         self._measure(0 if sound < samples else _MARGIN)
         if sound < samples and not self.refused:
-            self._refuse(self._soundness.why)
+            self._refuse(soundness.why)
 
     @property
     def verdict(self) -> Verdict | None:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
-        if not self.tolerance or self.refused:
-            return None
-        largest, by_zone = np.array(self._largest), self._by_zone.largest()
-        return judge_zones(largest, by_zone, self.tolerance, self.zones, self._before, doubt=self.doubt)
+        return None if self.refused else self.limits.verdict(self._part)
 
     @property
     def growth(self) -> Growth | None:
         """Return the growth of the form error over the measured revolutions; None if it does not grow."""
-        return growth(np.array(self._largest), self._before)
+        return part.error_growth(self._part)
 
     def finish(self) -> None:
         """Measure the remaining revolutions."""
@@ -207,7 +199,6 @@ class Form:
         rms = found.form.rms[:whole]
         self.rms.add(rms)
         self.largest.add(found.form.largest[:whole])
-        self._largest.extend(found.form.largest[:whole])
         if self.first is None:
             self.first = self._revolution(found, 0)
         best = int(np.argmin(rms))

@@ -223,10 +223,9 @@ def gather(path: Path) -> Gathered:
             unjudged = str(error)
         nose, doubt = part.nose_radius(declared), provenance.doubt_of(source.about)
         forms = [
-            Form(encoder, tool, allowed, nose, doubt, types, zones)
+            Form(encoder, tool, part.Limits.of(declared, tool, doubt), nose, types)
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
-            for allowed, zones in [part.limits(declared, tool)]
         ]
         tallies = {topic: Tally(kind) for topic, kind in sorted(types.items())}
         servos = [Servo(watch) for watch in watches(loops(declared), types)]
