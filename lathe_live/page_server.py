@@ -30,11 +30,13 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from lathe_rc.drawing.pages import own_file
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, of_name, shown
 
 HOST = "127.0.0.1"  #: the only interface
 TOKEN = "X-Lathe-Token"  # noqa: S105 - the header with the token, which the scripts of a page send
 _LARGEST = 2**20  # request [B]
+_LONGEST = 400  # error [characters]
+_DIGITS = 300  # digits of an integer from which on it counts as infinite
 _LOOSE = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 
 
@@ -133,10 +135,9 @@ async def _told(answer: Answer, request: Request) -> Response:
     """Return the response to a question."""
     try:
         found = await run_in_threadpool(answer, await _question(request))
-    except InputError as error:
-        return JSONResponse({"error": str(error)}, 400)
-    except LatheError as error:
-        return JSONResponse({"error": str(error)}, 500)
+    except (LatheError, OSError) as error:
+        told = of_name(error) if isinstance(error, OSError) else error
+        return JSONResponse({"error": shown(told, _LONGEST)}, 400 if isinstance(told, InputError) else 500)
     return JSONResponse(found, headers=_LOOSE)
 
 
@@ -153,11 +154,13 @@ async def _question(request: Request) -> Mapping[str, Any]:
             if len(body) > _LARGEST:
                 raise InputError(f"question of more than {_LARGEST} B; allowed: a smaller one")
     try:
-        found = json.loads(body or b"{}")
+        # An integer beyond all numbers is refused as infinity by the one that asks for a number.
+        found = json.loads(body or b"{}", parse_int=lambda digits: (int if len(digits) < _DIGITS else float)(digits))
+        json.dumps(found, ensure_ascii=False).encode()  # refuses half a character
     except (ValueError, RecursionError):
         found = None
-    if not isinstance(found, dict):
-        raise InputError("a question that is no JSON object; allowed: an object")
+    if not isinstance(found, dict) or b"\\u0000" in body:
+        raise InputError("a question that is no JSON object of numbers and texts without NUL; allowed: such an object")
     return found
 
 

@@ -15,7 +15,7 @@ from click.shell_completion import CompletionItem
 
 from lathe_rc import __version__, allowed_code, extras
 from lathe_rc.catalogue import COMMANDS
-from lathe_rc.errors import LatheError, shown
+from lathe_rc.errors import LatheError, of_name, shown
 
 
 class _Command(click.Command):
@@ -47,9 +47,10 @@ class Group(click.Group):
         try:
             with extras.named(), allowed_code.call():
                 return super().invoke(ctx)
-        except LatheError as error:
-            click.echo(f"lathe: {error}", err=True)
-            ctx.exit(error.exit_code)
+        except (LatheError, OSError) as error:
+            told = of_name(error) if isinstance(error, OSError) else error
+            click.echo(f"lathe: {told}", err=True)
+            ctx.exit(told.exit_code)
         except MemoryError as error:
             click.echo(f"lathe: not enough memory ({shown(error)})", err=True)
             ctx.exit(LatheError.exit_code)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that the user can correct: each has a one-line message and an exit code."""
 
+import errno
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import ClassVar
 
@@ -41,6 +42,17 @@ def shown(text: object, longest: int = 200) -> str:
     """Return the beginning of the first line of an external message, in printable characters."""
     first = (str(text).strip().splitlines() or [type(text).__name__])[0]
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])
+
+
+def of_name(error: OSError) -> InputError:
+    """Return the refusal of a file whose name is too long for the file system.
+
+    Raises:
+        OSError: the error is another one.
+    """
+    if error.errno != errno.ENAMETOOLONG:
+        raise error
+    return InputError(f"{shown(error.filename, 60)}…: the name is too long; allowed: a name that the file system takes")
 
 
 def at_most(value: float, digits: int = 6) -> str:

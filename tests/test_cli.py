@@ -202,6 +202,13 @@ def test_missing_scenario_is_refused_with_those_of_like_names(name, said):
     assert_refused(lathe("run", name), said)
 
 
+@pytest.mark.parametrize("options", [["LONG"], ["cell.yaml", "--bag", "LONG"], ["cell.yaml", "--figure", "LONG.png"]])
+def test_a_name_that_no_file_system_takes_is_refused(options):
+    assert_refused(
+        lathe("run", *(option.replace("LONG", "x" * 5000) for option in options)), "the name is too long; al"
+    )
+
+
 def test_a_run_that_no_memory_holds_is_refused_with_what_it_takes(folder):
     """A run that needs more than the free memory is refused with its need, before anything begins, in every mode."""
     said = "spindle_encoder.revolutions = 1e+09: 3.84e+12 samples"

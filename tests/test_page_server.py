@@ -5,6 +5,7 @@ import http.client
 import json
 import re
 import socket
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -23,6 +24,7 @@ SITE = Site(
     {
         "twice": lambda question: {"found": 2 * question["value"]},
         "refuse": refuse,
+        "file": lambda question: {"found": Path(question["name"]).exists()},
     },
 )
 
@@ -63,10 +65,16 @@ def test_a_page_contains_all_that_it_needs_and_the_browser_allows_nothing_else(a
 def test_answers_are_data_and_refusals(address):
     assert ask(address, "twice", {"value": 21})[:2] == (200, '{"found":42}')
     assert ask(address, "refuse", {"gain": 3})[:2] == (400, '{"error":"gain = 3; allowed: less"}')
+    assert ask(address, "refuse", {"gain": "x" * 5000})[:2] == (400, f'{{"error":"gain = {"x" * 393}"}}')
+    assert ask(address, "file", {"name": "x" * 5000})[0] == 400
+    assert ask(address, "file", {"name": "9" * 5000})[0] == 400
+    assert ask(address, "refuse", f'{{"gain": {"9" * 4000}}}')[:2] == (400, '{"error":"gain = inf; allowed: less"}')
     assert ask(address, "nothing", {})[0] == 404
 
 
-@pytest.mark.parametrize("question", ["[1]", "{", "[" * 100_000, "x" * (2**20 + 1)])
+@pytest.mark.parametrize(
+    "question", ["[1]", "{", "[" * 100_000, "x" * (2**20 + 1), '{"value": "\\u0000"}', '{"value": "\\ud800"}']
+)
 def test_a_question_that_is_no_object_is_refused(address, question):
     assert ask(address, "twice", question)[0] == 400
 
