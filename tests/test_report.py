@@ -30,6 +30,7 @@ from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.judge.causes import changing
 from lathe_rc.view import report as reporting
+from lathe_rc.view.form_limits import form_limits
 from lathe_rc.view.report_figures import against_time, colour_range, spectrum_range, timing
 from lathe_rc.view.report_form import Form, Revolution
 from lathe_rc.view.report_gather import gather
@@ -204,6 +205,19 @@ class TestVerdict:
         assert told.verdict.mood == "bad"
         assert re.search(r"falls by [\d.]+% a revolution; in tolerance after some \d+ more", told.limits[0].text)
         assert "repeats from revolution to revolution, most at 2 waves a turn" in told.limits[1].text
+
+    @pytest.mark.parametrize(
+        ("offset", "largest"),
+        [(0.0, "most at 3 waves a turn (1 µm)"), (-5.0, "most in the size of the part (5 µm of the radius)")],
+    )
+    def test_tells_the_largest_part_of_what_repeats(self, offset, largest):
+        """Learning leaves it only where the error does not grow."""
+        profile = offset + np.sin(3.0 * np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False))
+        (settled,) = form_limits(np.tile(profile, (10, 1)), excess=0.0, learning=True, causes=[])
+        assert settled.text.endswith(f"{largest}: what learning and its Q filter leave.")
+        grows, repeats = form_limits(profile * 1.2 ** np.arange(10.0)[:, None], excess=0.0, learning=True, causes=[])
+        assert "grows by 20.0%" in grows.text
+        assert repeats.text.endswith((" µm).", " µm of the radius)."))
 
     def test_noise_changes_from_revolution_to_revolution(self, head):
         noise = {"noise_rms": 1e-6}

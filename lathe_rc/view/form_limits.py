@@ -47,15 +47,10 @@ def form_limits(profiles: Samples, *, excess: float, learning: bool, causes: Ite
     # The mean of count revolutions still contains 1/count of the variable power; the factor corrects this.
     mean = profiles.mean(axis=0)
     share = min(float(np.mean((profiles - mean) ** 2)) * count / (count - 1) / power, 1.0)
-    amplitude = np.abs(np.fft.rfft(mean)) * 2.0 / mean.size
-    order = int(np.argmax(amplitude[1:])) + 1
-    left = ": what learning and its Q filter leave" if learning else ""
-    named, waves = ", ".join(causes), "wave" if order == 1 else "waves"
+    left = ": what learning and its Q filter leave" if learning and not trend else ""
+    named = ", ".join(causes)
     parts = [
-        (
-            1.0 - share,
-            f"repeats from revolution to revolution, most at {order} {waves} a turn ({amplitude[order]:.3g} µm){left}",
-        ),
+        (1.0 - share, f"repeats from revolution to revolution, {_largest(mean)}{left}"),
         (share, f"changes from revolution to revolution{': ' if named else ''}{named}"),
     ]
     if trend:
@@ -63,6 +58,15 @@ def form_limits(profiles: Samples, *, excess: float, learning: bool, causes: Ite
     for part, text in sorted(parts, reverse=True):
         if part >= _SOME:
             yield Finding(f"{part:.0%} of the form error's power in the last {count} revolutions {text}.")
+
+
+def _largest(profile: Samples) -> str:
+    """Return the largest part of a profile [µm] in words: the size of the part, or an undulation."""
+    amplitude = np.abs(np.fft.rfft(profile)) * 2.0 / profile.size
+    order, size = int(np.argmax(amplitude[1:])) + 1, amplitude[0] / 2.0
+    if size * np.sqrt(2.0) > amplitude[order]:  # it has the larger power
+        return f"most in the size of the part ({size:.3g} µm of the radius)"
+    return f"most at {order} {'wave' if order == 1 else 'waves'} a turn ({amplitude[order]:.3g} µm)"
 
 
 def _trend(rms: Samples, excess: float) -> Finding | None:
