@@ -8,6 +8,7 @@ function drawCauses(found) {
   const percent = share => `${digits(Math.round(share * 1000) / 10)} %`, first = found.last - found.revolutions + 1;
   const names = [...large.map(part => `${part.cause} ${percent(part.share)}`), ...(others.length ? [`${others.map(part => part.cause).join(", ")} together ${percent(sum)}`] : [])];
   $("causes-of").textContent = `Form error of revolutions ${first} to ${found.last}, ${digits(found.rms, 3)} µm RMS, by lathe budget: shares in its power of ${names.join("; ")}`
+    + (found.warning ? `\n${found.warning}` : "")
     + Object.entries(found.left_out).map(([cause, why]) => `\nnot switched off: ${cause}: ${why}`).join("");
   const colours = style("--marks").split(" ");
   $("shares").replaceChildren(...large.filter(part => part.share > 0).map((part, k) => {
@@ -27,7 +28,8 @@ $("why").addEventListener("click", async () => {
   $("shares").replaceChildren();
   $("causes-of").textContent = "determining the causes by some 10 to 30 runs up to here…";
   openCauses(true);
-  const found = await tell($("causes-of"), "causes");
-  if (!found || run != HAVE.run) { $("causes-of").textContent = found ? "Another run has begun." : ""; return; }
-  drawCauses(found);
+  const found = await tell($("bar"), "causes");
+  if (found && run == HAVE.run) { drawCauses(found); return; }
+  openCauses(false);
+  if (found) answer($("bar"), "no causes: another run has begun", true);
 });

@@ -2,6 +2,7 @@
 """The parts of a form error add up, each is what it says, and interactions of causes are not hidden."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -198,6 +199,7 @@ def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
     assert found.left_out == {"Q floor": "learning_controller converges with no flat Q"}
     assert found.causes == []
     assert found.rest.share == pytest.approx(1.0)
+    assert re.fullmatch(r"form error diverges from revolution \d+ on: .*; the shares are of what .*", found.warning)
 
 
 @pytest.mark.parametrize(

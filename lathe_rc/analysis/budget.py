@@ -20,6 +20,7 @@ from itertools import combinations
 
 import numpy as np
 
+from lathe_rc.analysis.tolerance import Growth
 from lathe_rc.arrays import Array
 
 Causes = frozenset[str]
@@ -63,6 +64,7 @@ class Budget:
         interactions: sum of all interactions; causes, rest and interactions add up to the form error.
         pairs: interactions of two causes each; empty if the interactions have a share below `TOLD`.
         left_out: causes that could not be switched off, with the reason.
+        growth: growth of the form error over the run; None if it does not grow.
     """
 
     revolutions: int
@@ -73,11 +75,19 @@ class Budget:
     interactions: Part
     pairs: Sequence[Part] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    growth: Growth | None = None
 
     @property
     def rows(self) -> list[Part]:
         """Return the rows of a table: causes, rest, interactions, and the pairs with a share of `TOLD` or more."""
         return [*self.causes, self.rest, self.interactions, *(pair for pair in self.pairs if abs(pair.share) >= TOLD)]
+
+    @property
+    def warning(self) -> str:
+        """Why the shares do not tell the cause; empty if they do."""
+        if self.growth is None or not self.growth.diverges:
+            return ""
+        return f"{self.growth.told()}; the shares are of what the loop amplifies, not its cause"
 
     @property
     def explained(self) -> float:
@@ -96,6 +106,7 @@ class Budget:
             "pairs": [part.summary() for part in self.pairs],
             "explained": self.explained,
             "left_out": dict(self.left_out),
+            "warning": self.warning,
         }
 
 

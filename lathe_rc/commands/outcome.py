@@ -99,6 +99,7 @@ def budget_told(found: Budget) -> Iterator[RenderableType]:
     }
     yield tables.of_rows((*found.rows, whole), columns, left=1)
     yield from (Text(f"not switched off: {name}: {why}") for name, why in found.left_out.items())
+    yield from (Text(warning) for warning in filter(None, [found.warning]))
 
 
 def told(

@@ -2,14 +2,14 @@
 """Error budget of a scenario: contributions to the form error, determined by runs with causes switched off."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
-from lathe_rc.analysis.tolerance import LAST
+from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch, models
 from lathe_rc.cell.parameters import NodeParameters, Value, Values
@@ -18,6 +18,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.causes import EVERYWHERE, ORDER, PREFIXES
 from lathe_rc.messages import Samples, Signals
+from lathe_rc.signals.form_errors import form_errors
 from lathe_rc.stages.learning.learning_controller import LearningController
 from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
 from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
@@ -52,11 +53,13 @@ class _Tail:
         whole: number of complete revolutions in the run.
         error: form error at equally spaced angles [m], shape (revolutions, points).
         height: height of the tool along the part [m], shape (samples,).
+        largest: largest form error of each revolution of the run [m], shape (revolutions,).
     """
 
     whole: int
     error: Samples
     height: Samples
+    largest: Samples
 
 
 class _Keep:
@@ -80,12 +83,13 @@ class _Keep:
         """Return the last complete revolutions of the run."""
         angle = self._kept["angle"]
         if angle.size < 2:
-            return _Tail(0, np.empty((0, 0)), angle)
+            return _Tail(0, np.empty((0, 0)), angle, angle)
         # Keep one revolution more than reported, for the spline; the last one may lack two samples.
         before = max(int((angle[-1] + 2.0 * (angle[-1] - angle[-2])) / _TURN) - LAST - 1, 0)
         begin = int(np.searchsorted(angle, before * _TURN))
         error = evenly(angle[begin:] - before * _TURN, self._kept["error"][begin:])
-        return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:])
+        largest = form_errors(angle, self._kept["error"]).largest
+        return _Tail(before + error.shape[0], error[-LAST:], self._kept["height"][begin:], largest)
 
 
 def _not_yet(scenario: Scenario, values: Values) -> dict[str, Value]:
@@ -277,4 +281,4 @@ def budget(
     if abs(told.interactions.share) >= TOLD:
         runs |= run(split.together() - runs.keys(), found)
         told = split.split(_compared(scenario, runs), left_out)
-    return told
+    return replace(told, growth=growth(whole.largest))

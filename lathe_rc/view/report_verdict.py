@@ -55,7 +55,7 @@ def assess(data: Gathered, losses: Sequence[str], made_of: Budget | None) -> Ass
     if made_of:
         largest = max((*made_of.causes, made_of.rest), key=lambda part: part.share)
         text = f"The largest cause, by the budget below: {largest.name}, {largest.percent()} % of the power."
-        limits.append(Finding(text))
+        limits.append(Finding(_sentence(made_of.warning) if made_of.warning else text))
     for kind in data.curves.kinds.values():
         if parse(kind.text).verb == LIMITED:
             node = kind.topic.strip("/").removesuffix("/events")
