@@ -65,7 +65,7 @@ def zones(declared: Mapping[str, Judged]) -> dict[str, tuple[Zone, ...]]:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the form of a part is judged by.
+    """Limits by which the form of a part is judged.
 
     Attributes:
         tolerance: allowed form error to each side [m]; 0: the tool has no tolerance.
