@@ -144,6 +144,7 @@ function drawHeader(now) {
     $(id).disabled = Boolean(step) && !step.allowed && !old.safety;
     $(id).title = step ? step.text : "";
   }
+  offerRepair(now.faults || []);
   $("in-force").textContent = (now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
   $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }

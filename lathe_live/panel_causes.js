@@ -7,11 +7,10 @@ function drawCauses(found) {
   const others = parts.filter(part => !large.includes(part)), sum = others.reduce((total, part) => total + part.share, 0);
   const percent = share => `${digits(Math.round(share * 1000) / 10)} %`, first = found.last - found.revolutions + 1;
   const names = [...large.map(part => `${part.cause} ${percent(part.share)}`), ...(others.length ? [`${others.map(part => part.cause).join(", ")} together ${percent(sum)}`] : [])];
-  $("causes-of").textContent = `Form error of revolutions ${first} to ${found.last}, ${digits(found.rms, 3)} µm RMS, by lathe budget: shares in its power of ${names.join("; ")}`
-    + (found.warning ? `\n${found.warning}` : "")
+  $("causes-of").textContent = found.warning || `Form error of revolutions ${first} to ${found.last}, ${digits(found.rms, 3)} µm RMS, by lathe budget: shares in its power of ${names.join("; ")}`
     + Object.entries(found.left_out).map(([cause, why]) => `\nnot switched off: ${cause}: ${why}`).join("");
   const colours = style("--marks").split(" ");
-  $("shares").replaceChildren(...large.filter(part => part.share > 0).map((part, k) => {
+  $("shares").replaceChildren(...large.filter(part => part.share > 0 && !found.warning).map((part, k) => {
     const bar = Object.assign(document.createElement("span"), { textContent: part.cause, title: `${part.cause} ${percent(part.share)}, ${digits(part.rms, 3)} µm RMS` });
     bar.style.flex = `${part.share} 1 0`;
     bar.style.background = colours[k % colours.length];

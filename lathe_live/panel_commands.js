@@ -90,7 +90,7 @@ function describe() { // fills the commands from what the cell tells of itself
   }));
   const form = $("fault").elements, breakable = ABOUT.nodes.filter(node => Object.keys(node.targets).length);
   $("fault").hidden = !breakable.length;
-  $("fault-note").textContent = breakable.length ? "" : "Nothing may break in this cell: go on with allow_faults = true.";
+  $("fault-note").textContent = breakable.length ? "" : "No faults can be injected: allow_faults is false in this cell.";
   options(form.node, breakable.map(node => node.name));
   offerFaults();
   $("parameters").replaceChildren(...ABOUT.parameters.map(name => new Option(name)));
@@ -106,6 +106,14 @@ function offerFaults() {
   form.values.dataset.of = form.kind.value;
   form.values.value = Object.entries(kind.values).map(([name, value]) => `${name}=${value ?? ""}`).join(" ");
   $("fault-note").textContent = kind.doc;
+}
+let inForce = "";
+function offerRepair(faults) { // chooses a fault that has come into force, once, for its repair
+  const newest = faults.at(-1) || "", [node, target, kind] = newest.split(/:? /), form = $("fault").elements;
+  if (newest == inForce) return;
+  inForce = newest;
+  if (!ABOUT.nodes.some(each => each.name == node)) return;
+  for (const [field, value] of Object.entries({ node, target, kind })) { form[field].value = value; offerFaults(); }
 }
 for (const name of ["node", "target", "kind"]) $("fault").elements[name].addEventListener("change", offerFaults);
 $("fault").addEventListener("submit", event => {

@@ -61,20 +61,21 @@ function drawMachine(now) {
 
 function drawDials(now) {
   const dials = [["speed", "1/min", now.rpm, nice((ABOUT.rpm || now.rpm || 1) * 1.25), ABOUT.rpm]];
-  if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force) * 1.2), ABOUT.force]);
-  if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), ABOUT.margin]);
+  if (now.measured_force !== undefined) dials.push(["force", "N", now.measured_force, nice(Math.max(seen("force", now.measured_force, 1), ABOUT.force, ABOUT.force_limit) * 1.2), ABOUT.force, ABOUT.force_limit]);
+  if (Number.isFinite(now.margin)) dials.push(["stability margin", "", now.margin, nice(Math.max(now.margin || 0, 0.05) * 1.2), 0, ABOUT.margin]);
   const ink = style("--ink"), soft = style("--soft"), line = style("--line"), good = style("--good"), bad = style("--bad");
   const small = $("dials").getBoundingClientRect().width < 450 ? 12.5 : 10; // readable on a telephone as well
-  $("dials").innerHTML = dials.map(([name, unit, value, most, wanted], k) => {
+  $("dials").innerHTML = dials.map(([name, unit, value, most, wanted, limit], k) => {
     const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
     const at = (r, share) => `${(cx + r * Math.cos(angle(share))).toFixed(1)} ${(cy - r * Math.sin(angle(share))).toFixed(1)}`;
-    const mark = wanted ? `<path d="M${at(50, wanted / most)} L${at(66, wanted / most)}" stroke="${ink}" stroke-width="2"/>` : "";
+    const mark = (place, colour) => place ? `<path d="M${at(50, place / most)} L${at(66, place / most)}" stroke="${colour}" stroke-width="2"/>` : "";
+    const marked = [name == "force" && wanted ? `set point ${digits(wanted)}` : "", limit ? `limit ${digits(limit)} (red)` : ""].filter(Boolean).join(", ");
     const known = Number.isFinite(value);
     const needle = known ? `<path d="M${cx} ${cy} L${at(56, value / most)}" stroke="${value < 0 ? bad : good}" stroke-width="4" stroke-linecap="round"/>` : "";
     const words = (y, told, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(told)}</text>`;
-    return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark}${needle}`
+    return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark(wanted, ink)}${mark(limit, bad)}${needle}`
       + words(118, known ? `${unit == "N" ? newton(value, 4) : digits(value)} ${unit}` : "unknown", 15, ink) + words(137, name, small + 2, soft)
-      + (name == "stability margin" ? words(153, "below 0: learning diverges", small, soft) + (wanted ? words(169, `limit ${digits(wanted)}`, small, soft) : "") : "")
+      + [name == "stability margin" ? "below 0: learning diverges" : "", marked].filter(Boolean).map((told, line) => words(153 + 16 * line, told, small, soft)).join("")
       + `<text x="${cx + 56}" y="${cy + 40}" font-size="${small}" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
   }).join("");
 }

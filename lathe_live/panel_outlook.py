@@ -41,6 +41,7 @@ def _outlook(name: str, step: float, rpm: float, shown: Mapping[str, Any]) -> di
         "radius": shown.get("cut_radius", shown.get("radius", 50.0)),
         "rpm": rpm,
         "force": shown.get("force", 0.0),
+        "force_limit": shown.get("force_limit", 0.0),
         "supervised": shown.get("supervised", False),
         "margin": shown.get("margin", 0.0),
         "revolutions": shown.get("revolutions", 0.0),

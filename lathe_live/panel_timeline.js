@@ -7,8 +7,8 @@ const GLYPHS = { alarm: "▲", state: "■", fault: "✖", lost: "░", command:
 const STATES = ["nominal", "degraded", "retracting", "safe"]; // by number
 const LANE = 52, TITLE = 14, LEFT = 74, RIGHT = 12, TOP = 4, AXIS = 18, NEAR = 6, CALM_TIMELINE = 2000;
 const LANES = { // heading, unit and limits of the scale, given the extremes; the other lanes are drives
-  error: { title: "form error", unit: "µm" },
-  force: { title: "force, measured", unit: "N", ends: (low, high) => [Math.min(0, low), Math.max(ABOUT.force || 0, high, 0) * 1.05 || 1] },
+  error: { title: "form error (below 0: material left)", unit: "µm" },
+  force: { title: "force, measured", unit: "N", ends: (low, high) => [Math.min(0, low), Math.max(ABOUT.force || 0, ABOUT.force_limit || 0, high, 0) * 1.05 || 1] },
   speed: { title: "speed", unit: "1/min", ends: (low, high) => { const more = Math.max((high - low) / 8, high * 0.002); return [low - more, high + more]; } },
 };
 const laneOf = name => LANES[name] || { title: name.replace("following", "following error of"), unit: "µm", ends: (low, high) => { const end = Math.max(-low, high) || 1; return [-end, end]; } };
@@ -100,7 +100,8 @@ function drawTimeline() {
     const tall = LANE - TITLE - 4, scale = scaleOf(name, tall), { title, unit } = laneOf(name);
     Object.assign(pen, { strokeStyle: line, lineWidth: 1 });
     pen.strokeRect(LEFT, top, right - LEFT, tall);
-    label(pen, `${title} [${unit}]`, LEFT, top - 3, soft);
+    const lines = [[ABOUT.force, ink, "dashed: set point"], [ABOUT.force_limit, bad, "red: limit"]].filter(([value]) => name == "force" && value);
+    label(pen, [`${title} [${unit}]`, ...lines.map(([, , told]) => told)].join("; "), LEFT, top - 3, soft);
     if (!scale) return;
     const y = value => top + Math.max(0, Math.min(tall, scale.at(value)));
     const tolerance = name == "error" && ABOUT.tolerance;
@@ -114,9 +115,8 @@ function drawTimeline() {
         if (low < -tolerance) bar(k, y(-tolerance), Math.max(lower - y(-tolerance), 3), bad);
       });
     }
-    const limits = tolerance ? [-tolerance, tolerance] : name == "force" && ABOUT.force ? [ABOUT.force] : [];
-    for (const limit of limits) {
-      Object.assign(pen, { strokeStyle: ink, lineWidth: 1 });
+    for (const [limit, colour] of tolerance ? [[-tolerance, ink], [tolerance, ink]] : lines) {
+      Object.assign(pen, { strokeStyle: colour, lineWidth: 1 });
       pen.setLineDash([4, 4]);
       pen.beginPath(); pen.moveTo(LEFT, y(limit)); pen.lineTo(right, y(limit)); pen.stroke();
       pen.setLineDash([]);

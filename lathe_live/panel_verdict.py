@@ -36,12 +36,14 @@ class Evaluation:
         verdict, growth: those of the form so far; None if there is none.
         missing: newest revolutions that were not received, or why there is no verdict; empty if all is known.
         loops: statements on the force and position loops, and whether each is good.
+        until_out: verdict on the revolutions before those in which the tool was out of the part; None: it was not.
     """
 
     verdict: Verdict | None = None
     growth: Growth | None = None
     missing: str = ""
     loops: Sequence[tuple[str, bool | None]] = ()
+    until_out: Verdict | None = None
 
     def headline(self, out: str = "") -> Headline:
         """Return the headline on the part; ``out``: whether the tool is out of it, in words; empty: it is not."""
@@ -65,7 +67,11 @@ class Evaluation:
         if not verdict.in_tolerance:
             if verdict.largest <= verdict.tolerance:  # the form is in doubt
                 return _open(told, grown, out, self.missing)
-            return BAD, "PART BAD", [told, grown, out, self.missing]
+            ground = [told, grown, out]
+            if out and self.until_out:
+                place = f"{out}, {verdict.quantity.told(verdict.largest)} from the form"
+                ground = [place, f"up to revolution {self.until_out.over[1]} {self.until_out.told()}"]
+            return BAD, "PART BAD", [*ground, self.missing]
         if diverges:
             return BAD, "PART GOOD, BUT DIVERGES", [grown, told, out, self.missing]
         few = f"{FEWEST + 1} revolutions are needed to see whether the error grows"

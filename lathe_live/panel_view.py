@@ -199,6 +199,7 @@ class View:
         self._is_out = False
         self._out: tuple[float, float] = (math.inf, math.inf)  # samples in which the tool was last out of the part
         self._complete, self._end = 0, 0  # number of complete revolutions, and sample after the last one
+        self._cut_to = 0  # last revolution with the tool in the part
         self._scale: Scale | None = None
         self._epoch, self._joined = 0, 0  # times that rows were merged; revolutions in the open row
         self._rows: list[Row] = []
@@ -306,6 +307,7 @@ class View:
             row = _row(revolution, out=revolution.end > self._out[0] and self._end < self._out[1])
             self._end = revolution.end
             self._complete += 1
+            self._cut_to = self._cut_to if row.out else revolution.number
             self._newest = [*self._newest[1 - WATERFALL :], row]
             self._open, self._joined = self._open.merged(row) if self._open else row, self._joined + 1
             if self._joined == 2**self._epoch:
@@ -334,7 +336,10 @@ class View:
         """Evaluate the part as ``lathe run`` does; ``unjudged``: reason why its end cannot be judged, or empty."""
         form, rests_on = self._part, (self._part, self._complete, unjudged)
         if form and self._judged[0] != rests_on:
-            self._judged = rests_on, Evaluation(self._allowed.verdict(form, unjudged), error_growth(form))
+            verdict, until_out = self._allowed.verdict(form, unjudged), None
+            if verdict and 0 <= (cut := self._cut_to - form.before) < verdict.revolutions:
+                until_out = self._allowed.verdict(form, revolutions=cut)
+            self._judged = rests_on, Evaluation(verdict, error_growth(form), until_out=until_out)
         found = self._judged[1]
         results = [watch.result() for watch in self._watches]
         told = [(f"{each.loop.node}: {text}", good) for each in results for text, good in each.judged()]
@@ -366,10 +371,12 @@ class View:
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
-            out = ["The supervisor held the tool out of the part in the last revolutions."]
+            out = ["The supervisor has taken the tool out of the part in the last revolutions."]
             self._limits = self._complete, out if self.was_out else [each.text for each in found]
+        margin = self._now["margin"]
         return [
             *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
+            *(["Learning diverges: its stability margin is below 0."] if margin is not None and margin < 0.0 else []),
             *self._limits[1],
         ]
 

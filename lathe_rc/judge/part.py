@@ -84,21 +84,22 @@ class Limits:
         allowed = next((each.tolerance for each in own if each.quantity == "form" and each.tolerance), 0.0)
         return cls(allowed, next((each.zones for each in own if each.zones), ()), doubt)
 
-    def verdict(self, form: RunningForm, unjudged: str = "") -> Verdict | None:
+    def verdict(self, form: RunningForm, unjudged: str = "", revolutions: int | None = None) -> Verdict | None:
         """Judge a form, measured by the same zones, as if the run ended after the samples so far.
 
         Args:
             form: the form.
             unjudged: reason why the end of the run cannot be judged; empty if it can.
+            revolutions: number of revolutions that are judged, the first ones; None: all.
 
         Returns:
             None without a tolerance.
         """
         if not self.tolerance:
             return None
-        by_zone, before = form.by_zone, form.before
+        largest, *by_zone = (each[:revolutions] for each in (form.largest, *form.by_zone))
         return judge_zones(
-            form.largest, by_zone, self.tolerance, self.zones, before, unjudged=unjudged, doubt=self.doubt
+            largest, by_zone, self.tolerance, self.zones, form.before, unjudged=unjudged, doubt=self.doubt
         )
 
 

@@ -11,6 +11,7 @@ from lathe_rc.safety.state_machine import RESET, Reaction, State, after
 
 #: built-in monitors of signals that a learning controller commands: its memory may hold what raised the alarm
 OF_MEMORY = frozenset({"following", "stroke", "effort", "error", "error_growth"})
+OPERATOR = "operator"  #: name in place of a monitor's for a retraction that the operator asks for
 MARGIN = "stability_margin"  #: built-in monitor of the gain with which a controller learns
 
 
@@ -66,7 +67,7 @@ def reset(
     """
     if why := refusal(state, reaction):
         stuck = state is State.RETRACTING and faults
-        return Step(f"{why}; if it does not come out, repair {_listed(faults)}" if stuck else why)
+        return Step(f"repair {_listed(faults)}, with which the tool may not come out; {why}" if stuck else why)
     if reaction is Reaction.NONE:
         return Step("nothing to reset")
     before, reasons = [], []
@@ -81,7 +82,8 @@ def reset(
         reasons.append("the stability margin is that of the gain")
     does = "the tool approaches the part again" if state is State.SAFE else "the alarm is taken back"
     if not before:
-        return Step(f"reset: {does}; the monitors watch on", allowed=True)
+        lasts = "the monitors watch on" if set(alarms) <= {OPERATOR} else "the alarm is raised again if its cause lasts"
+        return Step(f"reset: {does}; {lasts}", allowed=True)
     again = "the tool may be retracted again" if reaction is Reaction.RETRACT else "the alarm may be raised again"
     return Step(f"{', '.join(before)}, then reset; otherwise {again}: {', '.join(reasons)}", allowed=True)
 

@@ -118,12 +118,13 @@ class SupervisorParameters(NodeParameters):
     clear_time: NonNegative = parameter(1e-3, "for so long", "s")
 
     def shown(self) -> Mapping[str, Any]:
-        """Supervision and largest allowed margin of the drives."""
-        return {"supervised": True, "margin": max(self.margin_limit, default=0.0)}
+        """Supervision, largest allowed margin of the drives, and limit of the force [N]."""
+        margin = max(self.margin_limit, default=0.0)
+        return {"supervised": True, "margin": margin, "force_limit": self.force_limit}
 
 
 MEMBERS_LOST = "members_lost"  #: name in place of a monitor's: the host reports that members of the cell are lost
-RETRACT, OPERATOR = "retract", "operator"  #: event that takes the tool out, and the name in place of a monitor's for it
+RETRACT = "retract"  #: event that takes the tool out
 RESET_REFUSED = "reset refused"  #: likewise: a reset is refused during a retraction or after a stop
 _SENSOR, _COMMAND, _MARGIN = ("measured_position", "effort"), ("position",), ("stability_margin",)
 _STATE, _REACTION, _TOLD = range(3)  # indices into the state of the step function
@@ -343,7 +344,7 @@ class Supervisor(Stage):
         """Reset the state of the cell, where a persistent fault raises its alarm again, or retract the tool."""
         if action == RETRACT:
             self._ask_for(Reaction.RETRACT)
-            self._told.append(OPERATOR)
+            self._told.append(next_step.OPERATOR)
             return
         if self.reaction is Reaction.NONE:
             return  # no alarm since the start or the last reset
