@@ -109,11 +109,12 @@ function offerFaults() {
 }
 let inForce = "";
 function offerRepair(faults) { // chooses a fault that has come into force, once, for its repair
-  const newest = faults.at(-1) || "", [node, target, kind] = newest.split(/:? /), form = $("fault").elements;
+  const newest = faults.at(-1) || "", [node, target, kind, ...values] = newest.split(/:? /), form = $("fault").elements;
   if (newest == inForce) return;
   inForce = newest;
   if (!ABOUT.nodes.some(each => each.name == node)) return;
   for (const [field, value] of Object.entries({ node, target, kind })) { form[field].value = value; offerFaults(); }
+  form.values.value = values.join(" ");
 }
 for (const name of ["node", "target", "kind"]) $("fault").elements[name].addEventListener("change", offerFaults);
 $("fault").addEventListener("submit", event => {

@@ -69,13 +69,14 @@ function drawDials(now) {
     const cx = 80 + 160 * k, cy = 88, angle = share => Math.PI * (1.2 - 1.4 * Math.max(0, Math.min(1, share)));
     const at = (r, share) => `${(cx + r * Math.cos(angle(share))).toFixed(1)} ${(cy - r * Math.sin(angle(share))).toFixed(1)}`;
     const mark = (place, colour) => place ? `<path d="M${at(50, place / most)} L${at(66, place / most)}" stroke="${colour}" stroke-width="2"/>` : "";
-    const marked = [name == "force" && wanted ? `set point ${digits(wanted)}` : "", limit ? `limit ${digits(limit)} (red)` : ""].filter(Boolean).join(", ");
+    const below = name == "stability margin" ? "below 0: learning diverges" : name == "force" && wanted ? `set point ${digits(wanted)}` : "";
+    const told = [below, limit ? `limit ${digits(limit)} (red)` : ""].filter(Boolean);
     const known = Number.isFinite(value);
     const needle = known ? `<path d="M${cx} ${cy} L${at(56, value / most)}" stroke="${value < 0 ? bad : good}" stroke-width="4" stroke-linecap="round"/>` : "";
-    const words = (y, told, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(told)}</text>`;
+    const words = (y, text, size, colour) => `<text x="${cx}" y="${y}" text-anchor="middle" font-size="${size}" fill="${colour}" font-family="system-ui, sans-serif">${escaped(text)}</text>`;
     return `<path d="M${at(58, 0)} A58 58 0 1 1 ${at(58, 1)}" fill="none" stroke="${line}" stroke-width="10"/>${mark(wanted, ink)}${mark(limit, bad)}${needle}`
       + words(118, known ? `${unit == "N" ? newton(value, 4) : digits(value)} ${unit}` : "unknown", 15, ink) + words(137, name, small + 2, soft)
-      + [name == "stability margin" ? "below 0: learning diverges" : "", marked].filter(Boolean).map((told, line) => words(153 + 16 * line, told, small, soft)).join("")
+      + told.map((text, line) => words(153 + 16 * line, text, small, soft)).join("")
       + `<text x="${cx + 56}" y="${cy + 40}" font-size="${small}" fill="${soft}" font-family="system-ui, sans-serif">${digits(most)}</text>`;
   }).join("");
 }

@@ -371,7 +371,7 @@ class View:
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
-            out = ["The supervisor has taken the tool out of the part in the last revolutions."]
+            out = ["The supervisor's retraction makes the form error of the last revolutions."]
             self._limits = self._complete, out if self.was_out else [each.text for each in found]
         margin = self._now["margin"]
         return [

@@ -87,7 +87,8 @@ class Budget:
         """Why the shares do not tell the cause; empty if they do."""
         if self.growth is None or not self.growth.diverges:
             return ""
-        return f"{self.growth.told()}; the shares are of what the loop amplifies, not its cause"
+        told = self.growth.told()
+        return f"{told}; the shares are of what the loop amplifies, not its cause (see the stability margin)"
 
     @property
     def explained(self) -> float:
