@@ -66,13 +66,26 @@ def _source_hash() -> str:
 SOURCES = _source_hash()
 
 
+def _is_writable(folder: Path) -> bool:
+    """Return whether a folder can be written, or made."""
+    there = next(place for place in (folder, *folder.parents) if os.access(place, os.F_OK))
+    return there.is_dir() and os.access(there, os.W_OK)
+
+
+@cache
+def _usual_folder() -> Path:
+    """Return the folder of the user's cache, or one of the Python environment if only that can be written."""
+    places = platformdirs.user_cache_path("lathe_rc"), Path(sys.prefix, "var", "cache", "lathe_rc")
+    return next(filter(_is_writable, places), places[0])
+
+
 def cache_folder() -> Path:
     """Return the folder for compiled code.
 
     Numba detects changes in a kernel's own file, but not in the kernels that it calls, so with a cache shared between
     versions of the source, outdated code would run. Each version of the source therefore has its own folder.
     """
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("lathe_rc")) / SOURCES
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or _usual_folder()) / SOURCES
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:

@@ -65,6 +65,13 @@ def of_a_process(folder, code, **environment):
     return done.stdout + done.stderr
 
 
+def test_compiled_code_is_kept_in_the_environment_if_the_users_cache_cannot_be_written(tmp_path):
+    code = "from lathe_rc import jit; print(jit.cache_folder().parent)"
+    for place, folder in ((tmp_path / "new", tmp_path / "new"), ("/dev/null", Path(sys.prefix, "var", "cache"))):
+        printed = of_a_process(tmp_path, code, NUMBA_CACHE_DIR="", XDG_CACHE_HOME=str(place))
+        assert printed == f"{folder / 'lathe_rc'}\n"
+
+
 def test_a_settings_file_of_numba_in_the_current_folder_is_not_read(tmp_path):
     """Neither as Numba is imported nor as it compiles; the environment remains the user's choice."""
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\n")
