@@ -48,7 +48,7 @@ def contents(path: Path, most: int = MOST) -> bytes:
 
 def open_file(name: str, flags: int) -> int:
     """Open regular files only (``opener`` for `open`): opening a pipe or a device could block forever."""
-    number = os.open(name, flags | os.O_NONBLOCK)
+    number = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # Windows lacks it
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
         raise OSError(errno.EINVAL, _NO_FILE)
@@ -118,11 +118,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         beside.replace(path)
         beside = None
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # makes the rename durable
-        finally:
-            os.close(folder)
+        if hasattr(os, "O_DIRECTORY"):  # Windows cannot open a folder
+            folder = os.open(path.parent, os.O_DIRECTORY)
+            try:
+                os.fsync(folder)  # makes the rename durable
+            finally:
+                os.close(folder)
     finally:
         if beside:
             beside.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 """Data of the package for ROS and pip: its dependencies, executables and tests."""
 
 import ast
+import os
 import re
 import runpy
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import setuptools
+from lacking import write_site
 
 from lathe_rc.catalogue import COMMANDS_OF, OURS
 
@@ -114,3 +116,26 @@ def test_the_core_runs_without_the_packages_around_it(tmp_path):
     assert set(COMMANDS_OF["lathe_rc"]) <= {*listed}
     assert not {*listed} & {name for package in OURS - {"lathe_rc", "lathe_papers"} for name in COMMANDS_OF[package]}
     assert (tmp_path / "B.html").exists()
+
+
+ELSEWHERE = """
+import os
+from importlib import import_module
+from lathe_rc import catalogue, files
+from lathe_rc.cli import main
+for name in catalogue.COMMANDS:
+    import_module(catalogue.module_of(name))
+assert not hasattr(files.os, "O_NONBLOCK"), "nothing is hidden"
+for line in ["run piston --revolutions=3 --bag=B", "bag check B", "measure B", "export bag B --csv", "resim B"]:
+    main(line.split(), standalone_mode=False)
+"""
+
+
+def test_offline_commands_use_nothing_that_windows_or_macos_lack(tmp_path):
+    """All commands can be imported; runs, bags and tables need no module and no name that Linux alone has."""
+    write_site(tmp_path)
+    command = [sys.executable, "-c", ELSEWHERE]
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))}
+    ran = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "B-csv" / "tool.csv").exists()

@@ -10,7 +10,6 @@ import faulthandler
 import math
 import pickle
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -30,7 +29,7 @@ T = TypeVar("T")
 FIRST = 30.0  #: time beyond its limit for the first cell of a process, which loads compiled code [s]
 _END = 5.0  # time that a process has to write its stack and to end [s]
 _FRAME = re.compile(r'File "(.+)", line (\d+) in')  # of Python's fault handler
-KILLED = signal.SIGKILL.name  #: part of the reason of a cell whose process was killed, for example for lack of memory
+KILLED = "SIGKILL"  #: part of the reason of a cell whose process was killed, for example for lack of memory
 NO_END = "no end within "  #: beginning of the reason of a cell that has reached its time limit
 
 
@@ -64,6 +63,10 @@ class Watchdog:
 
 def limit_memory(size: int) -> None:
     """Limit the memory of this process [B]: an allocation beyond it is an error of the cell, not the process's end."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows, where only Dask's limit of a worker's memory holds
+        return
     resource.setrlimit(resource.RLIMIT_DATA, (size, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
@@ -133,8 +136,9 @@ def _reason(process: subprocess.Popen[bytes], stream: IO[bytes], limit: float | 
     if limit is not None:
         return f"{NO_END}{limit:g} s{place}"
     if code < 0:
-        perhaps = ", perhaps for lack of memory" if code == -signal.SIGKILL else ""
-        return f"its process was ended by {signal.Signals(-code).name}{perhaps}{place}"
+        name = signal.Signals(-code).name
+        perhaps = ", perhaps for lack of memory" if name == KILLED else ""
+        return f"its process was ended by {name}{perhaps}{place}"
     return f"its process ended with exit code {code}"
 
 

@@ -21,14 +21,14 @@ from lathe_rc.names import instead
 _ALIGNED = 64  # begin of an array in the block [B]
 
 
-def _free_memory() -> int:
-    """Return the memory available without swapping [B], or the total memory if the system does not report it."""
+def _free_memory() -> float:
+    """Return the memory available without swapping [B], else the total memory; infinity: Windows tells neither."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             name, _, size = line.partition(":")
             if name == "MemAvailable":
                 return int(size.split()[0]) * 1024
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
 
 
 def check_room(cell: Cell) -> None:

@@ -3,14 +3,15 @@
 
 YAML leaves the meaning of a scalar to the reader, and rcl's interpretation differs from that of every Python library:
 ``1e-3`` is a double, ``0x10`` and ``010`` are integers, and ``yes`` is true. The text is therefore parsed by PyYAML,
-and the scalars by the C library's strtol and strtod, as in rcl_yaml_param_parser. Patterns for PyYAML's resolvers would
-take more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and treats a number out of range as
-a string.
+and the scalars by the C library's strtoll and strtod, as in rcl_yaml_param_parser. Patterns for PyYAML's resolvers
+would take more lines: rcl also reads hexadecimal fractions, ``infinity`` and ``nan(5)``, and treats a number out of
+range as a string.
 """
 
 import ctypes
 import errno
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,12 @@ _FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "
 _SPECIAL = re.compile(r"\.(?:nan|NaN|NAN)|[+-]?\.(?:inf|Inf|INF)")
 _PLAIN, _TEXT = "plain", "tag:yaml.org,2002:str"
 
-_libc = ctypes.CDLL(None, use_errno=True)
-_libc.strtol.restype, _libc.strtod.restype = ctypes.c_long, ctypes.c_double
+_libc = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None, use_errno=True)
+_libc.strtoll.restype, _libc.strtod.restype = ctypes.c_longlong, ctypes.c_double
 
 
 def _converted(function: Callable[..., Any], text: str, *base: int) -> Any:
-    """Return the number that strtol or strtod reads from a string; None after a partial conversion or range error."""
+    """Return the number that strtoll or strtod reads from a string; None after a partial conversion or range error."""
     data, end = ctypes.create_string_buffer(text.encode()), ctypes.c_char_p()
     ctypes.set_errno(0)
     number = function(data, ctypes.byref(end), *base)
@@ -45,7 +46,7 @@ def scalar(text: str) -> bool | int | float | str:
     """Return the value that rcl assigns to an unquoted scalar."""
     if text in _TRUE | _FALSE:
         return text in _TRUE
-    number: int | float | None = _converted(_libc.strtol, text, 0)
+    number: int | float | None = _converted(_libc.strtoll, text, 0)
     if number is None:
         number = float(text.replace(".", "")) if _SPECIAL.fullmatch(text) else _converted(_libc.strtod, text)
     return text if number is None else number

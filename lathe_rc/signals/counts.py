@@ -9,7 +9,6 @@ import math
 import os
 import re
 import stat
-import termios
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from decimal import Decimal
@@ -41,7 +40,6 @@ _GOES_ON = 3600  # [s] of extrapolation
 _FASTEST = 2.0  # highest expected speed, relative to the nominal one
 _COUNTER_BITS = range(8, 49)  # of a counter that begins anew
 _PIECE = 65536  # bytes per read
-_BAUD = {int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r"B[1-9][0-9]+", name)}
 _IFLAG, _OFLAG, _CFLAG, _LFLAG, _ISPEED, _OSPEED, _CC = range(7)  # indices in the list of termios.tcgetattr
 
 
@@ -244,12 +242,15 @@ class LineReader(Reader):
 
 def _make_raw(number: int, path: Path, baud: int) -> None:
     """Set a terminal to raw mode and to a speed."""
-    if baud not in _BAUD:
-        raise InputError(f"{path}: {baud} baud; allowed: {', '.join(map(str, sorted(_BAUD)))}")
+    import termios  # which Windows lacks
+
+    speeds = {int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r"B[1-9][0-9]+", name)}
+    if baud not in speeds:
+        raise InputError(f"{path}: {baud} baud; allowed: {', '.join(map(str, sorted(speeds)))}")
     state = termios.tcgetattr(number)
     state[_IFLAG] = state[_OFLAG] = state[_LFLAG] = 0
     state[_CFLAG] = termios.CS8 | termios.CREAD | termios.CLOCAL
-    state[_ISPEED] = state[_OSPEED] = _BAUD[baud]
+    state[_ISPEED] = state[_OSPEED] = speeds[baud]
     state[_CC][termios.VMIN], state[_CC][termios.VTIME] = 1, 0  # with 0, 0 a read without data would look like the end
     termios.tcsetattr(number, termios.TCSANOW, state)
 

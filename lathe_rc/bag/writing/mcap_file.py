@@ -162,7 +162,10 @@ class McapFile:
             needed += _ROOM
             with self._reserve.open("ab") as stream:
                 # A sparse file would not reserve any disk blocks.
-                os.posix_fallocate(stream.fileno(), 0, needed)
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(stream.fileno(), 0, needed)
+                else:  # macOS, Windows
+                    stream.write(bytes(needed - self._kept))
             self._kept = needed
 
     def free_room(self) -> None:
