@@ -3,6 +3,7 @@
 
 import importlib.util
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ _MODULES = {
     "view": ("rerun", "rerun_bindings"),
 }
 _EXTRAS = {module: extra for extra, modules in _MODULES.items() for module in modules}
+_FROM_3_11 = ("rerun", "rerun_bindings", "x3pio")  # older Pythons lack them, see requirements/
 _CHECKOUT = {
     "fmu": "./lathe setup fmu in a checkout",
     "formats": "./lathe setup formats in a checkout",
@@ -42,9 +44,11 @@ _CHECKOUT = {
 
 def refusal(module: str | None) -> LatheError | None:
     """Return the error for a module that cannot be imported; None if the module belongs to no extra."""
-    extra = _EXTRAS.get((module or "").partition(".")[0])
-    if extra is None:
+    name = (module or "").partition(".")[0]
+    if (extra := _EXTRAS.get(name)) is None:
         return None
+    if name in _FROM_3_11 and sys.version_info < (3, 11):
+        return LatheError(f"no module {module} for Python 3.10; allowed: 3.11 to 3.14")
     return LatheError(f"no module {module} here: {_CHECKOUT[extra]}, or pip install 'lathe_rc[{extra}]'")
 
 

@@ -14,6 +14,7 @@ import pytest
 import setuptools
 from lacking import write_site
 
+from lathe_rc import extras
 from lathe_rc.catalogue import COMMANDS_OF, OURS
 
 ROOT = Path(__file__).parents[1]
@@ -97,6 +98,12 @@ def test_pip_puts_the_command_lathe_alone_on_the_path(metadata):
 def test_colcon_finds_the_tests(metadata):
     """Without pytest among the requirements of the tests, ``colcon test`` runs none and is green."""
     assert "pytest" in metadata("install")["extras_require"]["test"]
+
+
+def test_an_extra_that_python_3_10_lacks_is_not_recommended_there(monkeypatch):
+    assert "pip install" in str(extras.refusal("rerun"))
+    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
+    assert str(extras.refusal("rerun.blueprint")) == "no module rerun.blueprint for Python 3.10; allowed: 3.11 to 3.14"
 
 
 ALONE = """
