@@ -5,10 +5,10 @@ import json
 
 import pytest
 from cells import scenario
-from uv import uv
 
 from lathe_rc import harness
 from lathe_rc.bag.repairing.recover import recover
+from uv import uv
 
 pytestmark = pytest.mark.system
 

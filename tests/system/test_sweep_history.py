@@ -13,7 +13,6 @@ from pathlib import Path
 import dask
 import distributed
 import pytest
-from uv import uv
 
 import lathe_explore
 from lathe_explore.sweep import inputs, row, workers
@@ -23,6 +22,7 @@ from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.kinds import STAGES
 from lathe_rc.errors import InputError, LatheError
+from uv import uv
 
 pytestmark = pytest.mark.system
 
