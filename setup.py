@@ -99,7 +99,7 @@ setup(
         "lathe_live": ["py.typed", "*.j2", "*.css", "*.html", "*.js"],
     },
     data_files=shared_files(),
-    python_requires=">=3.10",
+    python_requires=">=3.10,<3.15",
     install_requires=requirements("runtime"),
     extras_require={
         # `colcon test` runs pytest if the extra `test` asks for it, and else no test at all

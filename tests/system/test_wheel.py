@@ -1,23 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sdist and wheel hold the package and its data, and work in an environment that has nothing else."""
+"""The files of a release hold the package and its data, and work in an environment that has nothing else."""
 
 import os
 import shutil
 import subprocess
+import sys
 import tarfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from urllib.request import urlopen
 
+import numpy as np
 import pytest
-from uv import uv
+from bags import some
+from lacking import write_site
 
 import workplace
 from lathe_rc import __version__
 from lathe_rc.catalogue import OURS
 from lathe_rc.cell.beside import BESIDE
 from lathe_rc.cell.scenario import TABLES
+from uv import uv
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timeout(1800)]  # most of it installs and compiles
 
 LOCK = workplace.REQUIREMENTS / "python.lock"
 EXECUTABLES = {*TABLES.own, *BESIDE, "container", "launch_plan"}  # of `ros2 run`
@@ -26,13 +32,28 @@ NOT_COPIED = shutil.ignore_patterns(".git", ".lathe", ".*_cache", ".hypothesis",
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory) -> Path:
-    """Both sdists, and the wheel that was built from the first, of a copy of this checkout with all its caches."""
+    """The files that tools/release.py makes of this checkout and checks, with ROS as well."""
     folder = tmp_path_factory.mktemp("dist")
     source = folder / "source"
     shutil.copytree(workplace.ROOT, source, symlinks=True, ignore=NOT_COPIED)
-    uv("build", "--quiet", source, "--out-dir", folder)
-    uv("build", "--quiet", "--sdist", source / "msg_defs", "--out-dir", folder)
-    return folder
+    commit = ("-c", "user.name=me", "-c", "user.email=me@localhost", "commit", "--quiet", "--message=All")
+    for words in (("init", "--quiet"), ("add", "--all"), commit):
+        subprocess.run(["git", "-C", source, *words], check=True)
+    subprocess.run([sys.executable, source / "tools" / "release.py", folder / "files"], check=True)
+    return folder / "files"
+
+
+def test_a_release_has_packages_sources_notes_and_a_citation(dist):
+    release = f"lathe_rc-{__version__}"
+    packages = {f"{release}-py3-none-any.whl", f"{release}.tar.gz", f"lathe_rc_msgs-{__version__}.tar.gz"}
+    assert {path.name for path in dist.iterdir()} == packages | {f"{release}-source.tar.gz", "NOTES.md", "CITATION.cff"}
+    with tarfile.open(dist / f"{release}-source.tar.gz") as archive:
+        assert {"lathe_rc/lathe", "lathe_rc/tests/conftest.py", "lathe_rc/.ci/run"} <= set(archive.getnames())
+    notes, changelog = (
+        path.read_text(encoding="utf-8") for path in (dist / "NOTES.md", workplace.ROOT / "CHANGELOG.md")
+    )
+    assert changelog[changelog.index("## ") :].startswith(f"#{notes}\n## "), "the top section alone"
+    assert "\ndoi: 10.0000/placeholder\n" in (dist / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def files(folder: str) -> set[str]:
@@ -67,8 +88,7 @@ def test_sdists_hold_what_is_built_and_no_tests_and_caches(dist):
         ("lathe_rc", {"setup.py", "pyproject.toml", "package.xml", "LICENSE", "CITATION.cff", *files("config")}),
         ("lathe_rc_msgs", {name.removeprefix("msg_defs/") for name in files("msg_defs")}),
     ):
-        (path,) = dist.glob(f"{name}-*.tar.gz")
-        with tarfile.open(path) as archive:
+        with tarfile.open(dist / f"{name}-{__version__}.tar.gz") as archive:
             names = {member.name.partition("/")[2] for member in archive if member.isfile()}
         assert needed <= names
         assert [
@@ -76,9 +96,12 @@ def test_sdists_hold_what_is_built_and_no_tests_and_caches(dist):
         ] == []
 
 
-def install(dist: Path, place: Path, wanted: str) -> None:
+def install(dist: Path, place: Path, wanted: str, base: Path = workplace.BASE_PYTHON) -> None:
+    """Install lathe_rc into a new environment, from wheels alone."""
     python = place / "bin" / "python"
-    uv("pip", "install", "--quiet", "--python", python, "--find-links", dist, "--constraint", LOCK, wanted)
+    uv("venv", "--quiet", "--python", base, place)
+    words = ("--only-binary", ":all:", "--find-links", dist, "--constraint", LOCK, wanted)
+    uv("pip", "install", "--quiet", "--python", python, *words)
 
 
 class Installed:
@@ -108,9 +131,9 @@ class Installed:
 @pytest.fixture(scope="module")
 def alone(dist) -> Installed:
     """Without ROS and without any extra."""
-    uv("venv", "--quiet", "--python", workplace.BASE_PYTHON, dist / "alone")
-    install(dist, dist / "alone", "lathe_rc")
-    return Installed(dist / "alone")
+    place = dist.with_name("alone")
+    install(dist, place, "lathe_rc")
+    return Installed(place)
 
 
 def test_it_runs_without_ros(alone):
@@ -147,10 +170,53 @@ def test_a_command_without_its_extra_says_what_to_install(alone, words, extra):
     assert f"pip install 'lathe_rc[{extra}]'" in said
 
 
-@pytest.mark.timeout(900)  # most of a minute, of which a machine that does other things makes several
-def test_with_ros_the_messages_are_built_by_the_installation(dist, alone):
-    """The command that the refusals name adds ROS 2 and the messages; then the same cell runs as processes."""
-    install(dist, dist / "alone", "lathe_rc[ros]")
-    words = ("run", "piston", "--mode", "processes", "--revolutions", "5", "--bag", "nodes")
-    assert "0 lost; 5 revolutions" in alone.run("lathe", *words)
-    assert alone.run("lathe", "bag", "check", "nodes").startswith("clean: ")
+def pythons() -> Iterator[Path]:
+    """Yield the Pythons of this machine that lathe_rc supports, one of each version, from the oldest to the newest."""
+    folders = [*sorted(Path.home().glob(".pyenv/versions/*/bin")), *map(Path, os.get_exec_path())]
+    for name in (f"python3.{minor}" for minor in range(10, 15)):
+        paths = (folder / name for folder in folders if folder.name != "shims")
+        yield from [path for path in paths if path.is_file()][:1]
+
+
+PYTHONS = list(pythons())
+#: Nothing can be written but one folder, and no program is on the PATH.
+BARE = 'mount --bind "$0" "$0" && mount -o remount,bind,ro / && cd "$0/work" && export PATH=/nowhere && exec "$@"'
+TEN = """\
+run piston --revolutions 20 --bag B
+bag check B
+bag info B
+measure B
+export bag B --csv
+report B -o B.html
+sweep piston --revolutions 3 --vary learning_controller.lead_time=1.3e-3:1.5e-3:2 --out S
+fit drive response.csv --averages 64 --drives 2
+design piston --drive drive.yaml --revolutions 20
+panel piston --no-browser"""
+
+
+@pytest.mark.parametrize("base", some(PYTHONS, max(len(PYTHONS) - 1, 1)), ids=lambda path: path.name)
+def test_offline_use_needs_no_compiler_and_no_folder_but_the_environment(dist, base, tmp_path):
+    """Ten commands, in an environment that alone can be written; our packages lack all that Windows or macOS lack."""
+    install(dist, tmp_path / "venv", f"lathe_rc[sweep,panel] @ {next(dist.glob('*.whl')).as_uri()}", base)
+    place = tmp_path / "venv" / "work"
+    place.mkdir()
+    write_site(place)
+    frequency = np.geomspace(5.0, 1000.0, 60)
+    response = 1.0 / (1.0 + 1.4j * frequency / 165.0 - (frequency / 165.0) ** 2)
+    columns = np.stack((frequency, response.real, response.imag, np.full(60, 0.9999)), axis=1)
+    header = "frequency_hz,real,imag,coherence"
+    np.savetxt(place / "response.csv", columns, "%.8g", ",", header=header, comments="")
+    environ = {"PATH": os.defpath, "HOME": "/nonexistent", "PYTHONPATH": str(place)}
+    for line in TEN.splitlines():
+        command = ["unshare", "--mount", "sh", "-c", BARE, place.parent, place.parent / "bin" / "lathe", *line.split()]
+        with subprocess.Popen(
+            command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process:
+            if line.startswith("panel"):
+                address = next(text for text in process.stdout if text.startswith("page: ")).split()[1]
+                assert b"<html" in urlopen(address).read()  # noqa: S310 - http
+                process.terminate()
+            assert "cannot be kept" not in (printed := process.stdout.read()), printed
+        assert process.returncode == 0, (line, printed)
+    assert list((place.parent / "var" / "cache" / "lathe_rc").iterdir())
+    assert {path.name for path in place.iterdir()} >= {"B-csv", "B.html", "S", "drive.yaml", "piston-designed.yaml"}
