@@ -16,7 +16,7 @@ def built(place: Path, *flags: str, compiler: str = "cc", main: Path | None = No
     example = place / f"{name}_main"
     if main is not None:
         example, flags = place / f"{name}_{main.stem}", (*flags, f"-DCELL={name}", "-include", f"{place}/{name}.h")
-    strict = ["-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror"]
+    strict = ["-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
     subprocess.run(
         [compiler, *strict, *flags, "-o", example, *_parts(place, name), main or place / "main.c", "-lm"], check=True
     )
@@ -38,7 +38,7 @@ def _name(place: Path) -> str:
 
 
 def _parts(place: Path, name: str) -> list[Path]:
-    return [place / "lathe.c", place / f"{name}.c", place / f"{name}_state.c", *sorted(place.glob("*_step.c"))]
+    return [place / "lathe.c", place / f"{name}.c", *sorted(place.glob("*_step.c"))]
 
 
 _WATCHED = """

@@ -117,14 +117,14 @@ int main(int count, char **arguments)
         memcpy(&samples, event, sizeof samples); /* only up to the first one */
     free(event);
     size_t size = (cell->size + LATHE_ALIGNED - 1) / LATHE_ALIGNED * LATHE_ALIGNED;
-    char *block = aligned_alloc(LATHE_ALIGNED, size), *saved = calloc(1, cell->size);
+    char *block = aligned_alloc(LATHE_ALIGNED, size), *saved = calloc(1, cell->saved);
     memset(block, 0, size);
     if (lathe_step(block, 1, (const void *const *)in, NULL) != LATHE_REFUSED || lathe_sample(block) != -1 ||
-        lathe_save(block, saved) != LATHE_REFUSED || lathe_restore(block, saved, cell->size) != LATHE_REFUSED ||
+        lathe_save(block, saved) != LATHE_REFUSED || lathe_restore(block, saved, cell->saved) != LATHE_REFUSED ||
         lathe_set(block, 0, 0.0) != LATHE_REFUSED || strcmp(lathe_reason_text(block), "no block"))
         fail("a zeroed block is taken for one");
     lathe_init(cell, block);
-    if (lathe_restore(block, saved, cell->size) != LATHE_REFUSED)
+    if (lathe_restore(block, saved, cell->saved) != LATHE_REFUSED)
         fail("a zeroed state is restored");
     for (int64_t k = 0; k < tries;) {
         int32_t n = (int32_t)(1 + draw() % (uint64_t)cell->block);
@@ -173,18 +173,18 @@ int main(int count, char **arguments)
         first += n;
     }
     lathe_save(block, saved);
-    if (lathe_restore(block, saved, cell->size - 1) != LATHE_REFUSED)
+    if (lathe_restore(block, saved, cell->saved - 1) != LATHE_REFUSED)
         fail("a short state is restored");
     for (int64_t k = 0; k < flips; k++) {
-        uint64_t bit = (draw() << 20 ^ draw()) % (8 * cell->size);
+        uint64_t bit = (draw() << 20 ^ draw()) % (8 * cell->saved);
         if (k < 8 * 256)
             bit = (uint64_t)k; /* each of the head */
         saved[bit / 8] ^= (char)(1 << bit % 8);
-        if (lathe_restore(block, saved, cell->size) != LATHE_REFUSED)
+        if (lathe_restore(block, saved, cell->saved) != LATHE_REFUSED)
             fail("bit %" PRIu64 " flipped: restored", bit);
         saved[bit / 8] ^= (char)(1 << bit % 8);
     }
-    if (lathe_restore(block, saved, cell->size) != LATHE_DONE)
+    if (lathe_restore(block, saved, cell->saved) != LATHE_DONE)
         fail("a sound state is refused");
     printf("%" PRId64 " refused, %" PRId64 " stopped, %" PRId64 " taken, %" PRId64 " flips\n", refused, stopped, taken, flips);
     free(block);

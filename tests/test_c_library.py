@@ -13,8 +13,7 @@ from bags import lathe
 from c_libraries import DONE, INPUT, REFUSED, STOPPED, Loaded, built, hostile, watched
 from cells import scenario
 
-from lathe_export.c_library.memory_image import MemoryImage
-from lathe_export.c_library.sources import export_nodes
+from lathe_export.c_library.sources import export_nodes, library_of, sources
 from lathe_rc import InputError
 from lathe_rc.cell.scenario import load
 from lathe_rc.stages.learning.learning_controller import LearningController
@@ -71,7 +70,7 @@ def test_the_state_goes_to_another_block_and_comes_back(law):
     one, other = (Loaded(law.place, library.size) for _ in range(2))
     for first in range(0, 5120, 64):
         assert one.step(inputs, [wanted], first, 64) == DONE
-    saved = np.zeros(library.size, np.uint8)
+    saved = np.zeros(library.saved, np.uint8)
     pointer = ctypes.c_void_p(saved.ctypes.data)
     one.c.lathe_save(one.block, pointer)
     assert other.c.lathe_restore(other.block, pointer, saved.size) == DONE
@@ -83,7 +82,7 @@ def test_the_state_goes_to_another_block_and_comes_back(law):
             assert other.step(inputs, [found], sample, 1) == DONE
     assert np.ptp(wanted[5120:10240]) > 0.0
     assert found.tobytes() == wanted.tobytes()
-    assert zlib.crc32(bytes(saved[:40]) + bytes(8) + bytes(saved[48:])) == saved[40:48].view(np.int64)[0]
+    assert zlib.crc32(bytes(saved[:24]) + bytes(8) + bytes(saved[32:])) == saved[24:32].view(np.int64)[0]
 
 
 def test_parameters_are_checked_against_their_limits(law):
@@ -176,8 +175,11 @@ def test_the_steps_read_as_the_kernels_do_and_need_libm_alone(law):
     assert "/* Points to be read must already be learned, and not yet be overwritten by the next cycle. */" in text
     assert "lathe_rc.control.angle_memory.find: Assign the grid points" in text
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
-    shown = re.search(r"## A step as C\n.*?```c\n(.*?)```", page, re.DOTALL)
-    assert shown[1] in text
+    section = re.search(r"## A step as C\n(.*?)\n## ", page, re.DOTALL)[1]
+    shown = re.findall(r"```c\n(.*?)```", section, re.DOTALL)
+    assert len(shown) == 2
+    for part in shown:
+        assert part in text
     assert max(map(len, text.splitlines())) <= 120
     built(law.place)
     subprocess.run(["cc", "-std=c99", "-c", "learning_controller_step.c"], cwd=law.place, check=True)
@@ -197,11 +199,9 @@ def test_a_step_allocates_no_memory(law):
     assert told.returncode == 9
 
 
-def test_equal_memories_have_equal_images():
-    table = scenario(learning_controller={"learning_gain": 0.5}).nodes["learning_controller"]
-    one, other = (MemoryImage(LearningController("one", table).memory) for _ in range(2))
-    assert one.content.tobytes() == other.content.tobytes()
-    assert one.relocations == other.relocations
+def test_equal_stages_give_equal_files():
+    one, other = (library_of(scenario(), ["learning_controller"], None, 1, ()) for _ in range(2))
+    assert sources(one, "small") == sources(other, "small")
 
 
 @pytest.mark.parametrize(

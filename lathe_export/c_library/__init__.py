@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stages as programs without Python: the steps that the engine runs, printed as C libraries.
 
-`printer`        a step as C, from its kernels, with `c_types`, `kernel_types`, `c_expressions` and `c_function`.
-`memory_image`   the memory of a step as one relocatable block.
+`printer`        a step as C, from its kernels, with its memory.
 `library`        `library.Library`: several stages wired together, with signals, parameters and the layout of their
                  state; any other wrapper of the same steps starts here.
 `sources`        the files of a library: headers, tables, steps, example, CMake file and README.

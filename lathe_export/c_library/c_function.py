@@ -425,11 +425,7 @@ class CFunction:
             count, value, target = safe(target.elts[0].id), value.args[0], target.elts[1]
         kind, name = self.types.kind(value), self._in_c.text(target)
         size = str(len(kind.parts)) if isinstance(kind, TupleType) else f"{self._in_c.text(value, 15)}.size"
-        one = (
-            f"{self._in_c.text(value, 15)}.part[{count}]"
-            if isinstance(kind, TupleType)
-            else f"{self._in_c.text(value, 15)}.data[{count}]"
-        )
+        one = f"{self._in_c.text(value, 15)}.{'part' if isinstance(kind, TupleType) else 'data'}[{count}]"
         begin = f"{count} = 0" if count != "n" else "int64_t n = 0"
         yield f"for ({begin}; {count} < {size}; {count}++) {{"
         yield f"    {name} = {one};"

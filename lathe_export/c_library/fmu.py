@@ -5,6 +5,7 @@ The FMU is a C library of one sample a call, with the functions of the FMI stand
 it from its sources.
 """
 
+import hashlib
 import re
 import shutil
 import subprocess
@@ -17,10 +18,10 @@ from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lathe_export.c_library import sources
 from lathe_export.c_library.library import Library
+from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc import __version__, extras
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, LatheError, shown
@@ -144,19 +145,10 @@ def export_fmu(
 def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     """Return the text files of an FMU by path."""
     texts = sources.sources(library, scenario)
-    token = sources.identity(library, texts)
+    token = hashlib.sha256(texts[f"{library.name}.c"].encode()).hexdigest()
     headers = {each: (Path(fmpy.__file__).parent / "c-code" / each).read_text("utf-8") for each in _HEADERS[fmi]}
-    made = {
-        "name": library.name,
-        "upper": library.name.upper(),
-        "nodes": ", ".join(part.stage.name for part in library.parts),
-        "scenario": scenario,
-        "version": __version__,
-        "fmi": fmi,
-        "token": token,
-        "integers": _INTEGERS[fmi],
-    }
-    code = {"fmu.c": _TEMPLATES.get_template("fmu.c.j2").render(made)}
+    made = sources.described(library, scenario) | {"fmi": fmi, "token": token, "integers": _INTEGERS[fmi]}
+    code = {"fmu.c": TEMPLATES.overlay(trim_blocks=True).get_template("fmu/fmu.c.j2").render(made)}
     written = set(re.findall(rf"\bfmi{fmi}\w+", code["fmu.c"])) | _composed(code["fmu.c"], fmi)
     missing = sorted(set(_DECLARED.findall(headers[_HEADERS[fmi][0]])) - written)
     code["unsupported.c"] = _unsupported(missing)
@@ -270,12 +262,3 @@ def _build(name: str, compiled: Sequence[str]) -> ET.Element:
 def _text(root: ET.Element) -> str:
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'
-
-
-_TEMPLATES = Environment(
-    loader=PackageLoader("lathe_export", "templates/fmu"),
-    undefined=StrictUndefined,
-    keep_trailing_newline=True,
-    trim_blocks=True,
-    autoescape=False,  # noqa: S701 - C, not HTML
-)

@@ -345,11 +345,8 @@ class KernelTypes:
         Raises:
             UnprintableError: the printer does not know it, or not with these arguments.
         """
-        function, arguments, given = (
-            self.constant(node.func),
-            node.args,
-            {each.arg: each.value for each in node.keywords},
-        )
+        function, arguments = self.constant(node.func), node.args
+        given = {each.arg: each.value for each in node.keywords}
         count, kind, text = LIBRARY.get(function, (-1, NONE, ""))
         if function is np.concatenate and isinstance(arguments[0], ast.Tuple):
             arguments = arguments[0].elts
@@ -443,21 +440,13 @@ class KernelTypes:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 for target in targets:
                     for one, value in self._pairs(target, node.value):
-                        good = (
-                            value
-                            if isinstance(node, ast.Assign) or isinstance(getattr(node, "op", None), ast.Add)
-                            else None
-                        )
-                        assigned.setdefault(one, []).append(good)
+                        keeps = isinstance(node, ast.Assign) or isinstance(node.op, ast.Add)
+                        assigned.setdefault(one, []).append(value if keeps else None)
             elif isinstance(node, ast.For):
                 for name in names_in(node.target):
-                    start = None
-                    if self.is_call(node.iter, range):
-                        arguments = node.iter.args
-                        start = (
-                            arguments[0] if len(arguments) == 2 else ast.Constant(0) if len(arguments) == 1 else None
-                        )
-                    assigned.setdefault(name, []).append(start)
+                    arguments = node.iter.args if self.is_call(node.iter, range) else []
+                    starts = {1: ast.Constant(0), 2: arguments[0]} if arguments else {}
+                    assigned.setdefault(name, []).append(starts.get(len(arguments)))
         self.__dict__["_counted"] = found = {
             name for name in assigned if name not in self.given and self.kinds.get(name) == INT
         }

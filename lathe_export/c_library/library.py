@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several stages of a cell, wired together as one function of inputs, outputs and a block of state.
 
-The block of state belongs to the caller. It holds, one after the other, the position in the run, the memory of each
-stage, tapes with the newest samples of each signal, address tables, and room for temporary arrays. ``lathe.c`` runs the
-steps on it; `lathe_export.c_library.sources` writes its tables.
+The block of state belongs to the caller. It holds, one after the other, the position in the run, tapes with the newest
+samples of each signal, and the state of each stage, all of which `lathe_save` copies; then the memory of each stage and
+its table, which hold addresses, and room for temporary arrays. ``lathe.c`` runs the steps on it;
+`lathe_export.c_library.sources` writes its tables. No size depends on the processor: those of addresses are bounds.
 """
 
 from collections.abc import Collection, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, nextafter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from lathe_export.c_library.memory_image import MemoryImage
 from lathe_export.c_library.printer import printed
+from lathe_export.c_library.step_memory import Place, leaves
 from lathe_rc import messages
 from lathe_rc.blocks.columns import units
 from lathe_rc.cell import events
 from lathe_rc.cell.parameters import Row, explain_overflow, remapped
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
+from lathe_rc.compiled.struct_view import address
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.messages import MAX_BLOCK
 from lathe_rc.names import instead
@@ -69,9 +70,10 @@ class Signal:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Number in the memory of a stage that the caller may change.
+    """Number in the state of a stage that the caller may change.
 
     Attributes:
+        part: index of the stage.
         name: node and parameter, as in ``learning_controller.learning_gain``.
         unit: unit; empty if there is none.
         doc: description.
@@ -82,6 +84,7 @@ class Parameter:
         places: offsets in the block at which it is stored [B].
     """
 
+    part: int
     name: str
     unit: str
     doc: str
@@ -90,11 +93,10 @@ class Parameter:
     limits: str
     whole: bool
     value: float
-    places: tuple[int, ...]
+    places: Sequence[int]
 
 
-@dataclass(frozen=True)
-class Tape:
+class Tape(NamedTuple):
     """Newest samples of a signal.
 
     Attributes:
@@ -114,12 +116,11 @@ class Part:
 
     Attributes:
         stage: the stage, before its first sample.
-        symbol: name of its function.
-        code: the function in C.
-        arrays: number of places in it that make a temporary array.
-        memory, table: offsets of its memory and its address table in the block [B].
-        floats: number of float64 inputs.
-        reads: tape and delay of each entry of the address table after the first; tape -1: none.
+        symbol: name of its functions.
+        code: the functions in C.
+        arrays: number of places in them that make a temporary array.
+        state, memory, table: offsets of its state, memory and address table in the block [B].
+        reads: tape and delay of each entry of the address table; tape -1: none.
         writes: indices of its outputs among those of the library.
     """
 
@@ -127,9 +128,9 @@ class Part:
     symbol: str
     code: str
     arrays: int
+    state: int
     memory: int
     table: int
-    floats: int
     reads: Sequence[tuple[int, int]]
     writes: Sequence[int]
 
@@ -141,11 +142,13 @@ class Stream:
     Attributes:
         state: offset of its state in the block [B].
         values, used: offsets of the numbers drawn in advance and of the number of those used [B].
+        seed: state and increment of PCG64 at the start, lower words first.
     """
 
     state: int
     values: int
     used: int
+    seed: Sequence[int]
 
 
 @dataclass
@@ -165,9 +168,8 @@ class Library:
         inputs, outputs: signals, in the order of the caller's arrays.
         parameters: numbers that the caller may change.
         parts, tapes, streams: see the classes.
-        image: the block before the first sample, without the room for temporary arrays, shape (n,), uint8.
-        relocations: offsets of the words of the image that hold addresses, as offsets from its beginning [B].
         held: offset of the newest value of each output, 8 B each [B].
+        saved: size of a saved state, with which the block begins [B].
         room: offset of the room for temporary arrays [B].
         size: size of the block [B].
         left_out: events and faults of the scenario, which the caller has to cause; one line each.
@@ -189,7 +191,6 @@ class Library:
     parts: list[Part] = field(default_factory=list)
     tapes: list[Tape] = field(default_factory=list)
     streams: list[Stream] = field(default_factory=list)
-    relocations: list[int] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     fixed: list[str] = field(default_factory=list)
 
@@ -206,11 +207,15 @@ class Library:
         self._check_between(stages)
         self.step = stages[0].shared.step
         self._end = _HEAD
-        self._images: list[npt.NDArray[np.uint8]] = [np.zeros(_HEAD, np.uint8)]
         numbers = self._lay_tapes(stages)
+        self.held = self._append(8 * len(self.outputs))
         for stage in stages:
             self._add(stage, numbers)
             self._check_events(stage)
+        self.saved = self._end
+        for place, part in enumerate(self.parts):
+            memory = self._append(8 * max(part.stage.native().view.size, 1))
+            self.parts[place] = replace(part, memory=memory, table=self._append(8 * len(part.reads)))
         for name in self.tune:
             if name not in {parameter.name for parameter in self.parameters}:
                 node, _, parameter = name.partition(".")
@@ -218,8 +223,6 @@ class Library:
                     raise InputError(f"--tune {name}; allowed: NODE.PARAM of {', '.join(sorted(self.nodes))}")
                 raise InputError(f"--tune {name}: the step does not store it as it is; allowed: export once more")
         arrays = max(part.arrays for part in self.parts)
-        self.held = self._append(np.zeros(8 * len(self.outputs), np.uint8))
-        self.image = np.concatenate(self._images)
         self.room = self._end
         self.size = self.room + (arrays + 1) * 8 * max(self.block, _LEAST)
 
@@ -277,12 +280,10 @@ class Library:
 
     # ---- layout -------------------------------------------------------------------------------------
 
-    def _append(self, content: npt.NDArray[np.uint8]) -> int:
-        """Append content to the block, and return its offset."""
+    def _append(self, size: int) -> int:
+        """Append some bytes to the block, and return their offset."""
         offset = self._end
-        size = -(-content.size // 64) * 64
-        self._images.append(np.concatenate((content, np.zeros(size - content.size, np.uint8))))
-        self._end += size
+        self._end += -(-size // 64) * 64
         return offset
 
     def _lay_tapes(self, stages: Sequence[Stage]) -> dict[tuple[str, str], int]:
@@ -308,14 +309,13 @@ class Library:
             size = messages.sample_fields(kind)[name].itemsize
             longest = max(found) - given
             length = longest + self.block if longest else 0
-            content = np.zeros((2 * length or self.block) * size, np.uint8)
-            self.tapes.append(Tape(self._append(content), size, length))
+            self.tapes.append(Tape(self._append((2 * length or self.block) * size), size, length))
             signal = Signal(topic, name, units(kind).get(name, ""), size, number, *_range(kind, name), given)
             (self.outputs if topic in made else self.inputs).append(signal)
         return {key: number for number, key in enumerate(delays)}
 
     def _add(self, stage: Stage, numbers: dict[tuple[str, str], int]) -> None:
-        image, step = MemoryImage(stage.memory), stage.native()
+        step = stage.native()
         given = {signal.tape: signal.delay for signal in self.inputs}
         reads = [(-1, 0)] * (step.table.size - 1)
         places = iter(step.table.places)
@@ -330,48 +330,47 @@ class Library:
         ]
         for tape in writes:
             reads[next(places) - 1] = tape, 0
-        states = [(stream, self._append(_random_state(stream))) for stream in stage.streams if stream.drawn.values.size]
-        memory = self._end
-        for stream, state in states:
-            used = image.offset(stream.drawn.used)
-            image.content[used : used + 8] = 0
-            self.streams.append(Stream(state, memory + image.offset(stream.drawn.values), memory + used))
-        self.parameters += self._parameters(stage, image, memory)
-        for place in image.relocations:
-            image.content[place : place + 8].view(np.int64)[0] += memory
-            self.relocations.append(memory + place)
-        self._append(image.content)
-        table = self._append(np.zeros(8 * step.table.size, np.uint8))
+        tuned = self._tuned(stage)
         symbol = f"{self.name}_{len(self.parts)}_{stage.kind}"
+        code, arrays, memory = printed(stage, symbol, tuned)
+        state = self._append(memory.size)
+        for stream in stage.streams:
+            if stream.drawn.values.size:
+                values, used = (state + memory.offset(part) for part in stream.drawn)
+                self.streams.append(Stream(self._append(8 * 5), values, used, _seed(stream)))
+        for name in tuned:
+            self.parameters.append(self._parameter(stage, name, [state + place for place in memory.offsets(name)]))
         outputs = [signal.tape for signal in self.outputs]
         written = [outputs.index(tape) for tape in writes]
-        title = f"The step of {stage.name}, printed by lathe export c from its kernels."
-        code = printed(stage, symbol, title)
-        self.parts.append(Part(stage, symbol, *code, memory, table, step.table.floats, reads, written))
+        self.parts.append(Part(stage, symbol, code, arrays, state, 0, 0, reads, written))
 
     # ---- parameters ---------------------------------------------------------------------------------
 
-    def _parameters(self, stage: Stage, image: MemoryImage, memory: int) -> list[Parameter]:
-        found: list[Parameter] = []
-        for name, (array, index) in stage.handles.items():
-            place, value = (memory + image.offset(array, index),), float(array.flat[index])
-            doc = "1: it learns; 0: it does not"
-            found.append(
-                Parameter(f"{stage.name}.{name}", "", doc, 0.0, 1.0, "0 or 1", whole=True, value=value, places=place)
-            )
+    def _tuned(self, stage: Stage) -> dict[str, list[Place]]:
+        """Return the numbers in the memory that each parameter is stored as, and note the parameters without any."""
+        paths = {address(part): path for path, part in leaves(stage.memory) if isinstance(part, np.ndarray)}
+        found: dict[str, list[Place]]
+        found = {name: [(paths[address(array)], index)] for name, (array, index) in stage.handles.items()}
         asked = [name.partition(".")[2] for name in self.tune if name.partition(".")[0] == stage.name]
         rows = type(stage.shared).rows()
         for name in dict.fromkeys((*stage.tunable, *asked)):
             row = rows.get(name)
-            if row and row.type is float and not row.is_list and (places := _places(stage, name, image)):
-                at, value = tuple(memory + place for place in places), getattr(stage.shared, name)
-                low, high = (self._bound(stage, name, value, end) for end in _ends(row))
-                limits = f"from {low:.6g} up to {high:.6g}"
-                told = f"{stage.name}.{name}", row.unit, row.doc
-                found.append(Parameter(*told, low, high, limits, whole=False, value=value, places=at))
+            if row and row.type is float and not row.is_list and (places := _places(stage, name)):
+                found[name] = places
             else:
                 self.fixed.append(f"{stage.name}.{name}")
         return found
+
+    def _parameter(self, stage: Stage, name: str, places: Sequence[int]) -> Parameter:
+        part, named = len(self.parts), f"{stage.name}.{name}"
+        if name in stage.handles:
+            array, index = stage.handles[name]
+            doc, start = "1: it learns; 0: it does not", float(array.flat[index])
+            return Parameter(part, named, "", doc, 0.0, 1.0, "0 or 1", whole=True, value=start, places=places)
+        row, value = type(stage.shared).rows()[name], getattr(stage.shared, name)
+        low, high = (self._bound(stage, name, value, end) for end in _ends(row))
+        limits = f"from {low:.6g} up to {high:.6g}"
+        return Parameter(part, named, row.unit, row.doc, low, high, limits, whole=False, value=value, places=places)
 
     def _bound(self, stage: Stage, name: str, value: float, end: float) -> float:
         """Return the value of a parameter farthest towards ``end`` that the checks of the cell accept.
@@ -419,9 +418,9 @@ def _range(msgtype: str, name: str) -> tuple[float, float]:
     return -bound, bound
 
 
-def _places(stage: Stage, name: str, image: MemoryImage) -> list[int]:
-    """Return the offsets in a stage's memory at which a parameter is stored as it is; empty if it acts elsewhere."""
-    value, found = getattr(stage.shared, name), list[list[int]]()
+def _places(stage: Stage, name: str) -> list[Place]:
+    """Return the numbers in a stage's memory that a parameter is stored as, as it is; empty if it acts elsewhere."""
+    value, found = getattr(stage.shared, name), list[list[Place]]()
     for other in (value * 0.75, value * 1.25, value + 0.125, 0.375):
         try:
             changed = type(stage)(stage.name, stage.shared.changed(stage.name, {name: other}))
@@ -429,21 +428,29 @@ def _places(stage: Stage, name: str, image: MemoryImage) -> list[int]:
             continue
         if other == value:
             continue
-        new = MemoryImage(changed.memory)
-        if new.content.size != image.content.size or new.relocations != image.relocations:
+        places = _differences(stage.memory, changed.memory, other)
+        if places is None:
             return []
-        for used in (new.offset(each.drawn.used) for each in changed.streams if each.drawn.values.size):
-            new.content[used : used + 8] = 0
-        words = new.content.view(np.int64)
-        differs = np.flatnonzero(words != image.content.view(np.int64))
-        if not np.all(words[differs].view(np.float64) == other):
-            return []
-        found.append((8 * differs).tolist())
+        found.append(places)
     return found[0] if len(found) > 1 and all(each == found[0] for each in found) else []
 
 
-def _random_state(stream: NormalStream) -> npt.NDArray[np.uint8]:
-    """Return the state of a random stream: state and increment of PCG64, and that no number is drawn yet."""
+def _differences(memory: tuple[Any, ...], changed: tuple[Any, ...], value: float) -> list[Place] | None:
+    """Return the numbers that differ between two memories; None if the changed one is not always the given value."""
+    places, known, new = list[Place](), dict(leaves(memory)), dict(leaves(changed))
+    if known.keys() != new.keys():
+        return None
+    for path, part in known.items():
+        one, other = np.asarray(part), np.asarray(new[path])
+        if one.shape != other.shape:
+            return None
+        differs = np.flatnonzero((one != other) & ~(np.isnan(one) & np.isnan(other)))
+        if differs.size and not (one.dtype == float and one.flags.writeable and np.all(other.flat[differs] == value)):
+            return None
+        places += [(path, place if one.ndim else None) for place in differs.tolist()]
+    return places
+
+
+def _seed(stream: NormalStream) -> list[int]:
     state: Any = stream.generator.bit_generator.state
-    words = [state["state"][part] >> shift & (2**64 - 1) for part in ("state", "inc") for shift in (0, 64)]
-    return np.array([*words, 0], np.uint64).view(np.uint8)
+    return [state["state"][part] >> shift & (2**64 - 1) for part in ("state", "inc") for shift in (0, 64)]

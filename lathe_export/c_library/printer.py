@@ -10,29 +10,46 @@ the engine. What differs between the languages is a function of ``kernels.h``: t
 `kernel_types`   types of the names and expressions of a kernel
 `c_expressions`  expressions
 `c_function`     statements, comments, the function
+`step_memory`    the memory: tables and state
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from lathe_export.c_library import c_types
 from lathe_export.c_library.c_expressions import safe
 from lathe_export.c_library.c_function import CFunction, wrapped
-from lathe_export.c_library.c_types import BOOL, FLOAT, INT, OCTET, SHORT, ArrayType, PortsType, TupleType, Type
+from lathe_export.c_library.c_types import FLOAT, INT, OCTET, ArrayType, PortsType, TupleType, Type
 from lathe_export.c_library.kernel_types import KernelTypes, UnprintableError
+from lathe_export.c_library.step_memory import Place, StepMemory
+from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc.cell.stage import Stage
 from lathe_rc.compiled.struct_view import StructView
 from lathe_rc.extensions import is_ours
 
 
-def printed(stage: Stage, symbol: str, title: str) -> tuple[str, int]:
-    """Return the step of a stage as a C file, and the number of places in it that make a temporary array.
+class PrintedStep(NamedTuple):
+    """Step of a stage in C.
+
+    Attributes:
+        code: the file.
+        arrays: number of places in it that make a temporary array.
+        memory: its memory.
+    """
+
+    code: str
+    arrays: int
+    memory: StepMemory
+
+
+def printed(stage: Stage, symbol: str, tuned: Mapping[str, Sequence[Place]] | None = None) -> PrintedStep:
+    """Return the step of a stage in C.
 
     Args:
         stage: the stage.
-        symbol: name of its function.
-        title: first line of the file.
+        symbol: name of its ``lathe_code``.
+        tuned: see `lathe_export.c_library.step_memory.StepMemory`.
 
     Raises:
         UnprintableError: the step uses something that the printer does not know.
@@ -50,33 +67,44 @@ def printed(stage: Stage, symbol: str, title: str) -> tuple[str, int]:
     functions = [CFunction(each, printer) for each in printer.needed(step)]
     bodies = [line for each in functions for line in (*each.body(), "")]
     heads = [f"{each.head()};" for each in functions]
-
-    long = [f"int64_t {each}" for each in ("first", "start", "samples")]
-    arguments = ["lathe_room *room", "void *memory", *long, "const int64_t *table", "int64_t *reached"]
-    given = [*(["room"] if step.takes_room else []), "memory", "first", "start", "inputs", "flags", "outputs"]
+    arguments = {"inputs": (read, table.first - 1), "flags": (flags, 0), "outputs": (written, table.flags)}
+    given = ["room" if step.takes_room else "(void)room;", "memory", "first", "start_at", *arguments]
     entry = [
-        f"int64_t {symbol}({', '.join(arguments)})",
-        "{",
-        f"    const {printer.declared(read)} inputs = {_filled(read, table.first)};",
-        f"    const {printer.declared(flags)} flags = {_filled(flags, 1)};",
-        f"    const {printer.declared(written)} outputs = {_filled(written, 1 + table.flags)};",
-        f"    const {printer.declared(step.result)} found = {printer.name(step)}({', '.join(given)});",
-        *([] if step.takes_room else ["    (void)room;"]),
-        "    *reached = found.part[0];",
-        "    return found.part[1];",
-        "}",
+        f"const {printer.declared(kind)} {name} = {_filled(kind, begin, table.floats)};"
+        for name, (kind, begin) in arguments.items()
     ]
-    lines = [*printer.declarations(), *heads, "", *bodies, f"lathe_enter {symbol};", "", *entry]
-    text = "\n".join(part for line in lines for part in wrapped(line))
+    entry += [] if step.takes_room else [given.pop(0)]
+    entry.append(f"const {printer.declared(step.result)} found = {printer.name(step)}({', '.join(given)});")
+
+    memory = StepMemory(native.view, stage.memory, tuned or {})
+    text = TEMPLATES.get_template("c_library/NODE_step.c.j2").render(
+        node=stage.name,
+        declarations=_text(printer.declarations()),
+        tables="".join(f"{line}\n" for line in memory.tables()),
+        state=printer.unused("State"),
+        members=_text(memory.state(), 1),
+        size=max(memory.size, 8),
+        functions=_text([*heads, "", *bodies]),
+        starts=_text([*memory.start()] or ["(void)state;"], 1),
+        memory=printer.declared(native.view).removeprefix("const ").removesuffix(" *"),
+        initialiser=_text(memory.members(), 2),
+        most=8 * max(native.view.size, 1),
+        given=_text(entry, 1),
+        symbol=symbol,
+    )
     arrays = len(re.findall(r"\breal_(?:empty|full|copy|joined)\(room", text))
-    return f'/* SPDX-License-Identifier: Apache-2.0\n *\n * {title}\n */\n#include "kernels.h"\n\n{text}\n', arrays
+    return PrintedStep(text, arrays, memory)
 
 
-def _filled(kind: Type, begin: int) -> str:
+def _text(lines: Iterable[str], depth: int = 0) -> str:
+    return "\n".join(part for line in lines for part in wrapped(f"{'    ' * depth}{line}"))
+
+
+def _filled(kind: Type, begin: int, floats: int) -> str:
     """Return the arrays whose addresses begin at a place of the table."""
     if isinstance(kind, PortsType):
-        return f"{{table + {begin}, table[0], samples}}"
-    names = ", ".join(f"{SHORT[part.element]}_at(table[{begin + k}], samples)" for k, part in enumerate(kind.parts))
+        return f"{{table + {begin}, {floats}, samples}}"
+    names = ", ".join(f"{{table[{begin + k}], samples}}" for k in range(len(kind.parts)))
     return f"{{{{{names}}}}}" if kind.alike else f"{{{names}}}"
 
 
@@ -114,7 +142,8 @@ class Printer:
             left += new
         return [each for each in self.functions.values() if each in found]
 
-    def _unused(self, stem: str) -> str:
+    def unused(self, stem: str) -> str:
+        """Return a name that no other function or type of the file has."""
         name, count = stem, 2
         while name in self._taken:
             name, count = f"{stem}_{count}", count + 1
@@ -125,7 +154,7 @@ class Printer:
         """Return the name of a kernel: that of its module, and its own."""
         if types not in self._names:
             module, own = types.function.__module__.rpartition(".")[2], types.function.__name__.strip("_")
-            self._names[types] = self._unused(f"{module}_{own}")
+            self._names[types] = self.unused(f"{module}_{own}")
         return self._names[types]
 
     def declared(self, kind: Type) -> str:
@@ -137,7 +166,7 @@ class Printer:
         if kind not in self._tuples:
             for part in kind.parts:
                 self.declared(part)
-            self._tuples[kind] = self._unused(kind.name)
+            self._tuples[kind] = self.unused(kind.name)
         return self._tuples[kind]
 
     def _struct(self, kind: StructView) -> str:
@@ -145,7 +174,7 @@ class Printer:
             for member, _ in kind.members.values():
                 if isinstance(member, StructView):
                     self._struct(member)
-            self._structs[kind] = self._unused(kind.name.partition("(")[0].rpartition(".")[2])
+            self._structs[kind] = self.unused(kind.name.partition("(")[0].rpartition(".")[2])
         return self._structs[kind]
 
     def named(self, name: str, text: str) -> str:
@@ -164,7 +193,8 @@ class Printer:
             yield f"enum {{ {name} = {text} }};" if whole else f"static const {kind} {name} = {text};"
         for struct, name in self._structs.items():
             members = ((safe(member), c_types.of_numba(kind)) for member, (kind, _) in struct.members.items())
-            fields = [f"{self._member(kind)} {member}" for member, kind in members]
+            # A struct within another is no address.
+            fields = [f"{self._structs.get(kind) or self.declared(kind)} {member}" for member, kind in members]
             yield from _declared(name, fields or ["int64_t none"])
         for made, name in self._tuples.items():
             parts = [f"{self.declared(part)} {made.part(place)}" for place, part in enumerate(made.parts)]
@@ -172,12 +202,6 @@ class Printer:
                 parts = [f"{self.declared(made.parts[0])} part[{len(made.parts)}]"]
             yield from _declared(name, parts)
         yield ""
-
-    def _member(self, kind: Type) -> str:
-        """Return the type of a member, which takes whole words of 8 bytes."""
-        if isinstance(kind, StructView):
-            return self._structs[kind]
-        return INT if kind == BOOL else self.declared(kind)
 
 
 def _declared(name: str, fields: Sequence[str]) -> Iterator[str]:

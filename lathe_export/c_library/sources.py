@@ -8,24 +8,24 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numba.np.random._constants import fi_double, ki_double, wi_double
 
 from lathe_export.c_library.library import Library, Parameter, Signal
 from lathe_export.c_library.reference import Reference
+from lathe_export.c_library.step_memory import listed
+from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc import __version__
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 
-_GAP = 4  # zero words that are stored, so that there are fewer runs
 _OF_US = re.compile(r"`(lathe_rc\.[a-z_.]+)`")
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
@@ -48,6 +48,14 @@ _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
 KERNELS = "kernels.h"
 
 
+def described(library: Library, scenario: str) -> dict[str, Any]:
+    """Return what the templates say of a library."""
+    nodes = ", ".join(part.stage.name for part in library.parts)
+    return vars(library) | {
+        "upper": library.name.upper(), "nodes": nodes, "scenario": scenario, "version": __version__
+    }  # fmt: skip
+
+
 def sources(library: Library, scenario: str) -> dict[str, str]:
     """Return the text files of a library by name.
 
@@ -55,21 +63,12 @@ def sources(library: Library, scenario: str) -> dict[str, str]:
         library: the library.
         scenario: name of the scenario, for the comments.
     """
-    runs = _runs(library.image.view(np.uint64))
-    made: dict[str, Any] = {
-        **{name: getattr(library, name) for name in _KEPT},
-        "upper": library.name.upper(),
-        "nodes": ", ".join(part.stage.name for part in library.parts),
-        "scenario": scenario,
-        "version": __version__,
+    made = described(library, scenario) | {
         "steps": [f"{part.stage.name}_step.c" for part in library.parts],
-        "runs": [(8 * begin, end - begin) for begin, end in runs],
-        "tapes": [(tape.offset, tape.bytes, tape.length) for tape in library.tapes],
-        "streams": [(stream.state, stream.values, stream.used) for stream in library.streams],
         "ziggurat": {
-            "k": _listed(f"{word:#x}u" for word in ki_double.tolist()),
-            "w": _listed(map(float.hex, wi_double.tolist())),
-            "f": _listed(map(float.hex, fi_double.tolist())),
+            "k": listed((f"{word:#x}u" for word in ki_double.tolist()), 8),
+            "w": listed(map(float.hex, wi_double.tolist()), 8),
+            "f": listed(map(float.hex, fi_double.tolist()), 8),
         },
         "reasons": [(part.stage.name, *reason) for part in library.parts for reason in part.stage.stops.items()],
         "formulas": list(_formulas(part.stage for part in library.parts)),
@@ -77,37 +76,14 @@ def sources(library: Library, scenario: str) -> dict[str, str]:
     }
     found = {KERNELS: (_TEMPLATE_FOLDER / "c_library" / KERNELS).read_text("utf-8")}
     for name in _FIXED:
-        found[name] = _TEMPLATES.get_template(f"{name}.j2").render(made)
-    found[f"{library.name}.h"] = _TEMPLATES.get_template("NAME.h.j2").render(made)
-    tables = _TEMPLATES.get_template("NAME.c.j2")
+        found[name] = TEMPLATES.get_template(f"c_library/{name}.j2").render(made)
+    found[f"{library.name}.h"] = TEMPLATES.get_template("c_library/NAME.h.j2").render(made)
+    tables = TEMPLATES.get_template("c_library/NAME.c.j2")
     steps = {f"{part.stage.name}_step.c": part.code for part in library.parts}
-    told = hashlib.sha256(f"{tables.render(made)}{''.join(steps.values())}".encode() + library.image.tobytes())
+    told = hashlib.sha256(f"{tables.render(made)}{''.join(steps.values())}".encode())
     made["identity"] = f"0x{told.hexdigest()[:16]}"
     found[f"{library.name}.c"] = tables.render(made)
-    return found | steps | {f"{library.name}_state.c": _state(library)}
-
-
-def _state(library: Library) -> str:
-    """Return the words of the block before the first sample that are not 0, as C."""
-    found = library.image.view(np.uint64)
-    words = np.concatenate([found[begin:end] for begin, end in _runs(found)])
-    name = f"const uint64_t {library.name}_words[]"
-    listed = _listed(f"{word:#x}u" for word in words.tolist()) or "0"
-    return (
-        "/* SPDX-License-Identifier: Apache-2.0\n *\n * The block before sample 0, see lathe_init. */\n"
-        f"#include <stdint.h>\n\nextern {name};\n{name} = {{\n    {listed}\n}};\n"
-    )
-
-
-_KEPT = (
-    "name", "block", "step", "inputs", "outputs", "parameters", "parts", "relocations", "held", "room", "size",
-    "left_out",
-)  # fmt: skip
-
-
-def identity(library: Library, texts: Mapping[str, str]) -> str:
-    """Return the hash of a library's tables and state, from the files that `sources` returns."""
-    return hashlib.sha256(texts[f"{library.name}.c"].encode() + library.image.tobytes()).hexdigest()
+    return found | steps
 
 
 @dataclass(frozen=True)
@@ -196,14 +172,6 @@ def export_nodes(
     return Exported(place, library, reference)
 
 
-def _runs(words: np.ndarray) -> list[tuple[int, int]]:
-    """Return the begin and end of the runs of words of which few are 0; all other words are 0."""
-    filled = np.flatnonzero(words)
-    breaks = np.flatnonzero(np.diff(filled) > _GAP)
-    begins, ends = filled[np.r_[0, breaks + 1]], filled[np.r_[breaks, -1]] + 1
-    return list(zip(begins.tolist(), ends.tolist(), strict=True))
-
-
 def _formulas(stages: Iterable[Stage]) -> Iterator[tuple[str, str]]:
     """Yield the titles and texts of the modules of some stages, and of the modules that their classes refer to."""
     told: set[str] = set()
@@ -217,12 +185,6 @@ def _formulas(stages: Iterable[Stage]) -> Iterator[tuple[str, str]]:
             yield name, "\n".join(f"    {line}".rstrip() for line in inspect.cleandoc(module.__doc__).splitlines())
 
 
-def _listed(texts: Iterable[str]) -> str:
-    """Return an initialiser with eight elements in a line."""
-    all_of = list(texts)
-    return ",\n    ".join(", ".join(all_of[k : k + 8]) for k in range(0, len(all_of), 8))
-
-
 def _pairs(rows: Iterable[Iterable[int]]) -> str:
     return ", ".join("{" + ", ".join(map(str, row)) + "}" for row in rows)
 
@@ -233,7 +195,7 @@ def _number(value: float) -> str:
     return float(value).hex()
 
 
-def _described(signal: Signal) -> str:
+def _signal(signal: Signal) -> str:
     kind = "double" if signal.bytes == 8 else "uint8_t"
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
@@ -247,16 +209,10 @@ def _ranged(parameter: Parameter) -> str:
     return f"{parameter.doc}; at the start {parameter.value:.10g}{unit}{limits}"
 
 
-_TEMPLATES = Environment(
-    loader=PackageLoader("lathe_export", "templates/c_library"),
-    undefined=StrictUndefined,
-    keep_trailing_newline=True,
-    autoescape=False,  # noqa: S701 - C and Markdown, not HTML
-)
-_TEMPLATES.globals |= {
+TEMPLATES.globals |= {
     "pairs": _pairs,
     "number": _number,
-    "described": _described,
+    "described": _signal,
     "ranged": _ranged,
     "identifier": lambda name: re.sub(r"\W", "_", name).upper(),
     "text": json.dumps,

@@ -13,7 +13,7 @@
 #include <stdint.h>
 #include <string.h>
 
-/* An array whose elements follow one another. The shape stands behind the address, as in the memory of a step. */
+/* An array whose elements follow one another. */
 #define LATHE_ARRAY(type, name)                                                                                        \
     typedef struct {                                                                                                   \
         type *data;                                                                                                    \
@@ -63,24 +63,14 @@ LATHE_ARRAY(double, real)
 LATHE_ARRAY(int64_t, int)
 LATHE_ARRAY(uint8_t, octet)
 
-typedef struct { /* arrays of one size whose addresses follow one another */
-    const int64_t *table;
+typedef struct { /* arrays of one size */
+    void *const *table;
     int64_t count, size;
 } ports;
 
-static inline real_array real_at(int64_t address, int64_t size)
-{
-    return (real_array){(double *)(intptr_t)address, size};
-}
-
-static inline octet_array octet_at(int64_t address, int64_t size)
-{
-    return (octet_array){(uint8_t *)(intptr_t)address, size};
-}
-
 static inline real_array port(ports all, int64_t number)
 {
-    return real_at(all.table[number < 0 ? number + all.count : number], all.size);
+    return (real_array){all.table[number < 0 ? number + all.count : number], all.size};
 }
 
 static inline int64_t at(int64_t index, int64_t size)
