@@ -2,6 +2,7 @@
 """Every law, drive and cell of the scenarios as a C library; with CMake, valgrind, a sanitizer, and on 64-bit ARM."""
 
 import subprocess
+from itertools import product
 
 import pytest
 from bags import sized, some
@@ -22,6 +23,18 @@ REFUSED = {
     "oval3000_hard": "gauge: the event 'sample 0: freeze'",
     **dict.fromkeys(["supervised", "supervised_full_cell", "supervised_two_channel"], "publish_margin = true"),
 }
+PROGRAM = """
+#include "law.h"
+alignas(LATHE_ALIGNED) static char block[LAW_BYTES];
+int main()
+{
+    const double given[LAW_INPUTS] = {};
+    const void *inputs[LAW_INPUTS];
+    for (int k = 0; k < LAW_INPUTS; k++)
+        inputs[k] = &given[k];
+    return lathe_init(&law, block) || lathe_step(block, 1, inputs, nullptr) || lathe_sample(block) != 1;
+}
+"""
 #: the same with what Python does left out, and stages with further kinds of inputs
 HOSTILE = [
     ("piston", ["learning_controller"], []),
@@ -64,7 +77,7 @@ def test_each_cell_has_the_bits_of_the_engine(path, tmp_path):
 
 @pytest.mark.timeout(1500)
 def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
-    """One of each different compiled step that the scenarios have."""
+    """One of each different compiled step that the scenarios have; by GCC and Clang, as C99 and C11, at -O0 and -O3."""
     steps = {}
     for path in SCENARIOS:
         for name, stage in Cell(load(path).nodes).stages.items() if path.stem not in REFUSED else ():
@@ -72,7 +85,20 @@ def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
     assert len(steps) >= 25
     for number, (path, name) in enumerate(some([*steps.values()], 4)):
         exported = export_nodes(load(path), [name], tmp_path / str(number), name="alone", samples=20_000)
-        told(exported, built(exported.place))
+        for compiler, flags in product(("gcc", "clang"), (("-std=c99", "-O0"), ("-std=c11", "-O3"))):
+            told(exported, built(exported.place, *flags, compiler=compiler))
+
+
+@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+def test_a_program_in_cpp_runs_a_library(compiler, tmp_path):
+    """The headers are C++17 without a warning."""
+    place = export_nodes(load("piston"), ["learning_controller"], tmp_path / "law", name="law", samples=100).place
+    (place / "program.cpp").write_text(PROGRAM)
+    strict = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+    subprocess.run(["cc", "-c", *(path for path in place.glob("*.c") if path.stem != "main")], cwd=place, check=True)
+    objects = [*place.glob("*.o")]
+    subprocess.run([compiler, *strict, "-o", "program", "program.cpp", *objects, "-lm"], cwd=place, check=True)
+    subprocess.run([place / "program"], check=True)
 
 
 def test_cmake_builds_both_libraries_and_the_example(tmp_path):
@@ -101,13 +127,16 @@ def test_the_address_sanitizer_finds_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("processor", "compiler"), [("aarch64", "aarch64-linux-gnu"), ("arm", "arm-linux-gnueabihf")]
+)
+@pytest.mark.parametrize(
     ("name", "nodes"),
     [("piston", ["learning_controller"]), ("robust", ["disturbance_controller"]), ("two_channel", [])],
 )
-def test_64_bit_arm_has_the_bits_of_the_engine(name, nodes, tmp_path):
-    """Cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
+def test_arm_has_the_bits_of_the_engine(processor, compiler, name, nodes, tmp_path):
+    """64-bit and 32-bit; cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
     exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", samples=20_000)
-    told(exported, "qemu-aarch64", built(exported.place, "-static", compiler="aarch64-linux-gnu-gcc"))
+    told(exported, f"qemu-{processor}", built(exported.place, "-static", compiler=f"{compiler}-gcc"))
 
 
 @pytest.mark.timeout(1500)
