@@ -13,9 +13,11 @@ from bags import lathe
 from c_libraries import DONE, INPUT, REFUSED, STOPPED, Loaded, built, hostile, watched
 from cells import scenario
 
+from lathe_export.c_library.single_precision import single
 from lathe_export.c_library.sources import export_nodes, library_of, sources
 from lathe_rc import InputError
 from lathe_rc.cell.scenario import load
+from lathe_rc.errors import LatheError
 from lathe_rc.stages.learning.learning_controller import LearningController
 from lathe_rc.stages.tool.tool import Tool
 
@@ -188,6 +190,29 @@ def test_the_steps_read_as_the_kernels_do_and_need_libm_alone(law):
     )
     wanted = {line.split()[-1] for line in symbols.stdout.splitlines() if " U " in line}
     assert wanted <= {"memmove", "memcpy", "sin", "cos", "exp", "floor", "ceil", "fmod", "copysign", "rint"}
+
+
+def test_a_law_in_float_has_no_double_and_states_its_loss(law, tmp_path):
+    """Half the state; the README says what a run with the example gives."""
+    small = export_nodes(scenario(), ["learning_controller"], tmp_path / "law", name="law", real="float")
+    assert 0.5 < small.library.saved / law.library.saved < 0.6
+    steps = ["learning_controller_step.c", "lathe.c"]
+    subprocess.run(["cc", "-Wdouble-promotion", "-Werror", "-c", *steps], cwd=small.place, check=True)
+    program = built(small.place)
+    told = subprocess.run([program, small.place / "reference.bin", "0"], capture_output=True, text=True, check=True)
+    readme = (small.place / "README.md").read_text(encoding="utf-8")
+    assert all(line in readme for line in told.stdout.splitlines())
+    largest, rms, signal = map(float, re.findall(r"(?:difference|rms) ([^ ,]+)", told.stdout))
+    assert 0.0 < rms < largest < 1e-3 * signal
+
+
+def test_a_number_beyond_those_of_a_float_is_refused():
+    assert (
+        single("x = 1e-300 + sin(0.5); /* 0.5 of double */")
+        == "x = 1.1754943508222875e-38f + sinf(0.5f); /* 0.5 of double */"
+    )
+    with pytest.raises(LatheError, match=r"1e\+300 is no number of a float"):
+        single("1e+300")
 
 
 def test_a_step_allocates_no_memory(law):

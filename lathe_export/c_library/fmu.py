@@ -7,7 +7,6 @@ it from its sources.
 
 import hashlib
 import re
-import shutil
 import subprocess
 import tempfile
 import zipfile
@@ -111,9 +110,7 @@ def export_fmu(
     place = place or Path(f"{library.name}.fmu")
     if place.exists() or not place.absolute().parent.is_dir():
         raise InputError(f"{place}: exists, or has no parent folder; allowed: a new file in a folder that exists")
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        raise LatheError("no C compiler (cc or gcc) builds the FMU; allowed: apt install gcc")
+    compiler = sources.compiler("builds the FMU")
     made = _files(library, scenario.name, fmi)
     try:
         with tempfile.TemporaryDirectory(dir=place.absolute().parent) as folder:

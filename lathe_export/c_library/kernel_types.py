@@ -56,6 +56,7 @@ LIBRARY: dict[Any, tuple[int, Type, str]] = {
     np.empty_like: (1, _REALS, "real_empty(room, ({0}).size)"),
     np.concatenate: (2, _REALS, "real_joined(room, {0}, {1})"),
 }
+LIBM = {*_MATH.values(), "atan2", "hypot", "fmod", "copysign", "fabs", "pow"} - {"sign"}
 CASTS = {float: FLOAT, np.float64: FLOAT, int: INT, np.int64: INT, np.uint64: WORD, np.uint8: OCTET, bool: BOOL}
 MISSING = object()  #: what is no constant
 

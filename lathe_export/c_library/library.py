@@ -47,7 +47,7 @@ class Signal:
     Attributes:
         topic, field: relative topic after remapping, and the field of its messages.
         unit: unit; empty if there is none.
-        bytes: size of a sample: 8 for a double, 1 for a uint8_t.
+        bytes: size of a sample: 8 for a double, 4 for a float, 1 for a uint8_t.
         tape: index of the tape.
         low, high: smallest and largest value that is accepted or given.
         delay: for an input, the caller gives at sample k the value of sample k - delay.
@@ -162,6 +162,7 @@ class Library:
         block: largest number of samples in a call.
         tune: further parameters that the caller may change, as NODE.PARAM; those that the event ``set`` may change and
             whose values the step reads are always among them.
+        real: type of real numbers in C, ``double`` or ``float``.
 
     Attributes:
         step: sampling step [s].
@@ -185,6 +186,7 @@ class Library:
     name: str
     block: int
     tune: Collection[str] = ()
+    real: str = "double"
     inputs: list[Signal] = field(default_factory=list)
     outputs: list[Signal] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
@@ -206,7 +208,7 @@ class Library:
             self._check(stage)
         self._check_between(stages)
         self.step = stages[0].shared.step
-        self._end = _HEAD
+        self._end, self._real = _HEAD, {"double": 8, "float": 4}[self.real]
         numbers = self._lay_tapes(stages)
         self.held = self._append(8 * len(self.outputs))
         for stage in stages:
@@ -224,7 +226,7 @@ class Library:
                 raise InputError(f"--tune {name}: the step does not store it as it is; allowed: export once more")
         arrays = max(part.arrays for part in self.parts)
         self.room = self._end
-        self.size = self.room + (arrays + 1) * 8 * max(self.block, _LEAST)
+        self.size = self.room + (arrays + 1) * self._real * max(self.block, _LEAST)
 
     # ---- checks -------------------------------------------------------------------------------------
 
@@ -306,7 +308,7 @@ class Library:
         for number, ((topic, name), found) in enumerate(delays.items()):
             kind = types[topic]
             given = 0 if topic in made or min(found) == 0 else self.block
-            size = messages.sample_fields(kind)[name].itemsize
+            size = 1 if messages.sample_fields(kind)[name].itemsize == 1 else self._real
             longest = max(found) - given
             length = longest + self.block if longest else 0
             self.tapes.append(Tape(self._append((2 * length or self.block) * size), size, length))
@@ -332,7 +334,7 @@ class Library:
             reads[next(places) - 1] = tape, 0
         tuned = self._tuned(stage)
         symbol = f"{self.name}_{len(self.parts)}_{stage.kind}"
-        code, arrays, memory = printed(stage, symbol, tuned)
+        code, arrays, memory = printed(stage, symbol, tuned, self._real)
         state = self._append(memory.size)
         for stream in stage.streams:
             if stream.drawn.values.size:

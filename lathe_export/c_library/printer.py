@@ -43,13 +43,16 @@ class PrintedStep(NamedTuple):
     memory: StepMemory
 
 
-def printed(stage: Stage, symbol: str, tuned: Mapping[str, Sequence[Place]] | None = None) -> PrintedStep:
+def printed(
+    stage: Stage, symbol: str, tuned: Mapping[str, Sequence[Place]] | None = None, bytes_of_real: int = 8
+) -> PrintedStep:
     """Return the step of a stage in C.
 
     Args:
         stage: the stage.
         symbol: name of its ``lathe_code``.
         tuned: see `lathe_export.c_library.step_memory.StepMemory`.
+        bytes_of_real: size of a real number in C [B].
 
     Raises:
         UnprintableError: the step uses something that the printer does not know.
@@ -76,7 +79,7 @@ def printed(stage: Stage, symbol: str, tuned: Mapping[str, Sequence[Place]] | No
     entry += [] if step.takes_room else [given.pop(0)]
     entry.append(f"const {printer.declared(step.result)} found = {printer.name(step)}({', '.join(given)});")
 
-    memory = StepMemory(native.view, stage.memory, tuned or {})
+    memory = StepMemory(native.view, stage.memory, tuned or {}, bytes_of_real)
     text = TEMPLATES.get_template("c_library/NODE_step.c.j2").render(
         node=stage.name,
         declarations=_text(printer.declarations()),

@@ -6,6 +6,8 @@ import hashlib
 import inspect
 import json
 import re
+import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -18,13 +20,14 @@ from numba.np.random._constants import fi_double, ki_double, wi_double
 
 from lathe_export.c_library.library import Library, Parameter, Signal
 from lathe_export.c_library.reference import Reference
+from lathe_export.c_library.single_precision import single
 from lathe_export.c_library.step_memory import listed
 from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc import __version__
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, LatheError
+from lathe_rc.errors import InputError, LatheError, shown
 
 _OF_US = re.compile(r"`(lathe_rc\.[a-z_.]+)`")
 _IDENTIFIER = re.compile(r"[a-z][a-z0-9_]*")
@@ -83,6 +86,9 @@ def sources(library: Library, scenario: str) -> dict[str, str]:
     told = hashlib.sha256(f"{tables.render(made)}{''.join(steps.values())}".encode())
     made["identity"] = f"0x{told.hexdigest()[:16]}"
     found[f"{library.name}.c"] = tables.render(made)
+    if library.real == "float":
+        steps |= {KERNELS: found[KERNELS]}
+        steps = {name: single(text) for name, text in steps.items()}
     return found | steps
 
 
@@ -102,7 +108,12 @@ class Exported:
 
 
 def library_of(
-    scenario: Scenario, nodes: Sequence[str], name: str | None, block: int | None, tune: Collection[str]
+    scenario: Scenario,
+    nodes: Sequence[str],
+    name: str | None,
+    block: int | None,
+    tune: Collection[str],
+    real: str = "double",
 ) -> Library:
     """Return stages of a scenario as a library (arguments and errors as for `export_nodes`)."""
     cell = Cell(scenario.nodes)
@@ -110,7 +121,7 @@ def library_of(
     name = name or (nodes[0] if len(nodes) == 1 else scenario.name)
     _check_name(name)
     cell.check(cures=False)
-    return Library(cell, nodes, name, cell.master.shared.block_size if block is None else block, tune)
+    return Library(cell, nodes, name, cell.master.shared.block_size if block is None else block, tune, real)
 
 
 def _check_name(name: str) -> None:
@@ -136,6 +147,7 @@ def export_nodes(
     block: int | None = None,
     tune: Collection[str] = (),
     samples: int = 65536,
+    real: str = "double",
 ) -> Exported:
     """Write stages of a scenario as a C library into a new folder.
 
@@ -147,12 +159,14 @@ def export_nodes(
         block: largest number of samples in a call; None: the block size of the scenario.
         tune: see `lathe_export.c_library.library.Library`.
         samples: length of the reference [sample].
+        real: ``double``, or ``float``, of which the README states the loss over the reference.
 
     Raises:
         InputError: the folder exists, the name is no identifier, or as for `lathe_export.c_library.library.Library`.
-        LatheError: a step cannot be printed as C, or the folder cannot be written.
+        LatheError: a step cannot be printed as C, the library stops or cannot be compiled in float, or the folder
+            cannot be written.
     """
-    library = library_of(scenario, nodes, name, block, tune)
+    library = library_of(scenario, nodes, name, block, tune, real)
     name = library.name
     place = place or Path(f"{name}-c")
     if place.exists() or not place.absolute().parent.is_dir():
@@ -166,10 +180,37 @@ def export_nodes(
             for file, text in texts.items():
                 (new / file).write_text(text, encoding="utf-8")
             reference.write(new / "reference.bin")
+            if real == "float":
+                (new / "README.md").write_text(texts["README.md"] + _loss(new), encoding="utf-8")
             new.rename(place)
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror})") from None
     return Exported(place, library, reference)
+
+
+def compiler(needed_for: str) -> str:
+    """Return the C compiler of the machine.
+
+    Raises:
+        LatheError: there is none.
+    """
+    if found := shutil.which("cc") or shutil.which("gcc"):
+        return found
+    raise LatheError(f"no C compiler (cc or gcc) {needed_for}; allowed: apt install gcc")
+
+
+def _loss(place: Path) -> str:
+    """Return what a library in float loses over the reference, as a section of its README."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "program"
+        build = [compiler("measures the loss of --real float"), "-O2", "-ffp-contract=off", "-o", program, "-lm"]
+        for command in ([*build[:-1], *place.glob("*.c"), build[-1]], [program, place / "reference.bin", "0"]):
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise LatheError(f"--real float: {shown(done.stderr or done.stdout)}; allowed: --real double")
+    *signals, run = done.stdout.splitlines()
+    said = "".join(f"- {line}\n" for line in signals)
+    return f"\n## Loss of float\n\n{run}, against the engine, which computes in double, from its inputs:\n\n{said}"
 
 
 def _formulas(stages: Iterable[Stage]) -> Iterator[tuple[str, str]]:
@@ -196,7 +237,7 @@ def _number(value: float) -> str:
 
 
 def _signal(signal: Signal) -> str:
-    kind = "double" if signal.bytes == 8 else "uint8_t"
+    kind = {8: "double", 4: "float", 1: "uint8_t"}[signal.bytes]
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
     unit = f" [{signal.unit}]" if signal.unit else ""

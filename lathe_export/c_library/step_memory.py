@@ -27,6 +27,7 @@ class StepMemory:
         kind: type of the memory.
         memory: the memory (see `lathe_rc.cell.stage.Stage.memory`).
         tuned: for each parameter, the numbers that it is stored as; the state holds these too.
+        real: size of a real number in C [B].
 
     Attributes:
         size: size of the state [B].
@@ -35,9 +36,11 @@ class StepMemory:
         LatheError: arrays share a part of their memory; the whole of it is fine.
     """
 
-    def __init__(self, kind: StructView, memory: tuple[Any, ...], tuned: Mapping[str, Sequence[Place]]) -> None:
+    def __init__(
+        self, kind: StructView, memory: tuple[Any, ...], tuned: Mapping[str, Sequence[Place]], real: int
+    ) -> None:
         self._kind, self._memory, self._tuned = kind, memory, tuned
-        self._known = dict(leaves(memory))
+        self._known, self._bytes = dict(leaves(memory)), {"f": real, "i": 8, "u": 1}
         arrays = {_named(path): part for path, part in self._known.items() if isinstance(part, np.ndarray)}
         self._names = {address(part): name for name, part in reversed(arrays.items())}
         ends = sorted({(address(part), address(part) + part.nbytes) for part in arrays.values() if part.size})
@@ -50,15 +53,15 @@ class StepMemory:
         self.size = 0
         numbers = [path for places in tuned.values() for path, index in places if index is None]
         self._numbers = {_named(path): self._known[path] for path in numbers}
-        state = sorted(self._arrays.items(), key=lambda each: -each[1].itemsize)  # octets behind whole words
-        for name, bytes_of in [*((each, 8) for each in self._numbers), *((each, part.nbytes) for each, part in state)]:
+        state = [(name, np.zeros(1)) for name in self._numbers] + [*self._arrays.items()]
+        for name, part in sorted(state, key=lambda each: -self._bytes[each[1].dtype.kind]):  # no gaps
             self._offsets[name] = self.size
-            self.size += bytes_of
+            self.size += part.size * self._bytes[part.dtype.kind]
         self.size = -(-self.size // 8) * 8
 
     def offset(self, array: npt.NDArray[Any], index: int = 0) -> int:
         """Return the offset in the state of an element of an array [B]."""
-        return self._offsets[self._names[address(array)]] + index * array.itemsize
+        return self._offsets[self._names[address(array)]] + index * self._bytes[array.dtype.kind]
 
     def offsets(self, parameter: str) -> list[int]:
         """Return the offsets in the state of the numbers that a parameter is stored as [B]."""

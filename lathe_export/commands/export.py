@@ -63,6 +63,13 @@ def bag(ctx: click.Context, bag: Path, kinds: tuple[str, ...], output: Path | No
 @click.option("--block", type=int, help="most samples in a call, and the delay of fed-back inputs; default: block_size")
 @click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
 @click.option(
+    "--real",
+    type=click.Choice(["double", "float"]),
+    default="double",
+    show_default=True,
+    help="type of real numbers; float for processors without double, the README states its loss",
+)
+@click.option(
     "--samples",
     type=click.IntRange(1),
     default=65536,

@@ -126,17 +126,19 @@ def test_the_address_sanitizer_finds_nothing(tmp_path):
     told(exported, built(exported.place, *flags), samples=1_000_000)
 
 
-@pytest.mark.parametrize(
-    ("processor", "compiler"), [("aarch64", "aarch64-linux-gnu"), ("arm", "arm-linux-gnueabihf")]
-)
+@pytest.mark.parametrize(("processor", "compiler"), [("aarch64", "aarch64-linux-gnu"), ("arm", "arm-linux-gnueabihf")])
 @pytest.mark.parametrize(
     ("name", "nodes"),
     [("piston", ["learning_controller"]), ("robust", ["disturbance_controller"]), ("two_channel", [])],
 )
 def test_arm_has_the_bits_of_the_engine(processor, compiler, name, nodes, tmp_path):
-    """64-bit and 32-bit; cross-compiled, with the libm of Debian's cross compiler, under qemu-user."""
+    """64-bit and 32-bit, with the libm of Debian's cross compilers, under qemu-user; in float those of x86-64."""
     exported = export_nodes(load(name), nodes, tmp_path / "arm", name="arm", samples=20_000)
     told(exported, f"qemu-{processor}", built(exported.place, "-static", compiler=f"{compiler}-gcc"))
+    small = export_nodes(load(name), nodes, tmp_path / "small", name="arm", samples=20_000, real="float").place
+    command = [f"qemu-{processor}", built(small, "-static", compiler=f"{compiler}-gcc"), small / "reference.bin", "0"]
+    loss = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert all(line in (small / "README.md").read_text(encoding="utf-8") for line in loss.splitlines())
 
 
 @pytest.mark.timeout(1500)
