@@ -334,7 +334,7 @@ class Library:
             reads[next(places) - 1] = tape, 0
         tuned = self._tuned(stage)
         symbol = f"{self.name}_{len(self.parts)}_{stage.kind}"
-        code, arrays, memory = printed(stage, symbol, tuned, self._real)
+        code, arrays, memory = printed(stage, symbol, tuned, self._real, self.block)
         state = self._append(memory.size)
         for stream in stage.streams:
             if stream.drawn.values.size:

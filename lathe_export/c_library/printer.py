@@ -25,8 +25,9 @@ from lathe_export.c_library.kernel_types import KernelTypes, UnprintableError
 from lathe_export.c_library.step_memory import Place, StepMemory
 from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc.cell.stage import Stage
-from lathe_rc.compiled.struct_view import StructView
+from lathe_rc.compiled.struct_view import StructView, address
 from lathe_rc.extensions import is_ours
+from lathe_rc.messages import MAX_BLOCK
 
 
 class PrintedStep(NamedTuple):
@@ -44,7 +45,11 @@ class PrintedStep(NamedTuple):
 
 
 def printed(
-    stage: Stage, symbol: str, tuned: Mapping[str, Sequence[Place]] | None = None, bytes_of_real: int = 8
+    stage: Stage,
+    symbol: str,
+    tuned: Mapping[str, Sequence[Place]] | None = None,
+    bytes_of_real: int = 8,
+    block: int = MAX_BLOCK,
 ) -> PrintedStep:
     """Return the step of a stage in C.
 
@@ -53,6 +58,7 @@ def printed(
         symbol: name of its ``lathe_code``.
         tuned: see `lathe_export.c_library.step_memory.StepMemory`.
         bytes_of_real: size of a real number in C [B].
+        block: largest number of samples in a call.
 
     Raises:
         UnprintableError: the step uses something that the printer does not know.
@@ -79,7 +85,8 @@ def printed(
     entry += [] if step.takes_room else [given.pop(0)]
     entry.append(f"const {printer.declared(step.result)} found = {printer.name(step)}({', '.join(given)});")
 
-    memory = StepMemory(native.view, stage.memory, tuned or {}, bytes_of_real)
+    rows = {address(part): part.shape[-1] - MAX_BLOCK + block for part in stage.of_block if part.size}
+    memory = StepMemory(native.view, stage.memory, tuned or {}, bytes_of_real, rows)
     text = TEMPLATES.get_template("c_library/NODE_step.c.j2").render(
         node=stage.name,
         declarations=_text(printer.declarations()),

@@ -28,6 +28,7 @@ class StepMemory:
         memory: the memory (see `lathe_rc.cell.stage.Stage.memory`).
         tuned: for each parameter, the numbers that it is stored as; the state holds these too.
         real: size of a real number in C [B].
+        rows: other lengths of the rows of some arrays, by their addresses.
 
     Attributes:
         size: size of the state [B].
@@ -37,7 +38,12 @@ class StepMemory:
     """
 
     def __init__(
-        self, kind: StructView, memory: tuple[Any, ...], tuned: Mapping[str, Sequence[Place]], real: int
+        self,
+        kind: StructView,
+        memory: tuple[Any, ...],
+        tuned: Mapping[str, Sequence[Place]],
+        real: int,
+        rows: Mapping[int, int],
     ) -> None:
         self._kind, self._memory, self._tuned = kind, memory, tuned
         self._known, self._bytes = dict(leaves(memory)), {"f": real, "i": 8, "u": 1}
@@ -48,7 +54,8 @@ class StepMemory:
             raise LatheError("arrays of a step's memory that share a part of it cannot be printed as C")
         own = {name: part for name, part in arrays.items() if part.size and self._names[address(part)] == name}
         self._tables = {name: part for name, part in own.items() if not part.flags.writeable}
-        self._arrays = {name: part for name, part in own.items() if part.flags.writeable}
+        self._rows = rows
+        self._arrays = {name: self._cut(part) for name, part in own.items() if part.flags.writeable}
         self._offsets: dict[str, int] = {}
         self.size = 0
         numbers = [path for places in tuned.values() for path, index in places if index is None]
@@ -58,6 +65,9 @@ class StepMemory:
             self._offsets[name] = self.size
             self.size += part.size * self._bytes[part.dtype.kind]
         self.size = -(-self.size // 8) * 8
+
+    def _cut(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return array[..., : self._rows.get(address(array))]
 
     def offset(self, array: npt.NDArray[Any], index: int = 0) -> int:
         """Return the offset in the state of an element of an array [B]."""
@@ -105,7 +115,7 @@ class StepMemory:
                 yield from (f"    {line}" for line in self._members(member, part, path))
                 yield "},"
             elif isinstance(part, np.ndarray):
-                yield f".{safe(name)} = {{{self._pointer(part)}, {', '.join(map(str, part.shape))}}},"
+                yield f".{safe(name)} = {{{self._pointer(part)}, {', '.join(map(str, self._cut(part).shape))}}},"
             else:
                 known = _named(path) in self._numbers
                 yield f".{safe(name)} = {f'state->{_named(path)}' if known else number(part)},"

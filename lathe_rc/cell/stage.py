@@ -572,6 +572,14 @@ class Stage(ABC):
             self._room = np.zeros((self.rooms, messages.MAX_BLOCK))
         return self._room
 
+    @property
+    def of_block(self) -> list[Samples]:
+        """Return the arrays of the memory that hold values of the current block alone.
+
+        Their rows have `MAX_BLOCK` elements or a few more; a host with shorter blocks may shorten them.
+        """
+        return [self.room, *(stream.drawn.values for stream in self.streams)]
+
     def take_room(self, other: "Stage") -> None:
         """Take over the scratch memory of a stage that no longer runs, if it is of the same size."""
         if other.rooms == self.rooms:

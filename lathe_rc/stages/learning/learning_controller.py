@@ -23,7 +23,7 @@ from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.identification import DriveIdentifier, Identified
 from lathe_rc.control.repetitive import Cycle, RepetitiveController, largest_feedback_delay
 from lathe_rc.errors import InputError
-from lathe_rc.messages import MAX_BLOCK, Signals
+from lathe_rc.messages import MAX_BLOCK, Samples, Signals
 from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.stages.common.obedience import OBEY, listens
 from lathe_rc.stages.common.tables import made_of
@@ -303,6 +303,12 @@ class LearningController(Learner):
         if parameters.stop_ratio:
             return f"stop_ratio = {parameters.stop_ratio:g} is watched in Python; allowed: 0"
         return super().needs_python
+
+    @property
+    def of_block(self) -> list[Samples]:
+        """Return the scratch arrays of the memory too."""
+        table = self._controller.table
+        return [*super().of_block, table.windows, table.ahead]
 
     @property
     def handles(self) -> Mapping[str, tuple[np.ndarray, int]]:
