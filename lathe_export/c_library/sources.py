@@ -202,9 +202,10 @@ def compiler(needed_for: str) -> str:
 def _loss(place: Path) -> str:
     """Return what a library in float loses over the reference, as a section of its README."""
     with tempfile.TemporaryDirectory() as folder:
-        program = Path(folder) / "program"
-        build = compiler("measures the loss of --real float"), "-O2", "-ffp-contract=off", "-o", program
-        for command in ((*build, *place.glob("*.c"), "-lm"), (program, place / "reference.bin", "0")):
+        program = f"{folder}/program"
+        build = [compiler("measures the loss of --real float"), "-O2", "-ffp-contract=off", "-o", program]
+        build += [*map(str, place.glob("*.c")), "-lm"]
+        for command in (build, [program, str(place / "reference.bin"), "0"]):
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 raise LatheError(f"--real float: {shown(done.stderr or done.stdout)}; allowed: --real double")

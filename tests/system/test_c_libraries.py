@@ -3,7 +3,9 @@
 
 import subprocess
 from itertools import product
+from pathlib import Path
 
+import numpy as np
 import pytest
 from bags import sized, some
 from c_libraries import built, hostile
@@ -139,6 +141,35 @@ def test_arm_has_the_bits_of_the_engine(processor, compiler, name, nodes, tmp_pa
     command = [f"qemu-{processor}", built(small, "-static", compiler=f"{compiler}-gcc"), small / "reference.bin", "0"]
     loss = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert all(line in (small / "README.md").read_text(encoding="utf-8") for line in loss.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("name", "node", "values"),
+    [
+        ("piston", "learning_controller", ["identify=false", "feedback_delay=200"]),
+        ("robust", "disturbance_controller", []),
+    ],
+)
+def test_a_law_in_float_runs_in_64_kb_on_a_cortex_m4(name, node, values, tmp_path):
+    """On a bare processor with newlib, under QEMU, with the bits of the same program on x86-64; in 1 KB of stack."""
+    cell = load(name, [f"{node}.{value}" for value in values])
+    exported = export_nodes(cell, [node], tmp_path / "law", name="law", real="float", block=1, samples=20_000)
+    place, signals = exported.place, exported.library.inputs
+    rows = np.stack([exported.reference.signal(each) for each in signals], axis=1).astype(np.float32).tolist()
+    listed = ",\n".join(f"{{{', '.join(f'{value.hex()}f' for value in row)}}}" for row in rows)
+    given = f"static const float given[{len(rows)}][LAW_INPUTS] = {{\n{listed}}};\n"
+    (place / "given.h").write_text(given, encoding="utf-8")
+    folder = Path(__file__).parents[1]
+    how = {"main": folder / "cortex_m4.c"}
+    chip = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-nostartfiles"]
+    script = ["-T", f"{folder}/cortex_m4.ld", f"-I{place}"]
+    emulator = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "-kernel"]
+    bare = [*emulator, built(place, *chip, *script, compiler="arm-none-eabi-gcc", **how)]
+    found = subprocess.run(bare, capture_output=True, text=True, check=True).stderr.split()  # the console
+    here = [built(place, f"-I{place}", **how)]
+    wanted = subprocess.run(here, capture_output=True, text=True, check=True).stdout.split()
+    assert found[:1] == wanted != ["00000000"]
+    assert int(found[1], 16) < 1024
 
 
 @pytest.mark.timeout(1500)
