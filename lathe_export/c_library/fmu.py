@@ -144,7 +144,7 @@ def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     texts = sources.sources(library, scenario)
     token = hashlib.sha256(texts[f"{library.name}.c"].encode()).hexdigest()
     headers = {each: (Path(fmpy.__file__).parent / "c-code" / each).read_text("utf-8") for each in _HEADERS[fmi]}
-    made = sources.described(library, scenario) | {"fmi": fmi, "token": token, "integers": _INTEGERS[fmi]}
+    made = sources.context(library, scenario) | {"fmi": fmi, "token": token, "integers": _INTEGERS[fmi]}
     code = {"fmu.c": TEMPLATES.overlay(trim_blocks=True).get_template("fmu/fmu.c.j2").render(made)}
     written = set(re.findall(rf"\bfmi{fmi}\w+", code["fmu.c"])) | _composed(code["fmu.c"], fmi)
     missing = sorted(set(_DECLARED.findall(headers[_HEADERS[fmi][0]])) - written)

@@ -51,12 +51,11 @@ _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
 KERNELS = "kernels.h"
 
 
-def described(library: Library, scenario: str) -> dict[str, Any]:
+def context(library: Library, scenario: str) -> dict[str, Any]:
     """Return what the templates say of a library."""
     nodes = ", ".join(part.stage.name for part in library.parts)
-    return vars(library) | {
-        "upper": library.name.upper(), "nodes": nodes, "scenario": scenario, "version": __version__
-    }  # fmt: skip
+    own = {"upper": library.name.upper(), "nodes": nodes, "scenario": scenario, "version": __version__}
+    return vars(library) | own
 
 
 def sources(library: Library, scenario: str) -> dict[str, str]:
@@ -66,7 +65,7 @@ def sources(library: Library, scenario: str) -> dict[str, str]:
         library: the library.
         scenario: name of the scenario, for the comments.
     """
-    made = described(library, scenario) | {
+    made = context(library, scenario) | {
         "steps": [f"{part.stage.name}_step.c" for part in library.parts],
         "ziggurat": {
             "k": listed((f"{word:#x}u" for word in ki_double.tolist()), 8),
@@ -237,7 +236,7 @@ def _number(value: float) -> str:
     return float(value).hex()
 
 
-def _signal(signal: Signal) -> str:
+def _described(signal: Signal) -> str:
     kind = {8: "double", 4: "float", 1: "uint8_t"}[signal.bytes]
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
@@ -254,7 +253,7 @@ def _ranged(parameter: Parameter) -> str:
 TEMPLATES.globals |= {
     "pairs": _pairs,
     "number": _number,
-    "described": _signal,
+    "described": _described,
     "ranged": _ranged,
     "identifier": lambda name: re.sub(r"\W", "_", name).upper(),
     "text": json.dumps,
