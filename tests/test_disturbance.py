@@ -16,7 +16,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
 from lathe_rc.control import disturbance_memory
 from lathe_rc.control.angle_filter import angle_filter, at, follow
-from lathe_rc.errors import InputError
+from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.encoder import Encoder
 from lathe_rc.signals.profile import Piston
@@ -213,6 +213,14 @@ def test_the_drive_is_identified_while_it_cuts():
     Engine(cell, keeper.heard).run([keeper])
     a1, a2 = cell.stages["controller"].law.known.model
     assert_allclose([a1, a2], [2 * 0.804 * 1.2 / (0.8 * 1038.0), 1 / (0.8 * 1038.0) ** 2], rtol=0.03)
+
+
+def test_a_jump_of_the_angle_is_not_measured_point_by_point():
+    """Its error ends the run, as soon as that of a small jump does."""
+    fault = "spindle_encoder.faults=['revolution 2: encoder.angle wrong offset=1e8']"
+    jumps = config("robust", "allow_faults=true", "spindle_encoder.revolutions=6", fault)
+    (outcome,) = batch.run_many([jumps], ["tool"], threads=1)
+    assert isinstance(outcome.error, DivergedError)
 
 
 def test_frozen_it_keeps_what_it_has_learned_and_clear_forgets_that():

@@ -279,7 +279,7 @@ def _measure(m: DisturbanceTable, form: FormAhead, angle: float, speed: float, b
     lag = STAGES / low.bandwidth  # of the low-pass for slow signals, which thus belong to an earlier angle
     place = int(np.floor((angle - speed * lag) * (m.memory.value.size / _TURN)))
     low = m.identifier
-    if not state[_BEGUN]:
+    if not state[_BEGUN] or place - state[_POINT] > m.memory.value.size:  # or the angle has jumped by a revolution
         state[_BEGUN], state[_POINT], state[_FIRST] = 1, place, place
         m.memory.fresh[:] = 0.0
     while state[_POINT] < place:
