@@ -107,11 +107,11 @@ function offerFaults() {
   form.values.value = Object.entries(kind.values).map(([name, value]) => `${name}=${value ?? ""}`).join(" ");
   $("fault-note").textContent = kind.doc;
 }
-let inForce = "";
+let offered = "";
 function offerRepair(faults) { // chooses a fault that has come into force, once, for its repair
   const newest = faults.at(-1) || "", [node, target, kind, ...values] = newest.split(/:? /), form = $("fault").elements;
-  if (newest == inForce) return;
-  inForce = newest;
+  if (newest == offered) return;
+  offered = newest;
   if (!ABOUT.nodes.some(each => each.name == node)) return;
   for (const [field, value] of Object.entries({ node, target, kind })) { form[field].value = value; offerFaults(); }
   form.values.value = values.join(" ");
