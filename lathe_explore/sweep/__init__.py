@@ -31,6 +31,5 @@ LOOP_FIGURES = (
     "anti_windup",
     "diverges",
 )  #: of a force or position controller
-STATISTICS = ("max", "rms", "mean", "peak_to_valley")  #: of a signal in the last revolution
 SAMPLERS = ("tpe", "cmaes", "nsga2")  #: of a tuning
 BATCH = 8  #: trials that are asked for at a time

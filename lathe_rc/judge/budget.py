@@ -16,7 +16,7 @@ from lathe_rc.cell.parameters import NodeParameters, Value, Values
 from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.judge.causes import EVERYWHERE, ORDER, PREFIXES
+from lathe_rc.judge.causes import EVERYWHERE, PREFIXES
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.form_errors import form_errors
 from lathe_rc.stages.learning.learning_controller import LearningController
@@ -100,6 +100,7 @@ def _not_yet(scenario: Scenario, values: Values) -> dict[str, Value]:
 
 def _simple(scenario: Scenario) -> dict[str, Cause]:
     """Return the causes that fixed parameter values switch off."""
+    names = dict.fromkeys([*EVERYWHERE, *(name for table in scenario.nodes.values() for name in table.causes)])
     return {
         name: Cause(
             {
@@ -110,7 +111,7 @@ def _simple(scenario: Scenario) -> dict[str, Cause]:
                 if f"{prefix}{each}" in type(table).model_fields
             }
         )
-        for name in ORDER
+        for name in names
     }
 
 

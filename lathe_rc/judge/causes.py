@@ -7,9 +7,12 @@ from lathe_rc.cell.parameters import Values
 
 PREFIXES = ("", "coarse_", "fine_", "cut_")  #: parameter prefixes of stages composed of several devices
 
-#: causes that the same values switch off in every node that has these parameters; `NodeParameters.causes` has others
+#: causes in the order of a budget, and the values that switch each off in every node that has these parameters; tables
+#: may have values of their own, and causes that come behind these (`NodeParameters.causes`)
 EVERYWHERE: Mapping[str, Values] = {
     "force": {"deflects": False, "cross_slide": False, "radial_ratio": 0.0},
+    "load": {},
+    "vibration": {},
     "error motion": {"error_motion_order": [], "error_motion_amplitude": [], "error_motion_phase": []},
     "drift": {"gain_drift": 0.0, "mode_drift": 0.0},
     "noise": {"noise_rms": 0.0},
@@ -22,10 +25,6 @@ EVERYWHERE: Mapping[str, Values] = {
     | {"slew_rate": 0.0},
     "faults": {"faults": []},
 }
-ORDER = (
-    "force", "load", "vibration", "error motion", "drift", "noise", "jitter", "quantisation", "hysteresis", "backlash",
-    "limits", "faults",
-)  # fmt: skip
 #: causes that make one revolution differ from the next
 _CHANGING: Mapping[str, Values] = {
     "drift": EVERYWHERE["drift"],
