@@ -35,7 +35,7 @@ from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
-from lathe_rc.judge.part import Limits, error_growth
+from lathe_rc.judge.part import Tolerances, error_growth
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.form_limits import form_limits, varying_speed
 
@@ -153,9 +153,9 @@ class View:
         self.memories: Collection[str] = ()
         self._loops: Sequence[Loop] = ()
         self._declared: Mapping[str, Judged] = {}
-        self._doubt = 0.0  # about the form, see `Limits`
+        self._doubt = 0.0  # about the form, see `Tolerances`
         self._part: RunningForm | None = None  # from the first sample of the part on
-        self._allowed = Limits()
+        self._tolerances = Tolerances()
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -292,8 +292,8 @@ class View:
         self._now["height"] = float(tool["height"][-1]) * 1e3
         if sound:
             if self._part is None:
-                self._allowed = Limits.of(self._declared, self.topics.tool, self._doubt)
-                self._part = RunningForm(self.topics.encoder, self.topics.tool, self._soundness, self._allowed.zones)
+                self._tolerances = Tolerances.of(self._declared, self.topics.tool, self._doubt)
+                self._part = RunningForm(self.topics.encoder, self.topics.tool, self._soundness, self._tolerances.zones)
             self._part.add(first, angle[:sound], {name: signal[:sound] for name, signal in tool.items()})
             fields = (tool[name][:sound] for name in ("error", "reference", "height"))
             self._add(self._revolutions.add(first, angle[:sound], *fields))
@@ -336,9 +336,9 @@ class View:
         """Evaluate the part as ``lathe run`` does; ``unjudged``: reason why its end cannot be judged, or empty."""
         form, rests_on = self._part, (self._part, self._complete, unjudged)
         if form and self._judged[0] != rests_on:
-            verdict, until_out = self._allowed.verdict(form, unjudged), None
+            verdict, until_out = self._tolerances.verdict(form, unjudged), None
             if verdict and 0 <= (cut := self._cut_to - form.before) < verdict.revolutions:
-                until_out = self._allowed.verdict(form, revolutions=cut)
+                until_out = self._tolerances.verdict(form, revolutions=cut)
             self._judged = rests_on, Evaluation(verdict, error_growth(form), until_out=until_out)
         found = self._judged[1]
         results = [watch.result() for watch in self._watches]

@@ -155,7 +155,7 @@ def verdicts(bag: Path, commands: Sequence[tuple[str, ...]] = COMMANDS) -> dict[
         found[command[-1]] = said.exit_code, figures
     try:
         gathered = gather(bag)
-        judged = [repr((form.limits, form.verdict, form.first, form.last)) for form in gathered.forms]
+        judged = [repr((form.tolerances, form.verdict, form.first, form.last)) for form in gathered.forms]
         found["report"] = 3 if gathered.is_lossy else 0, (losses(gathered), judged)
     except LatheError as error:
         found["report"] = error.exit_code, str(error)

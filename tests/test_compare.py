@@ -15,7 +15,7 @@ from shown_page import ShownPage
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.drawing.charts import Charts
-from lathe_rc.judge.part import Limits
+from lathe_rc.judge.part import Tolerances
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view.report_gather import gather
 
@@ -68,13 +68,13 @@ def test_a_long_run_is_averaged_together_with_a_short_one(compared, monkeypatch)
 @pytest.mark.parametrize(("tolerance", "doubt"), [(0.5, 0.0), (3.0, 0.0), (12.0, 0.0), (12.0, 8.0), (500.0, 0.0)])
 def test_the_strip_tells_the_verdict_of_any_tolerance(compared, tolerance, doubt, monkeypatch):
     charts = Charts()
-    monkeypatch.setattr(compared.forms["slow"], "limits", Limits(doubt=doubt * 1e-6))
+    monkeypatch.setattr(compared.forms["slow"], "tolerances", Tolerances(doubt=doubt * 1e-6))
     together = figures.compared(compared.forms, tolerance * 1e-6)
     charts.data.update(together.data)
     (place,) = charts.place([figures.verdicts(together)])
     drawn = base64.b64decode(charts.picture(place, 1).partition(",")[2]).decode()
     for name, result in compared.results.items():
-        since = judge(result.part.form.largest, tolerance * 1e-6, doubt=compared.forms[name].limits.doubt).since
+        since = judge(result.part.form.largest, tolerance * 1e-6, doubt=compared.forms[name].tolerances.doubt).since
         told = f"within the tolerance from revolution {since} on" if since else "not within the tolerance at the end"
         assert re.search(f">{name}: {told}<", drawn)
 

@@ -564,8 +564,8 @@ def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
     )
     recording, declared = harness.run(loaded).recording, judged(loaded.nodes)
     angle, tool = recording.of_type(messages.ENCODER)["angle_true"], recording.dense["/tool"]
-    limits = part.Limits.of(declared, "/tool", form_doubt(loaded.nodes))
-    running, late = (RunningForm.of(recording.types, limits.zones) for _ in range(2))
+    tolerances = part.Tolerances.of(declared, "/tool", form_doubt(loaded.nodes))
+    running, late = (RunningForm.of(recording.types, tolerances.zones) for _ in range(2))
     size = recording.samples // 9
     for first in range(0, recording.samples, size):
         piece = slice(first, first + size)
@@ -574,11 +574,11 @@ def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
                 each.add(first, angle[piece], {field: signal[piece] for field, signal in tool.items()})
         cut = {topic: {n: s[: piece.stop] for n, s in fields.items()} for topic, fields in recording.dense.items()}
         found = part.verdict(loaded, replace(recording, dense=cut))
-        assert limits.verdict(running) == found or found.revolutions == 0
-        assert limits.verdict(running).told() == found.told()
-    assert 3 < late.before == found.revolutions - limits.verdict(late).revolutions
-    assert limits.verdict(late).in_tolerance
-    assert limits.verdict(late).since == late.before + 1  # no word about revolutions that were not seen
+        assert tolerances.verdict(running) == found or found.revolutions == 0
+        assert tolerances.verdict(running).told() == found.told()
+    assert 3 < late.before == found.revolutions - tolerances.verdict(late).revolutions
+    assert tolerances.verdict(late).in_tolerance
+    assert tolerances.verdict(late).since == late.before + 1  # no word about revolutions that were not seen
     assert part.error_growth(running) == part.error_growth(recording.form())
 
 

@@ -51,7 +51,7 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import DivergedError, InputError, LatheError, shown
 from lathe_rc.extensions import attribute
 from lathe_rc.judge.loops import FIGURES, loops, watches
-from lathe_rc.judge.part import Limits
+from lathe_rc.judge.part import Tolerances
 from lathe_rc.messages import Signals
 from lathe_rc.names import instead
 from lathe_rc.signals.form_errors import FormErrors, RunningErrors, turns_before
@@ -216,10 +216,10 @@ class _Keeper(Errors):
     def __init__(self, cell: Cell, samples: int, measures: Sequence[Measure]) -> None:
         parameters = {name: stage.shared for name, stage in cell.stages.items()}
         tool = next((topic for topic, source in cell.dense.items() if source.type == messages.TOOL), "")
-        self._limits = Limits.of(judged(parameters), f"/{tool}")
-        super().__init__(cell, samples, self._limits.zones)
-        if self._limits.tolerance:
-            self._limits = replace(self._limits, doubt=form_doubt(parameters))
+        self._tolerances = Tolerances.of(judged(parameters), f"/{tool}")
+        super().__init__(cell, samples, self._tolerances.zones)
+        if self._tolerances.tolerance:
+            self._tolerances = replace(self._tolerances, doubt=form_doubt(parameters))
         self._first = cell.first
         self._events = [topic for topic, source in cell.sparse.items() if source.type == messages.EVENT]
         self._functions = [each.statistic for each in measures if not each.topic]
@@ -290,7 +290,7 @@ class _Keeper(Errors):
                 found[name] = value = float(function(name)(recording))
                 if not math.isfinite(value):
                     raise LatheError(f"{name} is {value}; allowed: a finite number")
-        if not self.form.soundness.why and (verdict := self._limits.verdict(self.form)):
+        if not self.form.soundness.why and (verdict := self._tolerances.verdict(self.form)):
             found["tool.in_tolerance_from"] = verdict.since or None
         return found
 

@@ -64,8 +64,8 @@ def zones(declared: Mapping[str, Judged]) -> dict[str, tuple[Zone, ...]]:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits by which the form of a part is judged.
+class Tolerances:
+    """Tolerances of the form of a part.
 
     Attributes:
         tolerance: allowed form error to each side [m]; 0: the tool has no tolerance.
@@ -78,7 +78,7 @@ class Limits:
     doubt: float = 0.0
 
     @classmethod
-    def of(cls, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> "Limits":
+    def of(cls, declared: Mapping[str, Judged], topic: str, doubt: float = 0.0) -> "Tolerances":
         """Return what nodes declare for the tool of a fully qualified topic."""
         own = [each for each in declared.values() if topic.endswith(f"/{each.topic}")]
         allowed = next((each.tolerance for each in own if each.quantity == "form" and each.tolerance), 0.0)
@@ -117,8 +117,8 @@ def nose_radius(declared: Mapping[str, Judged]) -> float:
 def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
-    limits = Limits.of(judged(scenario.nodes), topic, form_doubt(scenario.nodes))
-    return limits.verdict(recording.form(limits.zones), recording.sound_form[1])
+    tolerances = Tolerances.of(judged(scenario.nodes), topic, form_doubt(scenario.nodes))
+    return tolerances.verdict(recording.form(tolerances.zones), recording.sound_form[1])
 
 
 def error_growth(form: RunningForm) -> Growth | None:

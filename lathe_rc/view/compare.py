@@ -148,7 +148,7 @@ def render(runs: Mapping[str, Gathered], command: str) -> str:
     template = page_template(Path(__file__).with_name("compare.html.j2"), printable=printable)
     with np.errstate(over="ignore", invalid="ignore"):  # a bag may hold absurd numbers, which are shown unchanged
         forms = _forms(runs)
-        tolerance = max((form.limits.tolerance for form in forms.values()), default=0.0)
+        tolerance = max((form.tolerances.tolerance for form in forms.values()), default=0.0)
         together = figures.compared(forms, tolerance, [name for name in forms if runs[name].doubt]) if forms else None
         servos = _servos(runs)
         ends = [each.result.found.errors.rms.size for by_run in servos.values() for each in by_run.values()]

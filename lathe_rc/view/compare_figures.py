@@ -91,7 +91,7 @@ def compared(forms: Mapping[str, Form], tolerance: float, unjudged: Collection[s
     least = min(float(size[-1]) for _, size in sizes.values())
     shown = min(form.map.size for form in forms.values())
     first_shown = tolerance * 1e6 or float(f"{2.0 * least:.1g}")
-    doubts = {name: 1e6 * form.limits.doubt for name, form in forms.items()}
+    doubts = {name: 1e6 * form.tolerances.doubt for name, form in forms.items()}
     return Compared(maps, differences, step, longest, shown, sizes, doubts, first_shown, unjudged)
 
 

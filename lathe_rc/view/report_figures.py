@@ -383,7 +383,7 @@ def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
     drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}
     for colour, (name, series) in enumerate(list(cycles.items())[:_OTHERS], start=1):
         drawn[_plain(name)] = series, colour, True
-    limit = form.limits.tolerance * 1e6 if form and not form.limits.zones else 0.0
+    limit = form.tolerances.tolerance * 1e6 if form and not form.tolerances.zones else 0.0
     titles = "revolution or cycle", "error [µm]"
     return _lines(drawn, (lambda place: place + 1, um), titles, height=280, log=True, limit=limit)
 

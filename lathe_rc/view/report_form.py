@@ -50,12 +50,12 @@ class Form:
     Args:
         encoder: topic with the angle.
         tool: topic with the form error.
-        limits: what the form is judged by.
+        tolerances: those of the form.
         nose_radius: nose radius of the tool in the plane of the feed [m]; 0: no surface along the part.
         types: message types of the bag by topic, for the signals that the form error is made of.
 
     Attributes:
-        tool, limits: see the arguments.
+        tool, tolerances: see the arguments.
         first, last, best: first, last and best (by RMS) revolution; None until one is measured.
         rms, largest: envelopes over the revolutions [m].
         map: radius deviation [m], by revolution and angle.
@@ -68,12 +68,12 @@ class Form:
         self,
         encoder: str,
         tool: str,
-        limits: part.Limits = part.Limits(),  # noqa: B008 - it never changes
+        tolerances: part.Tolerances = part.Tolerances(),  # noqa: B008 - it never changes
         nose_radius: float = 0.0,
         types: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self._part = RunningForm(encoder, tool, Soundness.of_form(types), limits.zones)
-        self._encoder, self.tool, self.limits, self._nose_radius = encoder, tool, limits, nose_radius
+        self._part = RunningForm(encoder, tool, Soundness.of_form(types), tolerances.zones)
+        self._encoder, self.tool, self.tolerances, self._nose_radius = encoder, tool, tolerances, nose_radius
         # Angle, form error and height (0 without a nose radius), starting at a margin before the next revolution.
         self._held = np.empty((3, 0))
         self._along = deque[tuple[Samples, Samples]](maxlen=_ALONG)  # profiles and heights
@@ -115,7 +115,7 @@ class Form:
     @property
     def verdict(self) -> Verdict | None:
         """Return whether the form is in tolerance; None without a tolerance or a measurement up to the end."""
-        return None if self.refused else self.limits.verdict(self._part)
+        return None if self.refused else self.tolerances.verdict(self._part)
 
     @property
     def growth(self) -> Growth | None:

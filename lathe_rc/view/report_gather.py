@@ -223,7 +223,7 @@ def gather(path: Path) -> Gathered:
             unjudged = str(error)
         nose, doubt = part.nose_radius(declared), provenance.doubt_of(source.about)
         forms = [
-            Form(encoder, tool, part.Limits.of(declared, tool, doubt), nose, types)
+            Form(encoder, tool, part.Tolerances.of(declared, tool, doubt), nose, types)
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
         ]
