@@ -28,8 +28,6 @@ from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.encoder import EncoderSamples
 from lathe_rc.stages.tool.tool import Tool
 
-_TYPES = {"encoder": messages.ENCODER, "tool": messages.TOOL}
-
 
 class Memory(NamedTuple):
     """State of the step function.

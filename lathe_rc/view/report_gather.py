@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a report, gathered in one pass over the bag.
 
-Memory use grows by 8 bytes per revolution and per report of the time master.
+Memory use grows by some 32 bytes per revolution, and by 8 bytes per report of the time master.
 """
 
 from collections.abc import Mapping
