@@ -23,7 +23,7 @@ _RUN = ("run", "piston", "--revolutions", "3")
 
 
 def build(source: Path, folder: Path) -> None:
-    """Build wheel, sdist and the sdist of the messages.
+    """Build the sdist, the wheel from it, and the sdist of the messages.
 
     Args:
         source: copy of the sources, into which the build writes.
@@ -63,7 +63,7 @@ def describe(source: Path, folder: Path) -> None:
 
 
 def check(folder: Path) -> None:
-    """Check the metadata and the contents of the packages; run a cell from each of them in an environment of its own.
+    """Check the metadata and the contents of the packages; run a cell without and with ROS, each in a new environment.
 
     Raises:
         subprocess.CalledProcessError: a check fails; its output is on the terminal.
@@ -73,7 +73,7 @@ def check(folder: Path) -> None:
     uv("tool", "run", "--quiet", "twine", "check", "--strict", wheel, sdist, messages)
     uv("tool", "run", "--quiet", "check-wheel-contents", "--ignore", "W009", wheel)  # W009 allows only one package
     with TemporaryDirectory() as home:
-        for wanted, *words in ([wheel], [sdist], [f"{wheel}[ros]", "--mode", "processes"]):
+        for wanted, *words in ([wheel], [f"{wheel}[ros]", "--mode", "processes"]):
             programs = Path(home, "venv", "bin")
             uv("venv", "--quiet", "--clear", "--python", BASE_PYTHON, programs.parent)
             uv("pip", "install", "--quiet", "--python", programs / "python", "--find-links", folder, wanted)
