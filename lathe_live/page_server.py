@@ -30,7 +30,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from lathe_rc.drawing.pages import own_file
-from lathe_rc.errors import InputError, LatheError, of_name, shown
+from lathe_rc.errors import InputError, LatheError, correctable, shown
 
 HOST = "127.0.0.1"  #: the only interface
 TOKEN = "X-Lathe-Token"  # noqa: S105 - the header with the token, which the scripts of a page send
@@ -136,7 +136,7 @@ async def _told(answer: Answer, request: Request) -> Response:
     try:
         found = await run_in_threadpool(answer, await _question(request))
     except (LatheError, OSError) as error:
-        told = of_name(error) if isinstance(error, OSError) else error
+        told = correctable(error)
         return JSONResponse({"error": shown(told, _LONGEST)}, 400 if isinstance(told, InputError) else 500)
     return JSONResponse(found, headers=_LOOSE)
 

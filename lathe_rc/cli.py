@@ -15,7 +15,7 @@ from click.shell_completion import CompletionItem
 
 from lathe_rc import __version__, allowed_code, extras
 from lathe_rc.catalogue import COMMANDS
-from lathe_rc.errors import LatheError, of_name, shown
+from lathe_rc.errors import LatheError, correctable, shown
 
 
 class _Command(click.Command):
@@ -48,7 +48,7 @@ class Group(click.Group):
             with extras.named(), allowed_code.call():
                 return super().invoke(ctx)
         except (LatheError, OSError) as error:
-            told = of_name(error) if isinstance(error, OSError) else error
+            told = correctable(error)
             click.echo(f"lathe: {told}", err=True)
             ctx.exit(told.exit_code)
         except MemoryError as error:

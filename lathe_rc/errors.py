@@ -44,12 +44,14 @@ def shown(text: object, longest: int = 200) -> str:
     return "".join(letter if letter.isprintable() else "\ufffd" for letter in first[:longest])
 
 
-def of_name(error: OSError) -> InputError:
-    """Return the refusal of a file whose name is too long for the file system.
+def correctable(error: LatheError | OSError) -> LatheError:
+    """Return an error that the user can correct, which a name that is too long for the file system is too.
 
     Raises:
         OSError: the error is another one.
     """
+    if isinstance(error, LatheError):
+        return error
     if error.errno != errno.ENAMETOOLONG:
         raise error
     return InputError(f"{shown(error.filename, 60)}…: the name is too long; allowed: a name that the file system takes")
