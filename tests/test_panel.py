@@ -579,7 +579,7 @@ def test_the_verdict_in_pieces_is_that_of_lathe_run_after_every_piece(name):
     assert 3 < late.before == found.revolutions - tolerances.verdict(late).revolutions
     assert tolerances.verdict(late).in_tolerance
     assert tolerances.verdict(late).since == late.before + 1  # no word about revolutions that were not seen
-    assert part.error_growth(running) == part.error_growth(recording.form())
+    assert part.error_growth(running) == part.error_growth(recording.form)
 
 
 def _evaluated(errors, doubt=0.0, **more):

@@ -130,9 +130,14 @@ class Recording:
     @cached_property
     def errors(self) -> FormErrors:
         """Form error of each complete revolution; empty if there is no tool."""
-        return self.form().found()
+        return self.form.found()
 
-    def form(self, zones: Sequence[Zone] = ()) -> RunningForm:
+    @cached_property
+    def form(self) -> RunningForm:
+        """Form of the part by revolution."""
+        return self.form_by(())
+
+    def form_by(self, zones: Sequence[Zone]) -> RunningForm:
         """Return the form of the part by revolution, and by zones with tolerances of their own."""
         form = RunningForm.of(self.types, zones)
         form.chunk(self.first, self.samples, self.dense, self.events)

@@ -146,7 +146,7 @@ class Result:
         """Workshop measurements of the part (`lathe_rc.judge.part`)."""
         return part.measured(self.recording)
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict | None:
         """Whether the part is within tolerance; None if the scenario's tool has no ``tolerance``."""
         return part.verdict(self.scenario, self.recording)
@@ -154,7 +154,7 @@ class Result:
     @property
     def growth(self) -> Growth | None:
         """Growth of a diverging or otherwise growing form error; None if it does not grow."""
-        return part.error_growth(self.recording.form())
+        return part.error_growth(self.recording.form)
 
     @cached_property
     def loops(self) -> "dict[str, LoopResult]":

@@ -19,7 +19,7 @@ from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
-from lathe_rc.messages import Signals, full
+from lathe_rc.messages import Signals
 from lathe_rc.signals.form_errors import that_count, turns_before
 from lathe_rc.signals.zones import Zone
 
@@ -118,7 +118,8 @@ def verdict(scenario: Scenario, recording: Recording) -> Verdict | None:
     """Judge whether the part turned in a run is within tolerance; None if the tool has no tolerance."""
     topic = next((topic for topic in recording.dense if recording.types[topic] == messages.TOOL), "")
     tolerances = Tolerances.of(judged(scenario.nodes), topic, form_doubt(scenario.nodes))
-    return tolerances.verdict(recording.form(tolerances.zones), recording.sound_form[1])
+    form = recording.form_by(tolerances.zones) if tolerances.zones else recording.form
+    return tolerances.verdict(form, recording.sound_form[1])
 
 
 def error_growth(form: RunningForm) -> Growth | None:
@@ -187,7 +188,7 @@ class FirstAndLast:
     """Sink of the engine that collects the first and the last revolutions of a run, chunk by chunk.
 
     Args:
-        types: message type by fully qualified topic; includes an encoder and a tool.
+        types: message type by topic, as the chunks name them; includes an encoder and a tool.
 
     Attributes:
         soundness: end of the samples on which the form error may rest.
@@ -202,11 +203,10 @@ class FirstAndLast:
 
     def chunk(self, first: int, samples: int, dense: Mapping[str, Signals], sparse: Mapping[str, list[Sparse]]) -> None:
         """Add a chunk of the run (implements `lathe_rc.cell.engine.Sink`)."""
-        named = {full(topic): signals for topic, signals in dense.items()}
         sound = self.soundness.sound(first, samples, sparse)
         if not sound:
             return
-        angle, error = named[self._encoder]["angle_true"][:sound], named[self._tool]["error"][:sound]
+        angle, error = dense[self._encoder]["angle_true"][:sound], dense[self._tool]["error"][:sound]
         piece = np.stack([angle, error])[:, that_count(angle, error)]
         if not self._tail.size:
             self._before = turns_before(piece[0], first)
