@@ -7,6 +7,8 @@ import subprocess
 
 from workplace import REQUIREMENTS
 
+WAITING = ["--option", "DPkg::Lock::Timeout=600"]  # [s] another installation may be running
+
 
 def packages() -> list[str]:
     """Return the packages in requirements/debian.txt."""
@@ -37,7 +39,7 @@ def provide() -> str:
     print(f"installing {', '.join(wanted)}", flush=True)
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     for command in (["update"], ["install", "--yes", "--no-install-recommends", *wanted]):
-        done = subprocess.run(["apt-get", "--quiet=2", *command], env=environment, check=False)
+        done = subprocess.run(["apt-get", "--quiet=2", *WAITING, *command], env=environment, check=False)
         if done.returncode:
             return f"apt-get {' '.join(command)} failed with exit code {done.returncode}: see above"
     return ""
