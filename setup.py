@@ -4,6 +4,7 @@
 import re
 import runpy
 import sys
+import tempfile
 from collections import defaultdict
 from pathlib import Path
 
@@ -23,6 +24,8 @@ EXECUTABLES = {
 }
 #: colcon calls these commands, for which setup.cfg has the folder of the scripts
 OF_COLCON = {"install", "develop"} & {*sys.argv}
+#: an egg-info in the checkout would be found before the one of colcon, which has the executables
+BUILT = {"bdist_wheel", "egg_info", "sdist"} & {*sys.argv}
 # pip puts scripts on the PATH, where names like `tool` and `profile` do not belong. In lib/lathe_rc, where `ros2 run`
 # finds them, pip writes no first line with the path of its Python: it is beside bin/ of the same environment.
 SCRIPT = """#!/bin/sh
@@ -115,6 +118,7 @@ setup(
         "lathe_rc.stages": ["adrc = lathe_papers.adrc:Adrc"],
         "lathe_rc.studies": [f"{study.replace('_', '-')} = lathe_papers.{study}:STUDY" for study in STUDIES],
     },
+    options={"egg_info": {"egg_base": tempfile.mkdtemp()}} if BUILT else {},
     cmdclass={} if OF_COLCON else {"install_data": InstallData},
     zip_safe=False,
 )
