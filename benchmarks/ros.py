@@ -57,7 +57,6 @@ _NAIVE = {"timer": (6000, 2000), "lockstep": (3000, 500)}  # samples by pace: in
 _PATIENCE = 60.0  # [s]
 #: Simulated revolutions beside bare transport, by scenario and block size.
 _BARE = {"piston": {64: 240, 256: 600, 1024: 900}, "full_cell": {64: 20}}
-_BARE_TARGET = 0.6
 _OF_RCLPY = ("EventsExecutor", "SingleThreadedExecutor")
 
 
@@ -211,7 +210,6 @@ def _bare_transport(name: str, sizes: Iterable[int], rounds: int, say: Say, shar
             "cell_real_time_factor": sides.spread(paces["cell"]),
             "bare_real_time_factor": sides.spread(paces["bare"]),
             "bare_transport_ratio": ratio,
-            "target_bare_transport_ratio": _BARE_TARGET,
         }
     return found
 
