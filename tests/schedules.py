@@ -104,7 +104,8 @@ class Schedule:
     def _relaunch(self, group: tuple[Design, ...]) -> None:
         """Start another process of members, once the one in which a member is shutting down has left."""
         members, names = [each for design in group if (each := self._member(design))], {each.name for each in group}
-        if any(not member.protocol.active for member in members):
+        shut_down = [each for each in members if each.protocol.done and not each.protocol.over]
+        if shut_down or any(not member.protocol.active for member in members):
             if any(member.protocol.done for member in members) and not self.cell.killed.keys() >= names:
                 self.cell.killed |= dict.fromkeys(names, self.cell.now)
                 members[0].process.end_by("SIGTERM")  # the process goes on with its other nodes
@@ -324,7 +325,8 @@ def hanging(cell: Simulation) -> list[str]:
     left = [each for each in cell.members.values() if not _waits_for_another(each)]
     found = [f"{each.identity} hangs" for each in left if not (each.process.stopped and cell.stalls == "safe")]
     everyone, _, lost = _outcome(cell)
-    if not cell.culprits and not lost and not cell.loses:
+    died = any(event == "dead" and not values["restarts"] for _, _, event, values in cell.reports)
+    if not (cell.culprits or lost or died or cell.loses):
         found += [f"{each.identity}: {each.protocol.failure}" for each in everyone if each.protocol.exit_code]
         recorders = [each for each in everyone if each.design.records and each.role.blocks == cell.length]
         if not recorders and not cell.killed:
@@ -361,7 +363,8 @@ def unsafe(cell: Simulation) -> list[str]:
     # A new process of a killed member may be too late for the end of the run.
     failed = [each for each in everyone if each.protocol.failure and each.full_name not in cell.killed]
     causes = [str(each.protocol.failure) for each in failed]
-    named = to_blame | (_fed_by(cell, to_blame) if cell.devices else set())
+    ahead = cell.spoiled and not cell.window  # a gap in a free-running cell lets readers run ahead of the time master
+    named = to_blame | (_fed_by(cell, to_blame) if cell.devices or ahead else set())
     if causes and not cell.loses and not any(name in text for name in named for text in causes):
         found.append(f"none of {causes} names {sorted(named)}")
     return found
@@ -384,6 +387,9 @@ def _wrong_values(cell: Simulation, everyone: list[Member], safe: int) -> list[s
     """Return which members have computed other values than offline up to the safe state, or than the safe ones."""
     found, expected = [], cell.expected()
     held = min((index for member in (*everyone, *cell.dead) for index in member.role.held.values()), default=safe)
+    second = [each.role for each in (*cell.gone, *cell.members.values(), *cell.dead) if each.namesake]
+    # A reader cannot tell the blocks of a namesake that has not heard of the cell yet from those that it expects.
+    held = min([held, *(cell.block(role.samples) - len(role.values) for role in second if role.values)])
     for member in everyone:
         protocol, values = member.protocol, member.role.values
         certain = values[: min(safe, held)]
@@ -430,6 +436,11 @@ def _lost_too_early(cell: Simulation) -> Iterator[str]:
 
 
 def _waits_for_another(member: Member) -> bool:
+    """Return True if a member waits for another time master, or is done in a process in which a member does."""
+    return _lacks_master(member) or (member.protocol.done and any(map(_lacks_master, member.process.members)))
+
+
+def _lacks_master(member: Member) -> bool:
     """Return True if a member has lost its time master, or is a second node of one name, or waits for such a master.
 
     Such a member reports this; an operator ends it, or starts another time master.
