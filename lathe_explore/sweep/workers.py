@@ -255,6 +255,14 @@ def _cluster(workers: int | None) -> distributed.LocalCluster:
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             )
+    except RuntimeError as error:
+        cause: BaseException = error
+        while before_it := cause.__cause__ or cause.__context__:
+            cause = before_it
+        raise LatheError(
+            f"Dask starts no workers on this machine ({shown(cause)}); they need a writable /dev/shm; or "
+            "--scheduler with the address of a scheduler elsewhere"
+        ) from None
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
