@@ -54,10 +54,10 @@ def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
     assert {place.partition(":")[0] for place in places} == {"0100007F"}  # 127.0.0.1
 
 
-def test_without_shared_memory_the_cause_and_a_cure_are_named():
+def test_without_shared_memory_the_cause_and_a_cure_are_named(tmp_path):
     alone = 'mount -t tmpfs -o ro tmpfs /dev/shm && exec "$0" -m lathe_rc sweep piston --vary "$1=1e-3:2e-3:2"'
     command = ["unshare", "--mount", "sh", "-c", alone, sys.executable, LEAD]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "Read-only file system); they need a writable /dev/shm" in done.stderr.splitlines()[-1]
 
