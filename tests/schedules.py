@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from simulation import RESTART_TIME, SIZE, STEP_NS, Design, Member, Simulation, encoder_of, safe_value
+from simulation import RESTART_TIME, SIZE, STEP_NS, Design, Member, Process, Simulation, encoder_of, safe_value
 
 from lathe_rc.protocol import Announcement, CellState, Progress, TimeMasterProtocol
 
@@ -70,6 +70,7 @@ class Schedule:
             "safe_samples": draw.choice((3 * SIZE, SIZE, 3 * SIZE + 1)),
         } | free
         stalls = draw.choice(("wait", "wait", "safe"))
+        self._ended: list[Process] = []  # by a signal, so that another process can be started
         self.cell = cell = Simulation(seed, designs, window, length, stalls, **drawn)
         cell.slow_match = draw.choice((0.005, 0.05, 0.05, 0.3))
         drawn["groups"] = " | ".join("+".join(design.name for design in group) for group in groups)
@@ -106,9 +107,11 @@ class Schedule:
         members, names = [each for design in group if (each := self._member(design))], {each.name for each in group}
         shut_down = [each for each in members if each.protocol.done and not each.protocol.over]
         if shut_down or any(not member.protocol.active for member in members):
-            if any(member.protocol.done for member in members) and not self.cell.killed.keys() >= names:
+            process = members[0].process
+            if any(member.protocol.done for member in members) and process not in self._ended:
+                self._ended.append(process)
                 self.cell.killed |= dict.fromkeys(names, self.cell.now)
-                members[0].process.end_by("SIGTERM")  # the process goes on with its other nodes
+                process.end_by("SIGTERM")  # it goes on with its other nodes
             self.cell.at(self.cell.now + 0.1, partial(self._relaunch, group))
         elif not members:
             self.cell.start(*group)
