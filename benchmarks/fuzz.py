@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuzzing of every reader of files from outside, for long: python benchmarks/fuzz.py [READER ...] [--seconds 3600].
 
-The readers and the damage done to valid files are those of tests/fuzz_targets.py. With Atheris (requirements/bench.in)
-coverage leads the search, without it damage is random. Each reader runs in a process of its own, which may take 1 GiB
-more than it begins with and 10 s of CPU time for an input. Inputs that lead to new code, and finds, stay in
-.lathe/fuzz/READER: ``python benchmarks/fuzz.py --input FILE READER`` reads one of them and shows what comes of it.
+The readers and the damage done to valid files are those of tests/support/fuzz_targets.py. With Atheris
+(requirements/bench.in) coverage leads the search, without it damage is random. Each reader runs in a process of its
+own, which may take 1 GiB more than it begins with and 10 s of CPU time for an input. Inputs that lead to new code, and
+finds, stay in .lathe/fuzz/READER: ``python benchmarks/fuzz.py --input FILE READER`` reads one of them and shows what
+comes of it.
 """
 
 import argparse
@@ -47,7 +48,7 @@ def _atheris() -> ModuleType | None:
 
 
 def _targets(atheris: ModuleType | None) -> Any:
-    sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+    sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT)]
     if atheris is None:
         return importlib.import_module("fuzz_targets")
     with atheris.instrument_imports(include=_FOLLOWED, exclude=_compiled()):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draws img/architecture.svg of index.md: the packages in layers, and who imports whom.
 
-tests/test_site.py compares the picture with the imports in the code.
+tests/repository/test_site.py compares the picture with the imports in the code.
 """
 
 from typing import NamedTuple

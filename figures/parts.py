@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts that lathe_rc does not have: docs/extending.md runs them, tests/test_parts.py in every host."""
+"""Parts that lathe_rc does not have: docs/extending.md runs them, tests/bag/test_parts.py in every host."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

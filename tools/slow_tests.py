@@ -38,9 +38,9 @@ Which promise each of the {slowest} slowest tests of `./lathe test` holds, and i
 tests ({seconds:.0f} s, one after the other). `./lathe test && ./lathe test --table` writes this page anew. Machines
 differ, so it is the share that counts. The cases of a test are added up; what several tests share counts for the first
 of them. A promise is the first line of the test's docstring, or else its name: change it there.
-tests/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts with the files that take
-longest. The table has the number of processes of cells and of programs that a test starts: {functions} tests, in
-{cases} cases, start processes of cells, and {programs} others programs.
+tests/repository/test_slow_tests.py checks that the page says what the tests say. `./lathe test` starts with the files
+that take longest. The table has the number of processes of cells and of programs that a test starts: {functions} tests,
+in {cases} cases, start processes of cells, and {programs} others programs.
 
 {coverage}
 
@@ -117,7 +117,11 @@ def _promises(path: Path) -> dict[Name, str]:
 
 def told() -> dict[Name, str]:
     """Return the promises of all tests, those of tests/system apart."""
-    return {name: promise for path in sorted(TESTS.glob("test_*.py")) for name, promise in _promises(path).items()}
+    return {name: promise for path in _files() for name, promise in _promises(path).items()}
+
+
+def _files() -> list[Path]:
+    return [path for path in sorted(TESTS.rglob("test_*.py")) if path.parent.name != "system"]
 
 
 def promises(words: Sequence[str]) -> int:
@@ -149,8 +153,9 @@ def took(report: Path) -> dict[Name, Cost]:
     found: dict[Name, Cost] = defaultdict(Cost)
     files = set[str]()
     for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - pytest wrote it here
-        _, _, place = (case.get("classname") or case.get("name") or "").partition("tests.")
-        file, _, owner = place.partition(".")
+        place = (case.get("classname") or case.get("name") or "").split(".")
+        file, *owners = place[next(k for k, word in enumerate(place) if word.startswith("test_")) :]
+        owner = ".".join(owners)
         files.add(file)
         name = Name(file, owner, case.get("name", "").partition("[")[0])
         counts = {each.get("name"): int(each.get("value", 0)) for each in case.iter("property")}
@@ -163,7 +168,7 @@ def took(report: Path) -> dict[Name, Cost]:
             before.processes + processes,
             before.programs + programs,
         )
-    here = {path.stem for path in TESTS.glob("test_*.py")}
+    here = {path.stem for path in _files()}
     if missing := sorted(here - files):
         raise RefusalError(
             f"the last ./lathe test ran {len(here) - len(missing)} of {len(here)} files of tests "
@@ -226,7 +231,7 @@ def wrong(page: str, said: Mapping[Name, str]) -> list[str]:
         if row := _ROW.match(line):
             name, promise = Name(file, row[1] or "", row[2]), row[3].replace(r"\|", "|")
             if name not in said:
-                found.append(f"no test {row[2]} in tests/{file}.py")
+                found.append(f"no test {row[2]} in {file}.py")
             elif promise != said[name]:
                 found.append(f"{row[2]} says: {said[name]}")
     return found

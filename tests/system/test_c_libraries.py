@@ -159,7 +159,7 @@ def test_a_law_in_float_runs_in_64_kb_on_a_cortex_m4(name, node, values, tmp_pat
     listed = ",\n".join(f"{{{', '.join(f'{value.hex()}f' for value in row)}}}" for row in rows)
     given = f"static const float given[{len(rows)}][LAW_INPUTS] = {{\n{listed}}};\n"
     (place / "given.h").write_text(given, encoding="utf-8")
-    folder = Path(__file__).parents[1]
+    folder = Path(__file__).parents[1] / "support"
     how = {"main": folder / "cortex_m4.c"}
     chip = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-nostartfiles"]
     script = ["-T", f"{folder}/cortex_m4.ld", f"-I{place}"]

@@ -4,13 +4,9 @@
 import html
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from bags import lathe
 from test_report_browser import Visit, by_hand
 

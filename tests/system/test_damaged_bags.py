@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two thousand damages to bags, and what is recovered; tests/test_recover.py has a sample."""
+"""Two thousand damages to bags, and what is recovered; tests/bag/test_recover.py has a sample."""
 
 from collections import Counter
 from random import Random

@@ -4,14 +4,10 @@
 import html
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from bags import lathe
 from test_report_browser import Visit
 

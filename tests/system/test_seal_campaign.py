@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hundreds of single changes to all of a bag but its messages; tests/test_seal.py has a sample."""
+"""Hundreds of single changes to all of a bag but its messages; tests/bag/test_seal.py has a sample."""
 
 from random import Random
 

@@ -13,9 +13,6 @@ from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from test_report_browser import QUIET, Visit
 
 pytestmark = pytest.mark.system

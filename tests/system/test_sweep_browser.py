@@ -2,13 +2,8 @@
 """The page of a sweep in a real browser: every figure is drawn, chosen and brushed, without a request."""
 
 import re
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from test_report_browser import Visit, by_hand
 from test_sweep_page import GRID, bowl, shown_page, swept
 

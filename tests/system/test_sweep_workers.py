@@ -48,7 +48,7 @@ with client_of(None, 1):
 def test_scheduler_and_workers_of_this_machine_listen_to_it_alone():
     # As a process group of its own: the nodes of tests that run beside this one listen too.
     command = [sys.executable, "-c", WORKERS]
-    tests = Path(__file__).parents[1]
+    tests = Path(__file__).parents[1] / "support"
     places = subprocess.check_output(command, cwd=tests, start_new_session=True, text=True).split()
     assert len(places) >= 4  # scheduler, dashboard, nanny, worker
     assert {place.partition(":")[0] for place in places} == {"0100007F"}  # 127.0.0.1
