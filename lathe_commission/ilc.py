@@ -11,13 +11,13 @@ Example:
     >>> from lathe_commission import ilc
     >>> f = np.geomspace(5.0, 2000.0, 200)
     >>> _, H = signal.freqresp(signal.lti([1038.0**2], [1.0, 2 * 0.8 * 1038.0, 1038.0**2]), 2 * np.pi * f)
-    >>> G = ilc.frequency_response(f, H * np.exp(-2j * np.pi * f * 0.36e-3))
+    >>> G = ilc.frequency_response(f, H * np.exp(-2j * np.pi * f * 0.36e-3)).fit()
     >>> L = ilc.learning_filter(G, "zero-phase")
     >>> Q = ilc.q_filter(G, L, margin=0.3)
     >>> loop, part = ilc.Loop(G, L, Q), ilc.reference({2: 100e-6}, rpm=1000)
     >>> loop.margin().error > 0.3
     True
-    >>> run = loop.simulate(G.fit(), part, trials=12)
+    >>> run = loop.simulate(G, part, trials=12)
     >>> bool(run.errors[-1] < 0.01 * run.errors[0])
     True
 """
@@ -38,7 +38,14 @@ from lathe_commission import given
 from lathe_commission.design import LAWS, Known
 from lathe_commission.modal_fit import MOST_MODES, ResponseData, fit
 from lathe_commission.trials import Trials
-from lathe_rc.analysis.frequency_response import AVERAGES, FrequencyResponse, deviation_of, of_measurement
+from lathe_rc.analysis.frequency_response import (
+    AVERAGES,
+    FrequencyResponse,
+    deviation_of,
+    of_measurement,
+    write_states,
+)
+from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex
@@ -74,6 +81,8 @@ _NODE, _DRIVE, _TOOL, _SPINDLE = "learning_controller", "electrodynamic_actuator
 _PENALTY = 1e-3  # ρ of an FIR inverse
 _DELAY = 64  # samples, with which the position reaches the law
 _LINEAR, _FEWEST = 0.8, 3  # phase [rad] up to which the lag is fitted to points, and the least number of these
+_STATIC = 100.0  # gain, above which or below whose inverse the units differ from those of the cell
+_GAINS = (0.7, 0.5, 0.3, 0.2, 0.1)  # that a refused Q is tried with
 _POINTS = 4096  # per revolution, at which an expected error is evaluated
 _ORDERS = 1000  # highest
 _TURN = 2.0 * math.pi
@@ -87,10 +96,12 @@ class Response:
     Attributes:
         points: the points, see `lathe_rc.analysis.frequency_response.FrequencyResponse`.
         model: model of the drive from `fit`; None before.
+        unresolved: resonances of the model that lie between the points, in words: their height rests on the model.
     """
 
     points: FrequencyResponse
     model: ModalDrive | None = None
+    unresolved: tuple[str, ...] = ()
 
     def fit(self, modes: int | None = None) -> "Response":
         """Return the response with a model of the drive fitted to the points (docs/drives.md#measured-drives).
@@ -102,13 +113,18 @@ class Response:
             InputError, LatheError: the points do not determine a model.
         """
         wanted = None if modes is None else given.whole("modes", modes, 0, MOST_MODES)
-        return replace(self, model=fit(ResponseData(self.points), modes=wanted).drive)
+        found = fit(ResponseData(self.points), modes=wanted)
+        return replace(self, model=found.drive, unresolved=found.unresolved)
 
     def __repr__(self) -> str:
-        """Return the range of the points, and the model."""
+        """Return the range of the points, and the frequencies of the model."""
         low, high = self.points.frequency[[0, -1]] / _TURN
         told = f"{self.points.frequency.size} points from {low:.4g} to {high:.4g} Hz"
-        return f"<Response of {told}, {self.model or 'no model'}>"
+        if self.model is None:
+            return f"<Response of {told}, no model>"
+        places = ", ".join(f"{mode / _TURN:.4g}" for mode, *_ in self.model.sections)
+        model = f"model of {places} Hz and a delay of {self.model.delay * 1e6:.3g} µs"
+        return f"<Response of {'; '.join((told, model, *self.unresolved))}>"
 
     @cached_property
     def lag(self) -> float:
@@ -213,19 +229,25 @@ def learning_filter(response: Response, kind: Filter = "zero-phase", *, gain: fl
 
     Args:
         response: response of the drive.
-        kind: ``zero-phase``: an FIR filter conj(G)/(|G|² + ρ), for all drives, also those that are not minimum-phase;
-            ``lead``: the lag at low frequencies, for drives with little resonance; ``notch``: a lead with zero-phase
-            notches at the modes of a fitted model; ``inverse``: delay and second order of a fitted model, without its
-            modes, at which it needs a small gain.
+        kind: ``zero-phase``: an FIR filter conj(G)/(|G|² + ρ), also for drives that are not minimum-phase, with a small
+            gain where a resonance is narrow; ``lead``: the lag at low frequencies, for drives with little resonance;
+            ``notch``: a lead with zero-phase notches at the modes of a fitted model; ``inverse``: delay and second
+            order of a fitted model, without its modes, at which it needs a small gain.
         gain: γ. Where Q is 0, the loop still needs |γZ| < 1.
 
     Raises:
         InputError: the kind needs a fitted model.
     """
     known = given.instance("response", response, Response, _MAKE).known
+    static = float(np.abs(response(np.ones(1))[0]))
+    if not 1.0 / _STATIC <= static <= _STATIC:
+        raise InputError(
+            f"a response with a static gain of {static:.3g}; allowed: {1.0 / _STATIC:g} to {_STATIC:g}: position over "
+            f"command, both in metres (such as H / {static:.3g})"
+        )
     chosen = {"learning_gain": given.number("gain", gain, 0.0, 2.0, above=True)}
     if kind in ("inverse", "notch") and response.model is None:
-        raise InputError(f"learning filter {kind!r} of a response without a model; allowed: of response.fit()")
+        raise InputError(f"learning filter {kind!r} of a response without a model; allowed: response = response.fit()")
     if kind == "notch" and not known.resonances:
         raise InputError("learning filter 'notch' of a model without modes; allowed: lead, inverse, zero-phase")
     if kind == "lead":
@@ -239,16 +261,20 @@ def learning_filter(response: Response, kind: Filter = "zero-phase", *, gain: fl
     raise InputError(f"learning filter {kind!r}; allowed: lead, inverse, zero-phase, notch")
 
 
-def q_filter(response: Response, learning: Values, *, margin: float = 0.3, rpm: float = 1000.0) -> Values:
+def q_filter(
+    response: Response, learning: Values, *, margin: float = 0.3, rpm: float = 1000.0, speed_deviation: float = 0.0
+) -> Values:
     """Return the widest flat Q with which the loop keeps a drive margin, as parameters of ``learning_controller``.
 
-    Without a model of the drive, Q is 0 above the points.
+    The filters are those that ``lathe design`` tries, so the loop may have more than the margin. Their ripple in the
+    pass band decides what error of the form is left. Without a model of the drive, Q is 0 above the points.
 
     Args:
         response: response of the drive.
         learning: learning filter, see `learning_filter`.
         margin: least drive margin [1].
         rpm: speed of the spindle [rev/min].
+        speed_deviation: largest deviation over that speed [1], within which the loop keeps the margin.
 
     Returns:
         The filter, ``q_pass`` and ``q_stop`` in rad/s.
@@ -265,7 +291,7 @@ def q_filter(response: Response, learning: Values, *, margin: float = 0.3, rpm: 
     for values in filters:
         made: Values = {"q_filter": "fir", **values}
         try:
-            found.append(Loop(response, learning, made, rpm).margin())
+            found.append(Loop(response, learning, made, rpm, speed_deviation).margin())
         except InputError as error:  # such as a filter that does not fit into the memory
             refused = error
             continue
@@ -273,10 +299,23 @@ def q_filter(response: Response, learning: Values, *, margin: float = 0.3, rpm: 
             return made
     if not found and refused:
         raise refused
-    most = max((each.error for each in found), default=0.0)
+    best = max(found, key=lambda each: each.error)
     raise InputError(
-        f"Q with a drive margin of {margin:g}; allowed: up to {most:.3g} (more by a smaller gain or another filter)"
+        f"Q with a drive margin of {margin:g}; allowed: up to {best.error:.3g}, which {best.frequency:.4g} Hz limits "
+        f"(more by {_gain_with(response, learning, margin, rpm, speed_deviation)}another filter)"
     )
+
+
+def _gain_with(response: Response, learning: Values, margin: float, rpm: float, speed_deviation: float) -> str:
+    """Return a smaller gain with which some Q has a margin, and "or", in words; empty: none was found."""
+    for gain in (each for each in _GAINS if each < _number(learning.get("learning_gain", 1.0))):
+        smaller: Values = {**learning, "learning_gain": gain}
+        try:
+            q_filter(response, smaller, margin=margin, rpm=rpm, speed_deviation=speed_deviation)
+        except InputError:
+            continue
+        return f"gain={gain:g} or "
+    return ""
 
 
 def _number(value: Value) -> float:
@@ -291,17 +330,19 @@ class Part:
     Attributes:
         harmonics: amplitude by waves per revolution [m].
         rpm: speed of the spindle [rev/min].
+        tolerance: largest form error of a good part [m].
     """
 
     harmonics: Mapping[int, float]
     rpm: float
+    tolerance: float
 
 
-def reference(harmonics: Mapping[int, float], rpm: float = 1000.0) -> Part:
-    """Return a form with amplitudes [m] by waves per revolution, at a speed [rev/min].
+def reference(harmonics: Mapping[int, float], rpm: float = 1000.0, *, tolerance: float = 2e-6) -> Part:
+    """Return a form with amplitudes [m] by waves per revolution, at a speed [rev/min], with a tolerance [m].
 
     Raises:
-        InputError: an order is no whole number from 1 on, or an amplitude or the speed is none.
+        InputError: an order is no whole number from 1 on, or an amplitude, the speed or the tolerance is none.
     """
     if not isinstance(harmonics, Mapping) or not harmonics:
         raise InputError(f"harmonics = {harmonics!r:.60}; allowed: {{ORDER: AMPLITUDE, ...}}, such as {{2: 100e-6}}")
@@ -309,7 +350,8 @@ def reference(harmonics: Mapping[int, float], rpm: float = 1000.0) -> Part:
         given.whole("order", order, 1, _ORDERS): given.number(f"amplitude of {order} waves", size, -1.0, 1.0)
         for order, size in harmonics.items()
     }
-    return Part(found, given.number("rpm", rpm, 0.0, above=True))
+    speed = given.number("rpm", rpm, 0.0, above=True)
+    return Part(found, speed, given.number("tolerance", tolerance, 0.0, above=True))
 
 
 class Margin(NamedTuple):
@@ -321,18 +363,26 @@ class Margin(NamedTuple):
         points: lowest and highest frequency of the points within the grid of the memory [Hz].
         beyond: magnitude of the drive above the points up to which learning converges there whatever its phase; None
             with a model, whose margin is evaluated there.
+        speeds: lowest and highest speed at which it is evaluated [rev/min].
+        unresolved: see `Response`.
     """
 
     error: float
     frequency: float
     points: tuple[float, float]
     beyond: float | None
+    speeds: tuple[float, float]
+    unresolved: tuple[str, ...]
 
     def __str__(self) -> str:
         """Return the margin, where it is, and what it is known from."""
         low, high = self.points
-        rest = "beyond by the model" if self.beyond is None else f"beyond unknown: below {self.beyond:.3g} it converges"
-        return f"{self.error:.4g} at {self.frequency:.3g} Hz, from points of {low:.4g} to {high:.4g} Hz, {rest}"
+        speeds = " to ".join(f"{speed:.5g}" for speed in dict.fromkeys(self.speeds))
+        rest = " and the model"
+        if self.beyond is not None:
+            rest = f"; between unknown, beyond too: where the drive moves less than {self.beyond:.3g}, it converges"
+        ground = f"{speeds} rpm, from points of {low:.4g} to {high:.4g} Hz{rest}"
+        return "; ".join((f"{self.error:.4g} at {self.frequency:.4g} Hz, for {ground}", *self.unresolved))
 
 
 class Expected(NamedTuple):
@@ -355,13 +405,15 @@ class Loop:
         response: response of the drive.
         learning: learning filter, see `learning_filter`.
         q: Q, see `q_filter`, or other parameters of ``learning_controller``.
-        rpm: speed at which margin and factor are evaluated [rev/min].
+        rpm: nominal speed, which determines the grid of the memory [rev/min].
+        speed_deviation: largest deviation over that speed [1]; the margin is the least within it.
     """
 
     response: Response
     learning: Values
     q: Values
     rpm: float = 1000.0
+    speed_deviation: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the arguments."""
@@ -369,6 +421,7 @@ class Loop:
         given.instance("learning", self.learning, dict, "ilc.learning_filter(...)")
         given.instance("q", self.q, dict, "ilc.q_filter(...)")
         given.number("rpm", self.rpm, 0.0, above=True)
+        given.number("speed_deviation", self.speed_deviation, 0.0, 0.9)
 
     def _check(self, part: Part) -> None:
         given.instance("part", part, Part, "ilc.reference(...)")
@@ -403,7 +456,8 @@ class Loop:
             drive: drive with a model; None: that of the loop, which may have been designed for another one.
             trials: number of revolutions.
             noise_rms: noise of the position sensor [m].
-            speed_deviation: amplitude over the nominal speed, and frequency [rad/s]; None: constant speed.
+            speed_deviation: amplitude over the nominal speed, and frequency [rad/s]; None: constant speed. Beyond the
+                deviation of the loop its margin is another one, see `Run.margin`.
             seed: seed of the noise.
 
         Raises:
@@ -412,7 +466,7 @@ class Loop:
         self._check(part)
         model = given.instance("drive", drive or self.response, Response, _MAKE).model
         if model is None:
-            raise InputError("a cell with a response without a model; allowed: response.fit()")
+            raise InputError("a drive without a model in a cell; allowed: drive = response.fit()")
         values = cast("Values", model.parameters())
         return self._scenario(part, values, trials, noise_rms, speed_deviation, seed)
 
@@ -435,7 +489,7 @@ class Loop:
             },
             _NODE: {"feedback_delay": _DELAY, **self.learning, **self.q},
             _DRIVE: {"noise_rms": noise_rms, **drive},
-            _TOOL: {"profile": "harmonics", "profile_file": "", **harmonics},
+            _TOOL: {"profile": "harmonics", "profile_file": "", "tolerance": part.tolerance, **harmonics},
         }
         values = {f"{node}.{name}": value for node, table in nodes.items() for name, value in table.items()}
         return load("piston").varied({"nominal_rpm": part.rpm, "seed": seed, **values})
@@ -444,6 +498,9 @@ class Loop:
         self, path: str | os.PathLike[str], part: Part, drive: Response | None = None, **conditions: Any
     ) -> None:
         """Write the cell with this loop as a scenario, for ``lathe run`` and all other commands.
+
+        The points of the drive are written beside it, as ``NAME.points.csv``, so that the margin of the cell has the
+        same ground.
 
         Args:
             path: file to write.
@@ -454,23 +511,29 @@ class Loop:
         Raises:
             InputError: see `scenario`; or the file cannot be written.
         """
-        text = self.scenario(part, drive, **conditions).to_yaml(given=True)
+        cell = self.scenario(part, drive, **conditions)
         try:
-            Path(path).write_text(text, encoding="utf-8")
-        except (OSError, TypeError) as error:
-            raise InputError(f"{path}: cannot be written ({error})") from None
+            points = Path(path).absolute().with_suffix(".points.csv")
+            write_states(points, [(drive or self.response).points], "points of the drive")
+            cell = cell.varied({f"{_DRIVE}.response_file": str(points)})
+            Path(path).write_text(cell.to_yaml(given=True), encoding="utf-8")
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError(f"{path!r:.80}: cannot be written ({error})") from None
 
     def margin(self) -> Margin:
         """Return the smallest relative error of the response, at one frequency, with which learning diverges.
 
-        It is evaluated at all points, and with the model if there is one (docs/learning.md).
+        It is evaluated at all points, and with the model if there is one, at the nominal speed and at the ends of the
+        deviation (docs/learning.md).
 
         Raises:
             InputError: no point is among the frequencies at which the law acts.
         """
-        speed, points = self._speed, self.response.points.frequency
-        found = [self._stage.drive_margin(drive, speed) for drive in self.response.drives]
+        points, swing = self.response.points.frequency, self._speed * self.speed_deviation
+        speeds = self._stage.checked_speeds(self._speed - swing, self._speed + swing)
+        found = [self._stage.drive_margin(drive, each) for drive in self.response.drives for each in speeds]
         least = min(each for each in found if each is not None)
+        speed = least.speed
         highest = self._stage.highest_waves(speed) * speed
         within = points[points <= highest]
         beyond = None
@@ -481,8 +544,9 @@ class Loop:
             beyond = float(
                 np.min((1.0 - kept) / np.maximum(np.abs(loop.gain * loop.corrected_drive(waves, speed)), 1e-9))
             )
-        ends = float(within[0] / _TURN), float(within[-1] / _TURN)
-        return Margin(least.error, least.waves * speed / _TURN, ends, beyond)
+        band = float(within[0] / _TURN), float(within[-1] / _TURN)
+        told = self.rpm * (1.0 - self.speed_deviation), self.rpm * (1.0 + self.speed_deviation)
+        return Margin(least.error, least.waves * speed / _TURN, band, beyond, told, self.response.unresolved)
 
     def supremum(self) -> tuple[float, float]:
         """Return the largest |Q - γZ| over all frequencies, and where it is [Hz]; learning converges below 1."""
@@ -548,6 +612,11 @@ class Run:
     def errors(self) -> Array:
         """RMS form error of each revolution [m], shape (revolutions,)."""
         return self.result.errors.rms
+
+    @property
+    def margin(self) -> DriveMargin:
+        """Drive margin of the cell, at all speeds of the run and with the model of its drive."""
+        return self.result.drive_margins[_NODE]
 
     def plot_convergence(self, loop: Loop | None = None) -> "RunFigure":
         """Return a figure of the RMS form error by revolution, with the one expected at constant speed of a loop."""

@@ -44,7 +44,7 @@ def test_the_margin_of_arrays_is_that_of_the_formula_at_each_point(measured):
     assert found.frequency == pytest.approx(F[brute.argmin()])
     assert found.points == pytest.approx((5.0, 2000.0))
     assert q["q_stop"] <= 2.0 * np.pi * 2000.0
-    assert f"beyond unknown: below {found.beyond:.3g} it converges" in str(found)
+    assert f"beyond too: where the drive moves less than {found.beyond:.3g}, it converges" in str(found)
     high = np.linspace(waves[-1], 500.0, 2000)
     ones = ilc.Loop(measured, learning, q)._stage.loop(np.ones_like)
     for size, least in ((0.999 * found.beyond, False), (1.01 * found.beyond, True)):
@@ -76,6 +76,42 @@ def test_the_written_scenario_is_the_run(known, tmp_path):
     factor, where = loop.supremum()
     assert lathe_rc.run(written).margins["learning_controller"] == pytest.approx(1.0 - factor, abs=0.02)
     assert where > 0.0
+
+
+@pytest.fixture(scope="module")
+def resonant():
+    """A drive with a mode of 1180 Hz that is narrower than the distance of the points."""
+    p, (pole, zero) = 2j * np.pi * F, 2.0 * np.pi * np.array([1180.0, 1240.0])
+    mode = (p * p + 0.024 * zero * p + zero**2) / (p * p + 0.024 * pole * p + pole**2) * (pole / zero) ** 2
+    return ilc.frequency_response(F, signal.freqresp(DRIVE, 2.0 * np.pi * F)[1] * DELAY * mode)
+
+
+def test_the_margin_within_a_deviation_of_the_speed_is_that_of_the_cell(resonant, tmp_path):
+    known = resonant.fit()
+    learning = ilc.learning_filter(known, "notch", gain=0.5)
+    q = ilc.q_filter(known, learning, margin=0.2)
+    steady, swinging = (ilc.Loop(known, learning, q, speed_deviation=part) for part in (0.0, 0.05))
+    found = steady.simulate(known, OVAL, trials=3, speed_deviation=(0.05, 37.0)).margin.error
+    assert swinging.margin().error == pytest.approx(found, abs=0.01)
+    assert steady.margin().error > found + 0.02
+    assert "950 to 1050 rpm" in str(swinging.margin())
+    swinging.to_scenario(tmp_path / "cell.yaml", OVAL, speed_deviation=(0.05, 37.0), trials=3)
+    written = lathe_rc.run(lathe_rc.load(tmp_path / "cell.yaml"))
+    assert written.drive_margins["learning_controller"].error == pytest.approx(found, abs=0.01)
+
+
+def test_a_resonance_between_the_points_is_said_with_model_and_margin(resonant):
+    known = resonant.fit()
+    learning = ilc.learning_filter(known, gain=0.3)
+    told = ilc.Loop(known, learning, ilc.q_filter(known, learning, margin=0.2)).margin()
+    assert all("Hz wide lies between the points" in text for text in (repr(known), str(told)))
+
+
+def test_a_gain_that_a_refused_q_names_has_the_margin(resonant):
+    with pytest.raises(InputError, match=r"\(more by gain=\S+ or another filter\)") as told:
+        ilc.q_filter(resonant, ilc.learning_filter(resonant), margin=0.9)
+    gain = float(str(told.value).partition("gain=")[2].partition(" ")[0])
+    assert ilc.q_filter(resonant, ilc.learning_filter(resonant, gain=gain), margin=0.9)
 
 
 def test_the_lag_of_noisy_points_is_that_of_the_drive(known):
@@ -124,15 +160,19 @@ LOOP = "ilc.Loop(G, {}, {})"
         ("ilc.frequency_response(PLANT, F)", "allowed: up to half of 1/dt"),
         ("G.fit(modes=-1)", "modes = -1; allowed: a whole number from 0 to 8"),
         ("ilc.learning_filter((F, ONES))", r"allowed: Response \(ilc.frequency_response"),
-        ("ilc.learning_filter(G, 'inverse')", "without a model; allowed: of response.fit"),
+        ("ilc.learning_filter(G, 'inverse')", r"without a model; allowed: response = response.fit\(\)"),
         ("ilc.learning_filter(G, 'P')", "allowed: lead, inverse, zero-phase, notch"),
+        ("ilc.learning_filter(ilc.frequency_response(F, 5e-6 * ONES))", "static gain of 5e-06; allowed: 0.01 to 100"),
         ("ilc.learning_filter(G, gain=np.nan)", "gain = nan; allowed: a number above 0 to 2"),
-        ("ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)", "margin of 0.9; allowed: up to .* by a smaller gain"),
+        (
+            "ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)",
+            r"0.9; allowed: up to \S+, which \S+ Hz limits \(more",
+        ),
         ("ilc.q_filter(G, {'lead_tme': 1e-3})", "lead_tme: unknown parameter; did you mean lead_time"),
         ("ilc.q_filter(G, {}, rpm='1000')", "rpm = '1000'; allowed: a number above 0"),
         ("ilc.Loop(G, None, {})", "learning = None: NoneType; allowed: dict"),
-        (f"{LOOP}.simulate(G, OVAL)", "without a model; allowed"),
-        (f"{LOOP}.to_scenario('x.yaml', OVAL)", "without a model; allowed"),
+        (f"{LOOP}.simulate(G, OVAL)", "without a model in a cell; allowed"),
+        (f"{LOOP}.to_scenario('x.yaml', OVAL)", "without a model in a cell; allowed"),
         ("ilc.Loop(G, {}, {}, rpm=500.0).asymptotic_error(OVAL)", "allowed: equal speeds"),
         (f"{LOOP}.asymptotic_error({{2: 1e-6}})", "allowed: Part"),
         (f"{LOOP}.expected_errors(OVAL, 2.5)", "revolutions = 2.5; allowed: a whole number"),
