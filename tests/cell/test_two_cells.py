@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from lathe_rc import harness, messages
 from lathe_rc.cli import main
 
-LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 20.0, "speed_factor": 1.0})  # there for 1.2 s
+LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 60.0, "speed_factor": 1.0})  # there for 3.6 s
 RIGHT = scenario(
     {"run_id": "right", "nominal_rpm": 1100.0, "block_size": 128},
     spindle_encoder={"revolutions": 6.0},

@@ -117,7 +117,7 @@ def diagnostics(bag):
 
 def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     """Foreign messages are refused, counted and named, and the cell gives the bits that it has alone."""
-    cell = scenario(spindle_encoder={"revolutions": 30.0, "speed_factor": 1.0})  # while all is said several times
+    cell = scenario(spindle_encoder={"revolutions": 60.0, "speed_factor": 1.0})  # while all is said several times
     on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
     sends = []
     for topic, (kind, own) in on.items():
