@@ -140,7 +140,7 @@ assert hal.get_value("law.learning-gain") == 0.5
 
 
 def test_a_lathe_with_an_encoder_in_counts_learns_the_form(halrun, examples):
-    """From sim_encoder and encoder with 600 counts: index pulse and latch, 230 µm before and less than 5 µm after."""
+    """From sim_encoder with 600 counts: 230 µm before, less than 5 µm after; index pulse, latch, and one reset."""
     file = driven(examples / "lathe.hal", """
 until(lambda waits, enabled: not waits and not enabled, ["encoder.0.index-enable", "law.enable"])
 def error():
@@ -157,6 +157,15 @@ until(lambda enabled: enabled, ["law.enable"])
 deadline = time.monotonic() + 100
 while (last := error()) > 5e-6:
     assert time.monotonic() < deadline, last
+subprocess.run(["halcmd", "unlinkp", "law.tool-measured-error"], check=True)
+hal.set_p("law.tool-measured-error", "nan")
+until(lambda ok, enabled: not ok and not enabled, ["estop-latch.0.ok-out", "law.enable"])
+hal.set_p("law.tool-measured-error", "0")
+assert hal.get_value("law.fault")
+sets("reset", "true")
+until(lambda ok, fault: ok and not fault, ["estop-latch.0.ok-out", "law.fault"])
+sets("reset", "false")
+until(lambda enabled: enabled, ["law.enable"])
 sets("index-enable", "true")  # the angle will jump: the law stops before it does
 until(lambda enabled: not enabled, ["law.enable"])
 assert not hal.get_value("law.fault")
