@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings as tables, and stages as C libraries or functional mock-up units (FMUs).
+"""Recordings as tables, and stages as C libraries, functional mock-up units (FMUs) or HAL components.
 
 The public names are listed in ``__init__.pyi``.
 """

@@ -40,7 +40,7 @@ COMMANDS_OF = {
         "tune": "Search for the parameters that best meet given goals.",
     },
     "lathe_export": {
-        "export": "Export a recording as tables, or stages as C libraries or FMUs.",
+        "export": "Export a recording as tables, or stages as C, FMU or HAL component.",
     },
     "lathe_live": {
         "loop": "Show block diagram and learning loops, with settings to drag.",

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -147,6 +147,7 @@ def export_nodes(
     tune: Collection[str] = (),
     samples: int = 65536,
     real: str = "double",
+    further: Callable[[Library, str], dict[str, str]] = lambda _library, _scenario: {},
 ) -> Exported:
     """Write stages of a scenario as a C library into a new folder.
 
@@ -159,6 +160,7 @@ def export_nodes(
         tune: see `lathe_export.c_library.library.Library`.
         samples: length of the reference [sample].
         real: ``double``, or ``float``, of which the README states the loss over the reference.
+        further: returns the text files beside those of the library by name, of the library and the scenario's name.
 
     Raises:
         InputError: the folder exists, the name is no identifier, or as for `lathe_export.c_library.library.Library`.
@@ -170,7 +172,7 @@ def export_nodes(
     place = place or Path(f"{name}-c")
     if place.exists() or not place.absolute().parent.is_dir():
         raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
-    texts = sources(library, scenario.name)
+    texts = sources(library, scenario.name) | further(library, scenario.name)
     reference = Reference(library, Cell(scenario.nodes), samples)
     try:
         with tempfile.TemporaryDirectory(dir=place.absolute().parent) as made_in:
@@ -236,7 +238,8 @@ def _number(value: float) -> str:
     return float(value).hex()
 
 
-def _described(signal: Signal) -> str:
+def described(signal: Signal) -> str:
+    """Return type, unit, range and delay of a signal in words."""
     kind = {8: "double", 4: "float", 1: "uint8_t"}[signal.bytes]
     before = "the sample" if signal.delay == 1 else f"{signal.delay} samples"
     late = f", of {before} before" if signal.delay else ""
@@ -244,7 +247,8 @@ def _described(signal: Signal) -> str:
     return f"{kind}{unit} from {signal.low:g} to {signal.high:g}{late}"
 
 
-def _ranged(parameter: Parameter) -> str:
+def ranged(parameter: Parameter) -> str:
+    """Return description, first value and limits of a parameter."""
     unit = f" {parameter.unit}" if parameter.unit not in ("", "1") else ""
     limits = f", {parameter.limits}{unit}" if parameter.limits else ""
     return f"{parameter.doc}; at the start {parameter.value:.10g}{unit}{limits}"
@@ -253,8 +257,8 @@ def _ranged(parameter: Parameter) -> str:
 TEMPLATES.globals |= {
     "pairs": _pairs,
     "number": _number,
-    "described": _described,
-    "ranged": _ranged,
+    "described": described,
+    "ranged": ranged,
     "identifier": lambda name: re.sub(r"\W", "_", name).upper(),
     "text": json.dumps,
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries or FMUs."""
+"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries, FMUs or components of HAL."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @click.group(cls=options.GroupWithDefault, default="bag")
 def export() -> None:
-    """Export a recording as tables, or stages of a scenario as a C library or FMU; without a command: a recording."""
+    """Export a recording as tables, or stages as C, FMU or HAL component; without a command: a recording."""
 
 
 @export.command()
@@ -125,3 +125,22 @@ def fmu(
     exported = ", ".join(part.stage.name for part in library.parts)
     counts = f"{len(library.inputs)} inputs, {len(library.outputs)} outputs, {len(library.parameters)} parameters"
     click.echo(f"{place}: {exported}; {counts}, a step of {library.step:.9g} s")
+
+
+@export.command()
+@click.argument("node", shell_complete=completers.nodes)
+@click.option("--scenario", required=True, shell_complete=completers.scenarios, help="whose table the node has")
+@options.overrides
+@click.option("--name", help="of the component, a C identifier; default: that of the node")
+@click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-hal, here")
+@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@options.allow_code
+def hal(node: str, scenario: str, overrides: tuple[str, ...], output: Path | None, **how: Any) -> None:
+    """Export a NODE of a scenario as a component for HAL, the hardware layer of LinuxCNC."""
+    from lathe_export.c_library.hal import export_hal
+    from lathe_rc.commands import scenario as scenarios
+
+    done = export_hal(scenarios.load(scenario, overrides), node, output, **how)
+    _tell(done.library, "not in the component, HAL has to cause it")
+    click.echo(f"{done.place}: {node}, {done.library.step * 1e9:.9g} ns a sample; state of {done.library.size} bytes")
+    click.echo(f"next: cd {done.place} && make && sudo make install")
