@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lathe_live.panel_advice import Situation
 from lathe_live.panel_age import Age
 from lathe_live.panel_lamp import OUT, Lamp
 from lathe_live.panel_outlook import outlook
@@ -37,7 +38,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.judge.part import Tolerances, error_growth
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.view.form_limits import form_limits, varying_speed
+from lathe_rc.view.form_limits import NOT_OVER, form_limits, varying_speed
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
@@ -56,15 +57,16 @@ class Row:
     """Revolution in the map, or several that are merged.
 
     Attributes:
-        since: number of the first revolution.
-        revolution: form of the last one.
-        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
+        since, number: numbers of the first and the last revolution.
+        height: mean position along the part in the last one [m].
+        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm], shape (CELLS,).
         out: whether the supervisor held the tool out of the part in some of it, or in each revolution.
     """
 
     since: int
-    revolution: Revolution
-    cells: list[float]
+    number: int
+    height: float
+    cells: Array
     out: bool = False
 
     def merged(self, later: "Row") -> "Row":
@@ -72,13 +74,13 @@ class Row:
         if self.out != later.out:
             cells = (later if self.out else self).cells
         else:
-            cells = [max(pair, key=abs) for pair in zip(self.cells, later.cells, strict=True)]
-        return Row(self.since, later.revolution, cells, self.out and later.out)
+            cells = np.where(np.abs(later.cells) > np.abs(self.cells), later.cells, self.cells)
+        return Row(self.since, later.number, later.height, cells, self.out and later.out)
 
     def told(self) -> dict[str, Any]:
         """Return the row as JSON data."""
-        place = {"since": self.since, "revolution": self.revolution.number}
-        return {**place, "cells": self.cells, "out": self.out, "height": round(self.revolution.height * 1e3, 6)}
+        place = {"since": self.since, "revolution": self.number, "height": round(self.height * 1e3, 6)}
+        return {**place, "cells": _short(self.cells), "out": self.out}
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class Snapshot:
         rows, log: complete rows of the map, lines of the log.
         open: row of the map that is not complete, if there is one.
         latest: newest revolutions.
-        part: evaluation of the part.
+        radius: radius deviation of the part in the newest one [m], shape (ANGLES,); empty: there is none.
+        situation: evaluation of the part, and what advice rests on.
     """
 
     number: int
@@ -104,7 +107,8 @@ class Snapshot:
     open: Row | None
     log: list[dict[str, Any]]
     latest: Sequence[Row]
-    part: Evaluation
+    radius: Array
+    situation: Situation
 
 
 def _short(values: Array) -> list[float]:
@@ -120,7 +124,8 @@ def has_memory(stage: Stage) -> bool:
 def _row(revolution: Revolution, *, out: bool) -> Row:
     parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
-    return Row(revolution.number, revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
+    cells = np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)
+    return Row(revolution.number, revolution.number, revolution.height, cells, out)
 
 
 class View:
@@ -156,6 +161,7 @@ class View:
         self._doubt = 0.0  # about the form, see `Tolerances`
         self._part: RunningForm | None = None  # from the first sample of the part on
         self._tolerances = Tolerances()
+        self._lasting = {*vars(self), "_lasting"} - {"_part"}  # attributes that are no `state` of a run
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -205,6 +211,7 @@ class View:
         self._rows: list[Row] = []
         self._open: Row | None = None
         self._newest: list[Row] = []
+        self._forms: list[Revolution] = []  # of the newest rows
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
         self._part = None
         self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
@@ -212,6 +219,16 @@ class View:
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
+
+    def state(self) -> Mapping[str, Any]:
+        """Return the state of the run so far, for `resume`; it goes on changing."""
+        return {name: value for name, value in vars(self).items() if name not in self._lasting}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from a copy of a state of the same cell, as another run of it."""
+        vars(self).update(state)
+        self.run += 1
+        self.age.begin()
 
     @property
     def reached(self) -> int:
@@ -229,7 +246,10 @@ class View:
         if self.live and now["state"] == "paused" and (age["still"] or 0.0) < _STILL:
             now["state"] = "running"
         out = lamp["next"]["retract"]["text"] if lamp["next"] and lamp["safety"]["state"] in OUT else ""
-        return {**now, "age": age, "live": self.live, "part": asdict(snapshot.part.headline(out))}
+        part = snapshot.situation.evaluation.headline(out)
+        alarmed = bool(lamp["next"]) and lamp["next"]["reset"]["text"] != "nothing to reset"
+        advice = snapshot.situation.advice(self.outlook, alarmed=alarmed)
+        return {**now, "age": age, "live": self.live, "part": asdict(part), "advice": advice}
 
     @property
     def supervised(self) -> bool:
@@ -309,6 +329,7 @@ class View:
             self._complete += 1
             self._cut_to = self._cut_to if row.out else revolution.number
             self._newest = [*self._newest[1 - WATERFALL :], row]
+            self._forms = [*self._forms[1 - WATERFALL :], revolution]
             self._open, self._joined = self._open.merged(row) if self._open else row, self._joined + 1
             if self._joined == 2**self._epoch:
                 self._rows.append(self._open)
@@ -346,6 +367,18 @@ class View:
         missing = self._missing(found.verdict)
         return replace(found, missing=missing, loops=[each for each in told if each[1] is not None])
 
+    def _situation(self, unjudged: str) -> Situation:
+        """Return the evaluation of the part with what advice on it rests on."""
+        return Situation(
+            self._evaluated(unjudged),
+            np.array([form.error for form in self._forms[-LAST:]]).reshape(-1, ANGLES),
+            (self._now["margin"] or 0.0) < 0.0,
+            any(text.startswith(NOT_OVER) for text in self._limits[1]),
+            any(self._now["learning"].values()),
+            self.memories,
+            sorted(self._conditions.limited),
+        )
+
     def _missing(self, verdict: Verdict | None) -> str:
         """Return which of the revolutions up to now are not judged, or why none is."""
         if not self.topics.tool:
@@ -362,12 +395,12 @@ class View:
 
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
-        rows = self._newest[-LAST:]
-        if self._limits[0] != self._complete and rows:
+        forms = self._forms[-LAST:]
+        if self._limits[0] != self._complete and forms:
             tolerance = self.outlook.get("tolerance")
             found = form_limits(
-                np.array([row.revolution.error for row in rows]) * _UM,
-                excess=rows[-1].revolution.largest * _UM / tolerance if tolerance else 0.0,
+                np.array([form.error for form in forms]) * _UM,
+                excess=forms[-1].largest * _UM / tolerance if tolerance else 0.0,
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
@@ -426,7 +459,8 @@ class View:
                 self._open,
                 self._log,
                 tuple(self._newest),
-                self._evaluated(why),
+                self._forms[-1].radius if self._forms else np.empty(0),
+                self._situation(why),
             )
             self._news.notify_all()
 
@@ -494,7 +528,7 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         have = Have(have.number)
     had = have.rows >> snapshot.epoch - have.epoch
     rows = snapshot.rows[had : had + _AT_ONCE]
-    latest = [row for row in snapshot.latest if row.revolution.number > have.latest]
+    latest = [row for row in snapshot.latest if row.number > have.latest]
     return {
         "number": snapshot.number,
         "run": snapshot.run,
@@ -505,5 +539,5 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         "more": had + len(rows) < len(snapshot.rows),
         "log": snapshot.log[have.log : have.log + _MOST_LINES],
         "latest": [row.told() for row in latest],
-        "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
+        "shape": _short(snapshot.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
     }

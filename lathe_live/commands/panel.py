@@ -49,6 +49,7 @@ def panel(
         given = {"--revolutions": revolutions, "--from": start_from, "--set": overrides, "--attach": attach}
         if wrong := [name for name, value in given.items() if value]:
             raise InputError(f"{wrong[0]} with the bag {scenario}; allowed: with a scenario")
+        click.echo(f"reading {scenario}", err=True)
         player = Player(Path(scenario))
         lossy.tell([Path(scenario)])
         with Driver(player, pace) as driver:
