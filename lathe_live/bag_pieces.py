@@ -10,7 +10,7 @@ from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import MAX_BLOCK, START_NS, Signals
 
-_PIECE = 2**15  # samples of a piece
+_PIECE = 2**14  # samples of a piece
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def pieces(source: Source, first: int, step_ns: int) -> Iterator[Piece]:
     start_ns = START_NS + (first - MAX_BLOCK) * step_ns
     for batch in source.batches(set(feeder.types), start_ns=max(start_ns, 0)):
         feeder.add(batch)
-        yield from found
-        found.clear()
+        while found:
+            yield found.pop(0)
     feeder.finish()
     yield from found

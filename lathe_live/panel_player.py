@@ -19,7 +19,7 @@ from lathe_rc.bag.reading.source import Source, name_of
 from lathe_rc.bag.reading.stream import first_of
 from lathe_rc.errors import InputError, LatheError
 
-_EVERY, _MOST = 2**20, 64  # least number of samples between two checkpoints, and about the largest number of these
+_EVERY, _MOST = 2**20, 128  # least number of samples between two checkpoints, and about the largest number of these
 
 
 @dataclass(frozen=True)

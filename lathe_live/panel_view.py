@@ -42,6 +42,7 @@ from lathe_rc.view.form_limits import NOT_OVER, form_limits, varying_speed
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
+_REST = 9.0  # least rest after a snapshot, in durations of it: that of a long run takes a tenth of the time at most
 MOST_ROWS = 256  #: rows of the map, an even number; when it is full, neighbours are merged
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
@@ -443,7 +444,6 @@ class View:
         now = time.monotonic()
         if not at_once and now < self._due:
             return
-        self._due = now + PERIOD
         with self._news:
             number = self.latest.number + 1 if self.latest else 1
             scale = self._scale.deviation / 1e3 if self._scale else 1.0
@@ -463,6 +463,8 @@ class View:
                 self._situation(why),
             )
             self._news.notify_all()
+        done = time.monotonic()
+        self._due = max(now + PERIOD, done + _REST * (done - now))
 
     # ---- readers ------------------------------------------------------------------------------------
 
