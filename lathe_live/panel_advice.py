@@ -55,8 +55,8 @@ class Situation:
             return f"lower the speed, or ask less of {told}, whose command is at its limits: learning does not help"
         names, steady = " and ".join(sorted(self.memories)), len(self.errors) >= FEWEST and not self.falls
         if names and ((self.unstable and steady) or (growth and growth.diverges)):
-            first = f"freeze {names}, clear" if self.learning else f"clear {names}, which repeats what it learned,"
-            return f"{first} and set a smaller learning_gain or a larger q_time: learning diverges"
+            first = "freeze and clear" if self.learning else "clear"
+            return f"{first} {names}, in which learning diverges; then set a smaller learning_gain or a larger q_time"
         if growth and not growth.diverges:
             return "the error grows as by wear or drift: change a worn edge, or find what drifts"
         return self._of_bad_part(outlook, steady=steady) if bad else ""

@@ -644,12 +644,12 @@ _BENT = {"bent": True}
         ({}, {}, False, ""),
         ({}, _BENT, True, ""),  # the supervisor's step counts
         ({"falls": True, "unstable": True, "memories": ["law"]}, _BENT, False, "wait: learning is not over"),
-        ({"unstable": True, "memories": ["law"]}, {}, False, "clear law, which repeats what it learned, and set"),
+        ({"unstable": True, "memories": ["law"]}, {}, False, "clear law, in which learning diverges; then set"),
         (
             {"unstable": True, "learning": True, "memories": ["a", "b"]},
             {},
             False,
-            "freeze a and b, clear and set a smaller",
+            "freeze and clear a and b, in which learning diverges",
         ),
         ({"unstable": True}, {}, False, ""),
         (
@@ -662,7 +662,7 @@ _BENT = {"bent": True}
             {"evaluation": _evaluated([0.1] * 8 + [0.15 * 1.3**k for k in range(9)]), "memories": ["law"]},
             {},
             False,
-            "clear law, which repeats what it learned, and set a smaller learning_gain or a larger q_time: learning",
+            "clear law, in which learning diverges; then set a smaller learning_gain or a larger q_time",
         ),
         (
             {"evaluation": _evaluated([0.1] * 8 + [0.2 + 0.1 * k for k in range(9)])},
@@ -686,7 +686,7 @@ def test_the_advice_of_a_run_that_diverges_or_asks_for_too_much_force_is_told_to
     )
     beyond = scenario("supervised_turning", 2, "force_controller.set_point=[200.0]")
     for loaded, advice in (
-        (diverging, "freeze learning_controller, clear and"),
+        (diverging, "freeze and clear learning_controller, in"),
         (beyond, "the set point of the force"),
     ):
         shown = opened(loaded)
