@@ -4,7 +4,7 @@ const $ = id => document.getElementById(id);
 const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, latest: 0 }; // see Have in panel_view.py
 const SHOWN = { now: {}, rows: [], open: null, latest: [], log: [], shape: null, ranges: {}, at: null };
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
-const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
+const WATERFALL = 12, MOST_LOG = 300, MOST_KEPT = 8192, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const LATE = "#8a8a8a", OUT_OF_ORDER = ["degraded", "retracting", "safe"];
 const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
@@ -37,10 +37,10 @@ function merge(told) {
   SHOWN.open = told.open;
   SHOWN.rows.push(...told.rows);
   SHOWN.latest = [...SHOWN.latest, ...told.latest].slice(-WATERFALL);
-  SHOWN.log.push(...told.log);
+  if (told.log.length) SHOWN.log = [...SHOWN.log, ...told.log].slice(-MOST_KEPT);
   SHOWN.shape = told.shape || SHOWN.shape;
   const changed = told.run != HAVE.run || told.rows.length || told.latest.length;
-  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: SHOWN.log.length });
+  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: told.logged });
   HAVE.latest = SHOWN.latest.length ? SHOWN.latest[SHOWN.latest.length - 1].revolution : 0;
   return changed;
 }
@@ -157,13 +157,14 @@ let logged = 0, loggedOf = "";
 function drawLog() { // up to the instant that is shown
   const { at } = SHOWN, of = `${HAVE.run} ${at ? at.sample : ""}`, lines = at ? SHOWN.log.filter(line => line.sample < at.sample) : SHOWN.log;
   if (loggedOf != of) { $("log").replaceChildren(); logged = 0; loggedOf = of; }
-  for (const line of lines.slice(Math.max(logged, lines.length - MOST_LOG))) {
+  const end = at ? lines.length : HAVE.log; // with those that are no longer kept
+  for (const line of lines.slice(Math.max(lines.length - Math.min(end - logged, MOST_LOG), 0))) {
     const item = document.createElement("li"), time = document.createElement("time");
     time.textContent = `${(line.sample * (ABOUT.step || 0)).toFixed(3)} s`;
     item.append(time, `${line.source}: ${line.text}`);
     $("log").prepend(item);
   }
-  logged = lines.length;
+  logged = end;
   while ($("log").children.length > MOST_LOG) $("log").lastChild.remove();
   $("left-out").textContent = SHOWN.now.left_out || "";
 }

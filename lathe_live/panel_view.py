@@ -44,6 +44,7 @@ CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
 _REST = 9.0  # least rest after a snapshot, in durations of it: that of a long run takes a tenth of the time at most
 MOST_ROWS = 256  #: rows of the map, an even number; when it is full, neighbours are merged
+MOST_LOG = 2**13  #: lines of the log; when it is full, the older half is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
 _STILL = 1.0  # [s] without a new sample from which on a run that is held is paused
@@ -94,6 +95,7 @@ class Snapshot:
         now: newest values, by name, in the units of the page.
         epoch: number of times that neighbours in the map were merged.
         rows, log: complete rows of the map, lines of the log.
+        dropped: number of older lines.
         open: row of the map that is not complete, if there is one.
         latest: newest revolutions.
         radius: radius deviation of the part in the newest one [m], shape (ANGLES,); empty: there is none.
@@ -107,6 +109,7 @@ class Snapshot:
     rows: list[Row]
     open: Row | None
     log: list[dict[str, Any]]
+    dropped: int
     latest: Sequence[Row]
     radius: Array
     situation: Situation
@@ -220,6 +223,7 @@ class View:
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
+        self._dropped = 0  # lines before those in the log
 
     def state(self) -> Mapping[str, Any]:
         """Return the state of the run so far, for `resume`; it goes on changing."""
@@ -429,6 +433,8 @@ class View:
         if kind:
             self.timeline.mark(sample, kind, text)
         self._log.append({"sample": sample, "source": source, "text": text[:300]})
+        if len(self._log) == MOST_LOG:
+            self._log, self._dropped = self._log[MOST_LOG // 2 :], self._dropped + MOST_LOG // 2  # a new list, as above
 
     def know_lost(self, text: str) -> None:
         """Show how many samples were left out so far."""
@@ -458,6 +464,7 @@ class View:
                 self._rows,
                 self._open,
                 self._log,
+                self._dropped,
                 tuple(self._newest),
                 self._forms[-1].radius if self._forms else np.empty(0),
                 self._situation(why),
@@ -489,7 +496,7 @@ class Have:
         number: number of its newest snapshot.
         run: number of its run.
         epoch, rows: state of its map, see `Snapshot`.
-        log: number of lines.
+        log: number of lines, with those that were dropped.
         latest: newest revolution in its waterfall.
     """
 
@@ -530,6 +537,7 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         have = Have(have.number)
     had = have.rows >> snapshot.epoch - have.epoch
     rows = snapshot.rows[had : had + _AT_ONCE]
+    lines = snapshot.log[max(have.log - snapshot.dropped, 0) :][:_MOST_LINES]
     latest = [row for row in snapshot.latest if row.number > have.latest]
     return {
         "number": snapshot.number,
@@ -539,7 +547,8 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         "rows": [row.told() for row in rows],
         "open": snapshot.open.told() if snapshot.open else None,
         "more": had + len(rows) < len(snapshot.rows),
-        "log": snapshot.log[have.log : have.log + _MOST_LINES],
+        "log": lines,
+        "logged": max(have.log, snapshot.dropped) + len(lines),
         "latest": [row.told() for row in latest],
         "shape": _short(snapshot.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
     }

@@ -77,6 +77,7 @@ class Panel:
         self.rows += told["rows"]
         self.open = told["open"]
         self.log += told["log"]
+        assert told["logged"] == len(self.log)  # nothing is dropped in short runs
         self.now = told["now"]
         lengths = (len(self.rows), len(self.log))
         latest = max([row["revolution"] for row in told["latest"]], default=self.have.latest)
@@ -416,6 +417,26 @@ def test_only_news_are_told():
     cell.view.publish({"state": "paused"})
     told = news(cell.view, Have(epoch=9, run=1), 1.0)
     assert (told["rows"], told["shape"], told["more"]) == ([], None, False)
+
+
+def test_the_log_of_a_long_run_takes_bounded_memory_and_a_page_gets_the_newest_lines(opened, monkeypatch):
+    """Each line once, in order; a page that asks seldom misses the oldest ones."""
+    monkeypatch.setattr(panel_view, "MOST_LOG", 16)
+    view = opened(scenario("supervised", 3)).cell.view
+    seldom, often, kept = 0, 0, []
+    for k in range(100):
+        view.say(k, "panel", str(k))
+        view.publish({"state": "running"}, at_once=True)
+        assert len(view.latest.log) < 16
+        told = news(view, Have(run=view.run, log=often), 0.0)
+        kept += [line["sample"] for line in told["log"]]
+        often = told["logged"]
+        if k in (9, 70, 99):
+            told = news(view, Have(run=view.run, log=seldom), 0.0)
+            assert [line["sample"] for line in told["log"]][-1] == k
+            seldom = told["logged"]
+    assert kept == list(range(100))
+    assert seldom == often == 100
 
 
 @pytest.fixture(scope="module")
