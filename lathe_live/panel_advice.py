@@ -66,6 +66,6 @@ class Situation:
             return "wait: learning is not over, the error falls"
         size = float(self.errors.mean()) if steady else 0.0
         if outlook.get("bent") and size**2 > float((self.errors**2).mean()) / 2.0:
-            bent = f"the force bends tool and part by {abs(size) * 1e6:.3g} µm, which no sensor of a drive sees"
-            return f"{bent}: cut less deep, or correct it by a gauge or a predistortion"
+            bent = f"the force bends tool and part by {abs(size) * 1e6:.2g} µm, which no sensor of a drive sees"
+            return f"{bent}: cut less deep, change a worn edge, or correct it by a gauge or a predistortion"
         return ""
