@@ -4,7 +4,7 @@ const $ = id => document.getElementById(id);
 const HAVE = { number: 0, run: 0, epoch: 0, rows: 0, log: 0, latest: 0 }; // see Have in panel_view.py
 const SHOWN = { now: {}, rows: [], open: null, latest: [], log: [], shape: null, ranges: {}, at: null };
 let ABOUT = { tolerance: 0, gaps: [], rpm: 0, force: 0, nodes: [], can: [], name: "" }, version = -1;
-const WATERFALL = 12, MOST_LOG = 300, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
+const WATERFALL = 12, MOST_LOG = 300, MOST_KEPT = 8192, MM = 105 / 50; // [px/mm]: the drawn radius of 50 mm
 const COLOURS = { nominal: "#2e7d4f", degraded: "#b8860b", retracting: "#d2622a", safe: "#b3262e" }; // as in Rerun
 const LATE = "#8a8a8a", OUT_OF_ORDER = ["degraded", "retracting", "safe"];
 const SAID = { safe: "safe (feeds stopped, tool out of the part)" };
@@ -37,10 +37,10 @@ function merge(told) {
   SHOWN.open = told.open;
   SHOWN.rows.push(...told.rows);
   SHOWN.latest = [...SHOWN.latest, ...told.latest].slice(-WATERFALL);
-  SHOWN.log.push(...told.log);
+  if (told.log.length) SHOWN.log = [...SHOWN.log, ...told.log].slice(-MOST_KEPT);
   SHOWN.shape = told.shape || SHOWN.shape;
   const changed = told.run != HAVE.run || told.rows.length || told.latest.length;
-  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: SHOWN.log.length });
+  Object.assign(HAVE, { number: told.number, run: told.run, rows: SHOWN.rows.length, log: told.logged });
   HAVE.latest = SHOWN.latest.length ? SHOWN.latest[SHOWN.latest.length - 1].revolution : 0;
   return changed;
 }
@@ -110,17 +110,18 @@ function draw(changed, moving = true) {
 // ---- header: state, verdict and age, at every width and scroll -------------------------------------------------------
 
 // The newest answer is at least as new as its question, however slow the link: its age counts from there.
-const SILENT = 5000, BEHIND = 1, STILL = 3; // [ms] and [s] from which on values are old
+const SILENT = 5, BEHIND = 1, STILL = 3; // [s] from which on values are old
 let heard = performance.now();
 
 function ages({ age, safety, state, live }) { // what is old, and why, in words
-  const silent = performance.now() - heard, lost = silent > SILENT, still = state == "running" && age && age.still > STILL;
+  const silent = (performance.now() - heard) / 1000, lost = silent > SILENT, still = state == "running" && age && age.still + silent > STILL;
   const behind = live && age && (age.behind === null || age.behind > BEHIND);
-  const words = lost ? `lathe panel was not heard for ${Math.round(silent / 1000)} s: everything below is old`
+  const words = lost ? `lathe panel was not heard for ${Math.round(silent)} s: everything below is old`
     : !age || state == "waiting" ? "no run heard yet" : age.behind === null ? "shows an earlier run; another one has begun"
     : behind ? `shows the run as it was ${digits(age.behind, 3)} s before its newest sample`
-    : still ? `no new sample for ${Math.round(age.still)} s` : "up to date";
-  return { lost, words, samples: lost || behind || live && still, safety: lost || safety && safety.late };
+    : still ? `no new sample for ${Math.round(age.still + silent)} s` : "up to date";
+  const heardOf = safety ? safety.age + silent : 0; // the supervisor, at the end of the link [s]
+  return { lost, words, heardOf, samples: lost || behind || live && still, safety: lost || safety && (safety.late || live && safety.state != "unknown" && heardOf > STILL) };
 }
 
 function drawHeader(now) {
@@ -132,14 +133,15 @@ function drawHeader(now) {
   const since = safety && safety.cause ? ` since ${(safety.since * (ABOUT.step || 0)).toFixed(3)} s` : "";
   const told = !safety ? "no supervisor" : unknown ? "unknown: the supervisor was not heard yet"
     : old.safety ? safety.state : (SAID[safety.state] || safety.state) + since;
-  $("safety").textContent = told + (old.lost ? ", no answer from lathe panel" : old.safety ? `, last heard ${Math.round(safety.age)} s ago` : "");
+  $("safety").textContent = told + (old.lost ? ", no answer from lathe panel" : old.safety ? `, last heard ${Math.round(old.heardOf)} s ago` : "");
   $("safety").parentNode.classList.toggle("old", Boolean(old.safety));
   $("alarm").textContent = !safety ? "" : safety.cause || (OUT_OF_ORDER.includes(safety.state) ? "(cause not heard)" : "");
   $("verdict").textContent = part ? part.title + (old.samples ? " (old)" : "") : "";
   $("ground").textContent = part ? part.text : "";
   $("part").className = `part ${old.samples ? "old" : part ? part.mood : ""}`;
   const { retract, reset } = now.next || {};
-  $("next").textContent = can("command") && reset && !(reset.text == "nothing to reset") ? `next: ${reset.text}` : "";
+  const next = [reset && reset.text != "nothing to reset" ? reset.text : "", now.advice].filter(Boolean);
+  $("next").textContent = can("command") && next.length ? `next: ${next.join("; ")}` : "";
   for (const [id, step] of [["retract", retract], ["reset", reset]]) {
     $(id).disabled = Boolean(step) && !step.allowed && !old.safety;
     $(id).title = step ? step.text : "";
@@ -148,20 +150,21 @@ function drawHeader(now) {
   $("in-force").textContent = (now.faults || []).map(fault => `fault in force: ${fault}`).join("\n");
   $("newest").textContent = safety && safety.alarm ? `newest: ${safety.alarm}` : "";
 }
-setInterval(() => { if (performance.now() - heard > SILENT) drawHeader(SHOWN.now); }, 1000);
+setInterval(() => { if (performance.now() - heard > 1000) drawHeader(SHOWN.now); }, 250);
 document.addEventListener("visibilitychange", () => drawHeader(SHOWN.now)); // a hidden page asks for nothing
 
 let logged = 0, loggedOf = "";
 function drawLog() { // up to the instant that is shown
   const { at } = SHOWN, of = `${HAVE.run} ${at ? at.sample : ""}`, lines = at ? SHOWN.log.filter(line => line.sample < at.sample) : SHOWN.log;
   if (loggedOf != of) { $("log").replaceChildren(); logged = 0; loggedOf = of; }
-  for (const line of lines.slice(Math.max(logged, lines.length - MOST_LOG))) {
+  const end = at ? lines.length : HAVE.log; // with those that are no longer kept
+  for (const line of lines.slice(Math.max(lines.length - Math.min(end - logged, MOST_LOG), 0))) {
     const item = document.createElement("li"), time = document.createElement("time");
     time.textContent = `${(line.sample * (ABOUT.step || 0)).toFixed(3)} s`;
     item.append(time, `${line.source}: ${line.text}`);
     $("log").prepend(item);
   }
-  logged = lines.length;
+  logged = end;
   while ($("log").children.length > MOST_LOG) $("log").lastChild.remove();
   $("left-out").textContent = SHOWN.now.left_out || "";
 }

@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // Commands of the panel; each answer stands at its command.
 async function tell(place, name, question) {
+  const slow = setTimeout(() => answer(place, "sent; no answer yet"), SILENT * 1000);
   try {
     const found = await ask(name, question);
+    clearTimeout(slow);
     answer(place, found.text ? `asked for: ${found.text}` : "");
     return found;
   } catch (error) {
+    clearTimeout(slow);
     answer(place, error instanceof TypeError ? "no answer: has lathe panel ended?" : error.message, true);
     return null;
   }

@@ -57,6 +57,7 @@ class Lamp:
 
     def __init__(self, *, live: bool = False) -> None:
         self._live, self._lock = live, threading.Lock()
+        self._lasting = {*vars(self), "_lasting"}  # attributes that are no `state` of a run
         self.clear()
 
     def clear(self) -> None:
@@ -70,6 +71,15 @@ class Lamp:
             self._cleared: dict[str, int] = {}  # sample at which a controller last cleared its memory
             self._conditions = event_log.Conditions()
             self._heard = time.monotonic()
+
+    def state(self) -> Mapping[str, Any]:
+        """Return the state so far, for `resume`; it goes on changing."""
+        return {name: value for name, value in vars(self).items() if name not in self._lasting}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from a copy of a state."""
+        with self._lock:
+            vars(self).update(state)
 
     def hear(self, last: int, state: int, reaction: int) -> None:
         """Take state and reaction at the last sample of a block of the supervisor."""

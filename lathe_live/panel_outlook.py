@@ -5,15 +5,21 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.judge.causes import changing
+from lathe_rc.judge.causes import EVERYWHERE, changing
 
 
 def outlook(scenario: Scenario) -> dict[str, Any]:
     """Return the name, tolerance and shape of a scenario, for the drawings of the page; lengths in µm and mm."""
-    causes = changing({name: table.model_dump() for name, table in scenario.nodes.items()})
+    nodes = {name: table.model_dump() for name, table in scenario.nodes.items()}
+    causes = changing(nodes)
+    bent = any(values.get(name, off) != off for values in nodes.values() for name, off in EVERYWHERE["force"].items())
     shown = properties(table.shown() for table in scenario.nodes.values())
     causes += ["cut"] if shown.get("cut") else []
-    return {**_outlook(scenario.name, scenario.shared.step, scenario.shared.nominal_rpm, shown), "changing": causes}
+    return {
+        **_outlook(scenario.name, scenario.shared.step, scenario.shared.nominal_rpm, shown),
+        "changing": causes,
+        "bent": bent,
+    }
 
 
 def plain_outlook(name: str, step: float) -> dict[str, Any]:

@@ -199,6 +199,13 @@ class Timeline:
         turns = found.first + found.every * np.arange(known.size)
         return float(np.interp(sample, found.low[known, place], turns[known]))
 
+    def last_of(self, turn: int) -> int | None:
+        """Return the last sample of a revolution, or of several that are merged; None: not received."""
+        with self._lock:
+            found = self._pyramid.bands(turn, turn, 1).high
+            last = found[0, self._lanes.index(_SAMPLE)] if found.size else np.nan
+        return None if np.isnan(last) else int(last)
+
     # ---- readers ------------------------------------------------------------------------------------
 
     def shown(self, first: float | None, last: float | None, cells: int) -> dict[str, Any]:

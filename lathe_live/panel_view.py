@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lathe_live.panel_advice import Situation
 from lathe_live.panel_age import Age
 from lathe_live.panel_lamp import OUT, Lamp
 from lathe_live.panel_outlook import outlook
@@ -37,11 +38,13 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.judge.part import Tolerances, error_growth
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.view.form_limits import form_limits, varying_speed
+from lathe_rc.view.form_limits import NOT_OVER, form_limits, varying_speed
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
+_REST = 9.0  # least rest after a snapshot, in durations of it: that of a long run takes a tenth of the time at most
 MOST_ROWS = 256  #: rows of the map, an even number; when it is full, neighbours are merged
+MOST_LOG = 2**13  #: lines of the log; when it is full, the older half is dropped
 WATERFALL = 12  #: newest revolutions whose error is shown as curves
 _AT_ONCE = 16  # rows in an answer
 _STILL = 1.0  # [s] without a new sample from which on a run that is held is paused
@@ -56,15 +59,16 @@ class Row:
     """Revolution in the map, or several that are merged.
 
     Attributes:
-        since: number of the first revolution.
-        revolution: form of the last one.
-        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm].
+        since, number: numbers of the first and the last revolution.
+        height: mean position along the part in the last one [m].
+        cells: radius deviation from the desired form, the largest in magnitude in each cell [µm], shape (CELLS,).
         out: whether the supervisor held the tool out of the part in some of it, or in each revolution.
     """
 
     since: int
-    revolution: Revolution
-    cells: list[float]
+    number: int
+    height: float
+    cells: Array
     out: bool = False
 
     def merged(self, later: "Row") -> "Row":
@@ -72,13 +76,13 @@ class Row:
         if self.out != later.out:
             cells = (later if self.out else self).cells
         else:
-            cells = [max(pair, key=abs) for pair in zip(self.cells, later.cells, strict=True)]
-        return Row(self.since, later.revolution, cells, self.out and later.out)
+            cells = np.where(np.abs(later.cells) > np.abs(self.cells), later.cells, self.cells)
+        return Row(self.since, later.number, later.height, cells, self.out and later.out)
 
     def told(self) -> dict[str, Any]:
         """Return the row as JSON data."""
-        place = {"since": self.since, "revolution": self.revolution.number}
-        return {**place, "cells": self.cells, "out": self.out, "height": round(self.revolution.height * 1e3, 6)}
+        place = {"since": self.since, "revolution": self.number, "height": round(self.height * 1e3, 6)}
+        return {**place, "cells": _short(self.cells), "out": self.out}
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,11 @@ class Snapshot:
         now: newest values, by name, in the units of the page.
         epoch: number of times that neighbours in the map were merged.
         rows, log: complete rows of the map, lines of the log.
+        dropped: number of older lines.
         open: row of the map that is not complete, if there is one.
         latest: newest revolutions.
-        part: evaluation of the part.
+        radius: radius deviation of the part in the newest one [m], shape (ANGLES,); empty: there is none.
+        situation: evaluation of the part, and what advice rests on.
     """
 
     number: int
@@ -103,8 +109,10 @@ class Snapshot:
     rows: list[Row]
     open: Row | None
     log: list[dict[str, Any]]
+    dropped: int
     latest: Sequence[Row]
-    part: Evaluation
+    radius: Array
+    situation: Situation
 
 
 def _short(values: Array) -> list[float]:
@@ -120,7 +128,8 @@ def has_memory(stage: Stage) -> bool:
 def _row(revolution: Revolution, *, out: bool) -> Row:
     parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
-    return Row(revolution.number, revolution, _short(np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)), out)
+    cells = np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)
+    return Row(revolution.number, revolution.number, revolution.height, cells, out)
 
 
 class View:
@@ -156,6 +165,7 @@ class View:
         self._doubt = 0.0  # about the form, see `Tolerances`
         self._part: RunningForm | None = None  # from the first sample of the part on
         self._tolerances = Tolerances()
+        self._lasting = {*vars(self), "_lasting"} - {"_part"}  # attributes that are no `state` of a run
         self.begin(types, step_ns, margin)
 
     def begin(self, types: Mapping[str, str], step_ns: int, margin: float | None = None) -> None:
@@ -205,6 +215,7 @@ class View:
         self._rows: list[Row] = []
         self._open: Row | None = None
         self._newest: list[Row] = []
+        self._forms: list[Revolution] = []  # of the newest rows
         self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
         self._part = None
         self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
@@ -212,6 +223,17 @@ class View:
         self._speeds = (math.inf, 0.0)  # extremes [rad/s]
         self._watches = watches(self._loops, self._types)
         self._log: list[dict[str, Any]] = []
+        self._dropped = 0  # lines before those in the log
+
+    def state(self) -> Mapping[str, Any]:
+        """Return the state of the run so far, for `resume`; it goes on changing."""
+        return {name: value for name, value in vars(self).items() if name not in self._lasting}
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from a copy of a state of the same cell, as another run of it."""
+        vars(self).update(state)
+        self.run += 1
+        self.age.begin()
 
     @property
     def reached(self) -> int:
@@ -229,7 +251,10 @@ class View:
         if self.live and now["state"] == "paused" and (age["still"] or 0.0) < _STILL:
             now["state"] = "running"
         out = lamp["next"]["retract"]["text"] if lamp["next"] and lamp["safety"]["state"] in OUT else ""
-        return {**now, "age": age, "live": self.live, "part": asdict(snapshot.part.headline(out))}
+        part = snapshot.situation.evaluation.headline(out)
+        alarmed = bool(lamp["next"]) and lamp["next"]["reset"]["text"] != "nothing to reset"
+        advice = snapshot.situation.advice(self.outlook, alarmed=alarmed)
+        return {**now, "age": age, "live": self.live, "part": asdict(part), "advice": advice}
 
     @property
     def supervised(self) -> bool:
@@ -309,6 +334,7 @@ class View:
             self._complete += 1
             self._cut_to = self._cut_to if row.out else revolution.number
             self._newest = [*self._newest[1 - WATERFALL :], row]
+            self._forms = [*self._forms[1 - WATERFALL :], revolution]
             self._open, self._joined = self._open.merged(row) if self._open else row, self._joined + 1
             if self._joined == 2**self._epoch:
                 self._rows.append(self._open)
@@ -346,6 +372,18 @@ class View:
         missing = self._missing(found.verdict)
         return replace(found, missing=missing, loops=[each for each in told if each[1] is not None])
 
+    def _situation(self, unjudged: str) -> Situation:
+        """Return the evaluation of the part with what advice on it rests on."""
+        return Situation(
+            self._evaluated(unjudged),
+            np.array([form.error for form in self._forms[-LAST:]]).reshape(-1, ANGLES),
+            (self._now["margin"] or 0.0) < 0.0,
+            any(text.startswith(NOT_OVER) for text in self._limits[1]),
+            any(self._now["learning"].values()),
+            self.memories,
+            sorted(self._conditions.limited),
+        )
+
     def _missing(self, verdict: Verdict | None) -> str:
         """Return which of the revolutions up to now are not judged, or why none is."""
         if not self.topics.tool:
@@ -362,12 +400,12 @@ class View:
 
     def _limiting(self) -> list[str]:
         """Return what limits the form error, in sentences."""
-        rows = self._newest[-LAST:]
-        if self._limits[0] != self._complete and rows:
+        forms = self._forms[-LAST:]
+        if self._limits[0] != self._complete and forms:
             tolerance = self.outlook.get("tolerance")
             found = form_limits(
-                np.array([row.revolution.error for row in rows]) * _UM,
-                excess=rows[-1].revolution.largest * _UM / tolerance if tolerance else 0.0,
+                np.array([form.error for form in forms]) * _UM,
+                excess=forms[-1].largest * _UM / tolerance if tolerance else 0.0,
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
@@ -395,6 +433,8 @@ class View:
         if kind:
             self.timeline.mark(sample, kind, text)
         self._log.append({"sample": sample, "source": source, "text": text[:300]})
+        if len(self._log) == MOST_LOG:
+            self._log, self._dropped = self._log[MOST_LOG // 2 :], self._dropped + MOST_LOG // 2  # a new list, as above
 
     def know_lost(self, text: str) -> None:
         """Show how many samples were left out so far."""
@@ -410,7 +450,6 @@ class View:
         now = time.monotonic()
         if not at_once and now < self._due:
             return
-        self._due = now + PERIOD
         with self._news:
             number = self.latest.number + 1 if self.latest else 1
             scale = self._scale.deviation / 1e3 if self._scale else 1.0
@@ -425,10 +464,14 @@ class View:
                 self._rows,
                 self._open,
                 self._log,
+                self._dropped,
                 tuple(self._newest),
-                self._evaluated(why),
+                self._forms[-1].radius if self._forms else np.empty(0),
+                self._situation(why),
             )
             self._news.notify_all()
+        done = time.monotonic()
+        self._due = max(now + PERIOD, done + _REST * (done - now))
 
     # ---- readers ------------------------------------------------------------------------------------
 
@@ -453,7 +496,7 @@ class Have:
         number: number of its newest snapshot.
         run: number of its run.
         epoch, rows: state of its map, see `Snapshot`.
-        log: number of lines.
+        log: number of lines, with those that were dropped.
         latest: newest revolution in its waterfall.
     """
 
@@ -494,7 +537,8 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         have = Have(have.number)
     had = have.rows >> snapshot.epoch - have.epoch
     rows = snapshot.rows[had : had + _AT_ONCE]
-    latest = [row for row in snapshot.latest if row.revolution.number > have.latest]
+    lines = snapshot.log[max(have.log - snapshot.dropped, 0) :][:_MOST_LINES]
+    latest = [row for row in snapshot.latest if row.number > have.latest]
     return {
         "number": snapshot.number,
         "run": snapshot.run,
@@ -503,7 +547,8 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
         "rows": [row.told() for row in rows],
         "open": snapshot.open.told() if snapshot.open else None,
         "more": had + len(rows) < len(snapshot.rows),
-        "log": snapshot.log[have.log : have.log + _MOST_LINES],
+        "log": lines,
+        "logged": max(have.log, snapshot.dropped) + len(lines),
         "latest": [row.told() for row in latest],
-        "shape": _short(snapshot.latest[-1].revolution.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
+        "shape": _short(snapshot.radius[:: ANGLES // _SHAPE] * _UM) if latest else None,
     }

@@ -39,21 +39,24 @@ def panel(
     """
     from lathe_live import page_server
     from lathe_live import panel as panels
-    from lathe_live.loop_page import LoopPage
-    from lathe_live.panel_player import Player
     from lathe_live.panel_run import Driver, LiveCell
-    from lathe_live.varied_loop import VariedLoop
-    from lathe_rc.commands import scenario as scenarios
 
     if measured.is_bag(Path(scenario)):
         given = {"--revolutions": revolutions, "--from": start_from, "--set": overrides, "--attach": attach}
         if wrong := [name for name, value in given.items() if value]:
             raise InputError(f"{wrong[0]} with the bag {scenario}; allowed: with a scenario")
+        from lathe_live.panel_player import Player
+
+        click.echo(f"reading {scenario}", err=True)
         player = Player(Path(scenario))
         lossy.tell([Path(scenario)])
         with Driver(player, pace) as driver:
             page_server.serve(panels.player_site(driver, player), port, click.echo, browser=not no_browser)
         return
+    from lathe_live.loop_page import LoopPage
+    from lathe_live.varied_loop import VariedLoop
+    from lathe_rc.commands import scenario as scenarios
+
     allowed_code.allow_own_code()
     loaded = scenarios.load(scenario, overrides, revolutions=revolutions, start_from=start_from)
     loop = LoopPage(VariedLoop(loaded), Path(f"{loaded.name}-loop.yaml")).site()

@@ -30,6 +30,7 @@ Column = Samples | Sequence[float | str | None] | float | str | bool | None
 
 _HERE = Path(__file__).parent
 _PAPER = 900  # [px] width of an image, approximately that of the page
+_MOST_SVG = 10**5  # [B] of a picture
 _GUIDE: Spec = {"labelColor": "--soft", "titleColor": "--ink", "gridColor": "--line", "domainColor": "--soft"}
 _GUIDE |= {"tickColor": "--soft", "labelFontSize": 11, "titleFontSize": 11}
 #: Style of all figures; names that begin with -- are colours of the page, see page.css.
@@ -123,23 +124,24 @@ class Charts:
         return bytes(convert(spec, scale=scale))
 
     def picture(self, name: str, beside: int) -> str:
-        """Return one of ``beside`` parts of a figure as a data URI: SVG, or JPEG if the part has too many marks."""
+        """Return one of ``beside`` parts of a figure as a data URI: SVG, or a smaller JPEG if it has too many marks."""
         spec = self._static(name)
         own = spec.get("usermeta", {})
         if "square" in own:  # drawn as in charts.js
             spec |= {"width": own["square"], "height": own["square"], "autosize": "pad"}
         else:
             spec["width"] = _PAPER // beside
-        if own.get("renderer") == "canvas":
-            kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=90)
-        else:
+        kind, image = "svg+xml", b""
+        if own.get("renderer") != "canvas":
             ids: dict[str, str] = {}  # Vega numbers clip paths across all figures of a process
             svg = re.sub(
                 r'(?<= id=")clip\d+|(?<=url\(#)clip\d+',
                 lambda found: ids.setdefault(found[0], f"clip{len(ids)}"),
                 vl_convert.vegalite_to_svg(spec),
             )
-            kind, image = "svg+xml", svg.encode()
+            image = svg.encode()
+        if not image or len(image) > _MOST_SVG:
+            kind, image = "jpeg", vl_convert.vegalite_to_jpeg(spec, scale=1.5, quality=80)
         return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
     @property

@@ -21,6 +21,7 @@ import lathe_rc
 from lathe_live import page_server, panel, panel_age, panel_lamp, panel_view
 from lathe_live.live_runs import Backlog
 from lathe_live.page_server import Site
+from lathe_live.panel_advice import Situation
 from lathe_live.panel_live import LivePanel
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
@@ -76,6 +77,7 @@ class Panel:
         self.rows += told["rows"]
         self.open = told["open"]
         self.log += told["log"]
+        assert told["logged"] == len(self.log)  # nothing is dropped in short runs
         self.now = told["now"]
         lengths = (len(self.rows), len(self.log))
         latest = max([row["revolution"] for row in told["latest"]], default=self.have.latest)
@@ -417,6 +419,26 @@ def test_only_news_are_told():
     assert (told["rows"], told["shape"], told["more"]) == ([], None, False)
 
 
+def test_the_log_of_a_long_run_takes_bounded_memory_and_a_page_gets_the_newest_lines(opened, monkeypatch):
+    """Each line once, in order; a page that asks seldom misses the oldest ones."""
+    monkeypatch.setattr(panel_view, "MOST_LOG", 16)
+    view = opened(scenario("supervised", 3)).cell.view
+    seldom, often, kept = 0, 0, []
+    for k in range(100):
+        view.say(k, "panel", str(k))
+        view.publish({"state": "running"}, at_once=True)
+        assert len(view.latest.log) < 16
+        told = news(view, Have(run=view.run, log=often), 0.0)
+        kept += [line["sample"] for line in told["log"]]
+        often = told["logged"]
+        if k in (9, 70, 99):
+            told = news(view, Have(run=view.run, log=seldom), 0.0)
+            assert [line["sample"] for line in told["log"]][-1] == k
+            seldom = told["logged"]
+    assert kept == list(range(100))
+    assert seldom == often == 100
+
+
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bag") / "turned"
@@ -623,6 +645,74 @@ _TURNED = [100.0, 10.0, 3.0, 1.5, 1.2, 1.0, 1.0]
 def test_a_part_is_good_only_with_every_ground(evaluated, out, headline):
     found = evaluated.headline(out)
     assert f"{found.mood} {found.title} {found.text}".startswith(headline)
+
+
+_BAD = _evaluated([9.0] * 8)
+_BENT = {"bent": True}
+
+
+@pytest.mark.parametrize(
+    ("changed", "outlook", "alarmed", "advice"),
+    [
+        ({"evaluation": _evaluated(_TURNED)}, _BENT, False, ""),
+        (
+            {},
+            {"force": 200.0, "force_limit": 165.0},
+            True,
+            "the set point of the force, 200 N, is above the supervisor's",
+        ),
+        ({}, _BENT, False, "the force bends tool and part by 9 µm"),
+        ({}, {}, False, ""),
+        ({}, _BENT, True, ""),  # the supervisor's step counts
+        ({"falls": True, "unstable": True, "memories": ["law"]}, _BENT, False, "wait: learning is not over"),
+        ({"unstable": True, "memories": ["law"]}, {}, False, "clear law, in which learning diverges; then set"),
+        (
+            {"unstable": True, "learning": True, "memories": ["a", "b"]},
+            {},
+            False,
+            "freeze and clear a and b, in which learning diverges",
+        ),
+        ({"unstable": True}, {}, False, ""),
+        (
+            {"limited": ["drive"], "unstable": True, "memories": ["law"]},
+            {},
+            False,
+            "lower the speed, or ask less of drive",
+        ),
+        (
+            {"evaluation": _evaluated([0.1] * 8 + [0.15 * 1.3**k for k in range(9)]), "memories": ["law"]},
+            {},
+            False,
+            "clear law, in which learning diverges; then set a smaller learning_gain or a larger q_time",
+        ),
+        (
+            {"evaluation": _evaluated([0.1] * 8 + [0.2 + 0.1 * k for k in range(9)])},
+            {},
+            False,
+            "the error grows as by wear or drift: change a worn edge",
+        ),
+    ],
+)
+def test_the_header_names_a_step_for_the_part_where_one_follows_from_its_state(changed, outlook, alarmed, advice):
+    known = {"unstable": False, "falls": False, "learning": False, "memories": [], "limited": []}
+    found = Situation(**{"evaluation": _BAD, "errors": np.full((4, 360), 9e-6), **known, **changed})
+    assert found.advice(outlook, alarmed=alarmed).startswith(advice)
+    assert bool(found.advice(outlook, alarmed=alarmed)) == bool(advice)
+
+
+def test_the_advice_of_a_run_that_diverges_or_asks_for_too_much_force_is_told_to_the_page(opened):
+    wrong = {"lead_time": 1e-4, "learning_gain": 0.5, "stop_ratio": 0.0, "allow_unstable": True}
+    diverging = cells.scenario(
+        spindle_encoder={"revolutions": 40.2}, learning_controller=wrong, tool={"tolerance": 2e-6}
+    )
+    beyond = scenario("supervised_turning", 2, "force_controller.set_point=[200.0]")
+    for loaded, advice in (
+        (diverging, "freeze and clear learning_controller, in"),
+        (beyond, "the set point of the force"),
+    ):
+        shown = opened(loaded)
+        shown.ask("start")
+        assert shown.until(lambda now: now["state"] == "ended")["advice"].startswith(advice)
 
 
 def test_the_headline_names_what_is_not_judged(opened):

@@ -1,37 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """The timeline of the panel: of a bag, of an own run, of a cell of nodes; and the map, which loses no extreme."""
 
+import copy
+
 import numpy as np
 import pytest
 from test_panel import Panel, attached, bag, hear, opened, retracted, scenario
 
 import lathe_rc
-from lathe_live import panel, panel_player, panel_timeline
+from lathe_live import bag_pieces, panel, panel_player, panel_timeline
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver
 from lathe_live.panel_topics import Topics
 from lathe_live.panel_view import MOST_ROWS, View
 from lathe_live.rerun_revolutions import ANGLES, Revolution
 from lathe_rc import event_log, messages
-from lathe_rc.errors import InputError
+from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.state_machine import State
 
 __all__ = ["bag", "opened", "retracted"]  # fixtures
 KINDS = ("fault", "alarm", "state", "command", "parameter", "lost")
 
 
-def spiked(bag, sample, value):
-    """A reader of bags by which one sample of the form error is another."""
+def spiked(sample, value):
+    """Pieces of a bag in which one sample of the form error is another."""
 
-    def read(path):
-        recording = lathe_rc.read_bag(path)
-        error = recording.dense["/tool"]["error"]
-        error.flags.writeable = True
-        error[sample] = value
-        return recording
+    def changed(*args):
+        for piece in bag_pieces.pieces(*args):
+            if piece.first <= sample < piece.end:
+                piece.dense["/tool"]["error"][sample - piece.first] = value
+            yield piece
 
-    assert bag.exists()
-    return read
+    return changed
 
 
 def test_the_timeline_of_a_bag_has_the_extremes_of_all_its_samples_and_its_events(bag):
@@ -69,9 +69,9 @@ def test_the_timeline_of_a_bag_has_the_extremes_of_all_its_samples_and_its_event
 
 
 def test_a_spike_of_one_sample_is_in_a_band_at_every_zoom_and_is_found_by_a_click(bag, monkeypatch):
-    monkeypatch.setattr(panel_player, "read_bag", spiked(bag, 13_579, 250e-6))
+    monkeypatch.setattr(panel_player, "pieces", spiked(13_579, 250e-6))
     player = Player(bag)
-    turn = int(player._angle[13_579] / (2.0 * np.pi))
+    turn = int(lathe_rc.read_bag(bag).of_type(messages.ENCODER)["angle_true"][13_579] / (2.0 * np.pi))
     with Driver(player, 0.0) as driver:
         shown = Panel(driver, None, panel.player_site(driver, player))
         for cells in (1, 2, 3, 8, 100):
@@ -90,6 +90,43 @@ def test_a_spike_of_one_sample_is_in_a_band_at_every_zoom_and_is_found_by_a_clic
         ):
             with pytest.raises(InputError, match=message):
                 shown.ask(name, **question)
+
+
+def test_a_jump_in_a_bag_reads_a_piece_of_it_and_shows_what_playing_it_shows(bag, monkeypatch):
+    """Forwards and backwards, around the retraction; whatever the length of the bag, there are few checkpoints."""
+    whole, played = Player(bag), {}
+    jumps = [20_000, 5_000, 25_123, whole.samples, 12_345, 0, 29_999]
+    for sample in sorted(jumps):
+        whole.advance(sample)
+        played[sample] = copy.deepcopy(whole.view.state()), whole.view.lamp.now(supervised=True)
+    monkeypatch.setattr(bag_pieces, "_PIECE", 512)
+    for name, value in (("_EVERY", 512), ("_MOST", 16)):
+        monkeypatch.setattr(panel_player, name, value)
+    player, read = Player(bag), []
+    told = [each.sample for each in player._checkpoints]
+    assert 8 <= len(told) <= 16
+    shown = player._show
+    monkeypatch.setattr(player, "_show", lambda piece: (read.append(piece.samples), shown(piece)))
+    for sample in jumps:
+        read.clear()
+        player.seek(sample)
+        assert sum(read) <= max(np.diff([*told, player.samples]))
+        state, lamp = played[sample]
+        found = player.view.state()
+        assert player.view.lamp.now(supervised=True) == lamp
+        for name in ("_now", "_log", "_end", "_complete", "_out"):
+            assert found[name] == state[name], (sample, name)
+        assert [row.told() for row in found["_newest"]] == [row.told() for row in state["_newest"]]
+        assert (found["_part"] is None) == (state["_part"] is None)
+        if state["_part"]:
+            assert np.array_equal(found["_part"].largest, state["_part"].largest)
+    player.seek(0)
+    bag.rename(bag.with_name("gone"))
+    try:
+        with pytest.raises(LatheError, match="broken"):
+            player.seek(20_000)
+    finally:
+        bag.with_name("gone").rename(bag)
 
 
 def test_commands_and_parameters_of_an_own_run_are_marked_at_their_sample(opened):
@@ -177,8 +214,8 @@ def test_the_map_of_a_long_run_shows_the_largest_error_of_all_its_revolutions():
         view._add([Revolution(number, number, error, -error, 0.0, 1e-7, 1e-7)])
     rows = [*view._rows, view._open]
     assert MOST_ROWS // 2 < len(rows) <= MOST_ROWS
-    assert [row.since for row in rows[1:]] == [row.revolution.number + 1 for row in rows[:-1]]
-    (found,) = (row for row in rows if row.since <= 346 <= row.revolution.number)
+    assert [row.since for row in rows[1:]] == [row.number + 1 for row in rows[:-1]]
+    (found,) = (row for row in rows if row.since <= 346 <= row.number)
     assert found.cells[60] == -50.0
     largest = np.abs(errors[:1096]).reshape(-1, 8, 180, 2)
     largest[-1, -2:] = 0.0

@@ -22,7 +22,7 @@ from lathe_live.loop_page import LoopPage
 from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver, LiveCell
 from lathe_live.varied_loop import VariedLoop
-from lathe_rc import harness
+from lathe_rc import harness, messages
 from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 
@@ -186,6 +186,57 @@ def test_the_lamp_shows_what_was_heard_and_is_grey_when_nothing_is(retracted, tm
         assert browser.run("document.body.classList.contains('lost')")
 
 
+RECORDED = """(() => {
+  window.recorded = [];
+  const safety = document.getElementById("safety"), look = () => {
+    const shown = [safety.textContent.split(/[ ,]/)[0], safety.parentNode.classList.contains("old")];
+    if (String(recorded.at(-1)?.slice(1)) != String(shown)) recorded.push([performance.now() / 1000, ...shown]);
+    requestAnimationFrame(look);
+  };
+  look();
+})()"""  # instants at which the state that is shown, or its mark as old, changes
+CLOCK = "performance.now() / 1000"
+
+
+FREE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+
+
+@pytest.mark.parametrize("link", [{"latency": 20_000}, {"downloadThroughput": 2000}, {"offline": True}])
+def test_over_a_slow_or_cut_link_no_old_state_is_shown_without_a_mark(retracted, tmp_path, link):
+    """Answers 20 s late, at 2 kB/s, or none: 5 s after a retraction, the page shows it or marks its state as old.
+
+    A command without an answer says so.
+    """
+    types, heard = retracted
+    live, read = attached(types), "document.getElementById({!r}).textContent".format
+    site = panel.attached_site(live.view, Cell(scenario().nodes), SimpleNamespace(cannot={}, act=lambda *_: "done"))
+    with page_server.serving(site) as address, Chromium(tmp_path) as browser:
+        browser.open(address)
+        hear(live, heard[: len(heard) // 3])
+        browser.until(f"{read('safety')} == 'nominal' && {read('age')} == 'up to date'")
+        browser.run(RECORDED)
+        browser.call("Network.emulateNetworkConditions", **{**FREE, **link})
+        browser.run("document.getElementById('retract').disabled = false")
+        browser.click("#retract")
+        hear(live, heard[len(heard) // 3 :])
+        changed, answer = browser.run(CLOCK), "document.querySelector('#bar .answer').textContent"
+        if "downloadThroughput" not in link:
+            said = "no answer: has lathe panel ended?" if "offline" in link else "sent; no answer yet"
+            browser.until(f"{answer} == '{said}' && {read('safety')}.startsWith('nominal, no answer from lathe panel')")
+        if "offline" in link:
+            browser.call("Network.emulateNetworkConditions", **FREE)
+        browser.until(f"{read('safety')}.startsWith('safe')", 120.0)
+        shown = browser.run("recorded")
+        ends = [*(begin for begin, *_ in shown[1:]), browser.run(CLOCK)]
+        unmarked = [
+            end - changed for end, (_, state, old) in zip(ends, shown, strict=True) if state == "nominal" and not old
+        ]
+        assert max(unmarked) < 5.5, shown
+        if "offline" not in link:
+            browser.until(f"{answer}.endsWith('done')", 120.0)
+            assert [line for line in browser.told if "readback" not in line] == []
+
+
 RED = """(() => {
   const place = document.getElementById('timeline'), { width, height } = place;
   const { data } = place.getContext('2d').getImageData(0, 0, width, height), columns = new Set();
@@ -203,9 +254,10 @@ def press(browser, key, **more):
 def test_a_spike_of_one_sample_in_a_long_bag_is_found_in_the_timeline_and_by_keyboard(tmp_path, monkeypatch):
     """Its red mark is the only one after the first revolutions; a click there shows it, and keys keep the focus."""
     harness.run(scenario("supervised", 800), bag=tmp_path / "bag")
-    monkeypatch.setattr(panel_player, "read_bag", spiked(tmp_path / "bag", 2_000_123, 40e-6))
+    monkeypatch.setattr(panel_player, "pieces", spiked(2_000_123, 40e-6))
     player = Player(tmp_path / "bag")
-    turn = int(player._angle[2_000_123] / (2 * np.pi))
+    angle = lathe_rc.read_bag(tmp_path / "bag").of_type(messages.ENCODER)["angle_true"]
+    turn = int(angle[2_000_123] / (2 * np.pi))
     with (
         Driver(player, 0.0) as driver,
         page_server.serving(panel.player_site(driver, player)) as address,

@@ -14,7 +14,7 @@ from shown_page import ShownPage
 
 from lathe_rc import harness
 from lathe_rc.analysis.tolerance import judge
-from lathe_rc.drawing.charts import Charts
+from lathe_rc.drawing.charts import Charts, chart, rows
 from lathe_rc.judge.part import Tolerances
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view.report_gather import gather
@@ -77,6 +77,18 @@ def test_the_strip_tells_the_verdict_of_any_tolerance(compared, tolerance, doubt
         since = judge(result.part.form.largest, tolerance * 1e-6, doubt=compared.forms[name].tolerances.doubt).since
         told = f"within the tolerance from revolution {since} on" if since else "not within the tolerance at the end"
         assert re.search(f">{name}: {told}<", drawn)
+
+
+def test_a_static_picture_stays_small_however_many_marks_it_has():
+    """A few are drawn as SVG, many as JPEG, so that a page is smaller than 3 MB whatever the run."""
+    for count, kind in ((100, "svg+xml"), (20_000, "jpeg")):
+        data = {"values": rows(x=np.arange(count), y=np.random.default_rng(1).standard_normal(count))}
+        encoding = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
+        charts = Charts()
+        (place,) = charts.place([chart(200, data=data, mark="line", encoding=encoding)])
+        picture = charts.picture(place, 1)
+        assert picture.startswith(f"data:image/{kind};base64,")
+        assert len(picture) < 300_000
 
 
 def test_a_scenario_runs_first_and_nodes_that_only_it_has_are_folded(compared, tmp_path):

@@ -99,6 +99,7 @@ class _Mcap:
         self._budget = Budget(self._size)
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, ChannelRecord] = {}
+        self._channel_sets: dict[bytes, frozenset[int]] = {}
         self._counts = np.zeros(_NUMBERS, np.int64)  # messages by channel
         self._announced: set[bytes] = set()
         self._announcements = self._described = 0
@@ -207,8 +208,10 @@ class _Mcap:
         if start < MAGIC or start + length > end or max(length, size) > MOST_BYTES or packed > length:
             raise ValueError(f"the index has a chunk of {length} B ({size} unpacked) at byte {start}: none can be")
         self._budget.take(size)
-        channels = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
-        return _Records(first_ns, last_ns, size, frozenset(channels.tolist()), self._path, start, length, in_chunk=True)
+        found = np.frombuffer(content, _PLACE, places // _PLACE.itemsize, _INDEX.size)["channel"]
+        # Hours of a cell have tens of thousands of chunks, nearly all of the same channels: one set serves them all.
+        channels = self._channel_sets.setdefault(found.tobytes(), frozenset(found.tolist()))
+        return _Records(first_ns, last_ns, size, channels, self._path, start, length, in_chunk=True)
 
     # ---- whole file ----------------------------------------------------------------------------------
 
