@@ -198,9 +198,8 @@ def test_each_name_compiles_or_is_refused(tmp_path):
 
 
 # Of MISRA C:2012, which has mandatory, required and advisory rules.
-ADVISORY = {"2.3", "2.4", "2.5", "2.6", "2.7", "4.2", "5.9", "8.7", "8.9", "8.11", "8.13", "10.5", "11.4", "11.5",
-            "12.1", "12.3", "12.4", "13.3", "13.4", "15.1", "15.4", "15.5", "17.5", "17.8", "18.4", "18.5", "19.2", "20.1",
-            "20.5", "20.10", "21.12"}  # fmt: skip
+ADVISORY = """2.3 2.4 2.5 2.6 2.7 4.2 5.9 8.7 8.9 8.11 8.13 10.5 11.4 11.5 12.1 12.3 12.4 13.3 13.4 15.1 15.4 15.5 17.5
+17.8 18.4 18.5 19.2 20.1 20.5 20.10 21.12"""
 
 
 def test_the_page_lists_the_rules_of_misra_that_laws_break(tmp_path):
@@ -215,5 +214,5 @@ def test_the_page_lists_the_rules_of_misra_that_laws_break(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
     section = re.search(r"## MISRA C\n(.*?)\n## ", page, re.DOTALL)[1]
     listed = [rule for row in re.findall(r"^\| ([\d., ]+) \|", section, re.MULTILINE) for rule in row.split(", ")]
-    assert set(listed) == broken - ADVISORY
+    assert set(listed) == broken - {*ADVISORY.split()}
     assert len(listed) == len(set(listed))
