@@ -49,6 +49,7 @@ rebuild_cache fmu unsupported words
 """
 _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
 KERNELS = "kernels.h"
+_COMPILERS = {"linux64": (("cc", "gcc"), "gcc"), "win64": (("x86_64-w64-mingw32-gcc",), "gcc-mingw-w64-x86-64")}
 
 
 def context(library: Library, scenario: str) -> dict[str, Any]:
@@ -187,15 +188,16 @@ def export_nodes(
     return Exported(place, library, reference)
 
 
-def compiler(needed_for: str) -> str:
-    """Return the C compiler of the machine.
+def compiler(needed_for: str, platform: str = "linux64") -> str:
+    """Return the C compiler of the machine for a platform.
 
     Raises:
         LatheError: there is none.
     """
-    if found := shutil.which("cc") or shutil.which("gcc"):
+    names, package = _COMPILERS[platform]
+    if found := next(filter(None, map(shutil.which, names)), None):
         return found
-    raise LatheError(f"no C compiler (cc or gcc) {needed_for}; allowed: apt install gcc")
+    raise LatheError(f"no C compiler ({' or '.join(names)}) {needed_for}; allowed: apt install {package}")
 
 
 def _loss(place: Path) -> str:

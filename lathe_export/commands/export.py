@@ -112,6 +112,14 @@ def _tell(library: "Library", left_out: str) -> None:
 @click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: NAME.fmu, here")
 @click.option("--fmi", type=click.Choice(["2", "3"]), default="3", show_default=True, help="version of FMI: 2.0 or 3.0")
 @click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@click.option(
+    "--platform",
+    multiple=True,
+    default=("linux64",),
+    show_default=True,
+    type=click.Choice(["linux64", "win64"]),
+    help="of a binary; win64 needs the compiler mingw-w64; repeatable",
+)
 @options.allow_code
 def fmu(
     nodes: tuple[str, ...], scenario: str, overrides: tuple[str, ...], output: Path | None, fmi: str, **how: Any
