@@ -19,6 +19,7 @@ from lathe_rc.errors import InputError
 
 pytestmark = pytest.mark.system
 
+LEVELS = (("-std=c99", "-O0"), ("-std=c11", "-O1"), ("-std=c17", "-O2"), ("-std=c11", "-O3"))
 SAMPLES = 200_000  # beyond the event of each scenario that has one
 #: scenarios that Python changes beside the steps, with what they are refused for
 REFUSED = {
@@ -80,7 +81,7 @@ def test_each_cell_has_the_bits_of_the_engine(path, tmp_path):
 
 @pytest.mark.timeout(1500)
 def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
-    """One of each different compiled step that the scenarios have; by GCC and Clang, as C99 and C11, at -O0 and -O3."""
+    """One of each different compiled step that the scenarios have; by GCC and Clang, as C99 to C17, at all levels."""
     steps = {}
     for path in SCENARIOS:
         for name, stage in Cell(load(path).nodes).stages.items() if path.stem not in REFUSED else ():
@@ -88,7 +89,7 @@ def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
     assert len(steps) >= 25
     for number, (path, name) in enumerate(some([*steps.values()], 4)):
         exported = export_nodes(load(path), [name], tmp_path / str(number), name="alone", samples=20_000)
-        for compiler, flags in product(("gcc", "clang"), (("-std=c99", "-O0"), ("-std=c11", "-O3"))):
+        for compiler, flags in product(("gcc", "clang"), LEVELS):
             told(exported, built(exported.place, *flags, compiler=compiler))
 
 
