@@ -23,7 +23,7 @@ from lathe_export.c_library.library import Library
 from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc import __version__, extras
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.fmi.units import BASE, powers
 
 with extras.named():
@@ -119,8 +119,7 @@ def export_fmu(
     """
     library = sources.library_of(scenario, nodes, name, block=1, tune=tune)
     place = place or Path(f"{library.name}.fmu")
-    if place.exists() or not place.absolute().parent.is_dir():
-        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new file in a folder that exists")
+    sources.check_new(place, "file")
     compilers = {each: sources.compiler("builds the FMU", each) for each in platform}
     made = _files(library, scenario.name, fmi)
     try:
@@ -170,8 +169,8 @@ def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     compiled = [each for each in code if each.endswith(".c")]
     found = {f"sources/{each}": text for each, text in (code | headers).items()}
     if fmi == 3:
-        found["sources/buildDescription.xml"] = _text(_build_description(library.name, compiled))
-    return found | {"modelDescription.xml": _text(_model(library, scenario, fmi, token, compiled))}
+        found["sources/buildDescription.xml"] = xml_text(_build_description(library.name, compiled))
+    return found | {"modelDescription.xml": xml_text(_model(library, scenario, fmi, token, compiled))}
 
 
 def _composed(code: str, fmi: int) -> set[str]:
@@ -271,6 +270,7 @@ def _build_description(name: str, compiled: Sequence[str]) -> ET.Element:
     return root
 
 
-def _text(root: ET.Element) -> str:
+def xml_text(root: ET.Element) -> str:
+    """Return an XML file."""
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'

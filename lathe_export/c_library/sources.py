@@ -169,8 +169,7 @@ def export_nodes(
     library = library_of(scenario, nodes, name, block, tune, real)
     name = library.name
     place = place or Path(f"{name}-c")
-    if place.exists() or not place.absolute().parent.is_dir():
-        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
+    check_new(place, "folder")
     texts = sources(library, scenario.name)
     reference = Reference(library, Cell(scenario.nodes), samples)
     try:
@@ -186,6 +185,16 @@ def export_nodes(
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror})") from None
     return Exported(place, library, reference)
+
+
+def check_new(place: Path, what: str) -> None:
+    """Check that a file or folder can be made at a place.
+
+    Raises:
+        InputError: it exists, or its parent folder does not.
+    """
+    if place.exists() or not place.absolute().parent.is_dir():
+        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new {what} in a folder that exists")
 
 
 def compiler(needed_for: str, platform: str = "linux64") -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries or FMUs."""
+"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries, FMUs or SSP."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,3 +133,19 @@ def fmu(
     exported = ", ".join(part.stage.name for part in library.parts)
     counts = f"{len(library.inputs)} inputs, {len(library.outputs)} outputs, {len(library.parameters)} parameters"
     click.echo(f"{place}: {exported}; {counts}, a step of {library.step:.9g} s")
+
+
+@export.command()
+@click.option("--scenario", required=True, shell_complete=completers.scenarios, help="whose tables the nodes have")
+@options.overrides
+@click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: SCENARIO.ssp, here")
+@options.allow_code
+def ssp(scenario: str, overrides: tuple[str, ...], output: Path | None) -> None:
+    """Export the cell of a scenario as connected FMUs, one for each stage (SSP 1.0, FMI 2.0)."""
+    from lathe_export.c_library.ssp import connections, export_ssp
+    from lathe_rc.commands import scenario as scenarios
+
+    place, libraries = export_ssp(scenarios.load(scenario, overrides), output)
+    for line in (line for library in libraries.values() for line in library.left_out):
+        click.echo(f"warning: not in the system, the importer has to cause it: {line}", err=True)
+    click.echo(f"{place}: {len(connections(libraries))} connections; step in this order: {', '.join(libraries)}")
