@@ -61,7 +61,12 @@ def bag(ctx: click.Context, bag: Path, kinds: tuple[str, ...], output: Path | No
 @click.option("--name", help="of the library, a C identifier; default: that of the node or, if several, the scenario")
 @click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-c, here")
 @click.option("--block", type=int, help="most samples in a call, and the delay of fed-back inputs; default: block_size")
-@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@click.option(
+    "--tune",
+    multiple=True,
+    metavar="NODE[.PARAM]",
+    help="a further parameter that may be changed, or all of a node that can; repeatable",
+)
 @click.option(
     "--real",
     type=click.Choice(["double", "float"]),
@@ -111,7 +116,12 @@ def _tell(library: "Library", left_out: str) -> None:
 @click.option("--name", help="of the model, a C identifier; default: that of the node or, if several, the scenario")
 @click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: NAME.fmu, here")
 @click.option("--fmi", type=click.Choice(["2", "3"]), default="3", show_default=True, help="version of FMI: 2.0 or 3.0")
-@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@click.option(
+    "--tune",
+    multiple=True,
+    metavar="NODE[.PARAM]",
+    help="a further parameter that may be changed, or all of a node that can; repeatable",
+)
 @click.option(
     "--platform",
     multiple=True,
