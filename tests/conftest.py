@@ -89,7 +89,14 @@ def pytest_collection():
 
 
 #: files of system tests that take a minute or more; docs/tests.md has the others' shares
-LONGEST = ("test_wheel", "test_simulation_services", "test_schedules", "test_c_libraries", "test_panel_browser")
+LONGEST = (
+    "test_wheel",
+    "test_simulation_services",
+    "test_schedules",
+    "test_c_libraries",
+    "test_c_coverage",
+    "test_panel_browser",
+)
 
 _ended_a_worker = []  # tests; the worker in its place would run them again
 

@@ -193,8 +193,9 @@ class Expressions:
         if left == 3 and not isinstance(places[0], ast.Slice):
             text, places, left = f"{short}_plane({text}, {self._index(places[0], f'{text}.planes')})", places[1:], 2
         if left == 2 and len(places) == 2 and not any(isinstance(place, ast.Slice) for place in places):
-            row, column = self._index(places[0], f"{text}.rows"), self._index(places[1], f"{text}.columns")
-            return f"{text}.data[{row if row.isalnum() else f'({row})'} * {text}.columns + {column}]", _ATOM
+            row, column = self._index(places[0], f"{text}.rows", 13), self._index(places[1], f"{text}.columns", 12)
+            begin = {"0": "", "1": f"{text}.columns"}.get(row, f"{row} * {text}.columns")
+            return f"{text}.data[{' + '.join(part for part in (begin, column) if part not in ('', '0')) or 0}]", _ATOM
         if left == 2 and places and not isinstance(places[0], ast.Slice):
             text, places, left = f"{short}_row({text}, {self._index(places[0], f'{text}.rows')})", places[1:], 1
         if not places:
@@ -223,12 +224,12 @@ class Expressions:
             return f"{text}.part[{self.text(index)}]"
         return f"{text}.{owner.part(place % len(owner.parts))}"
 
-    def _index(self, node: ast.expr, size: str) -> str:
-        """Return an index; one that may be below 0 counts from the end."""
+    def _index(self, node: ast.expr, size: str, least: int = LEAST) -> str:
+        """Return an index, as `text`; one that may be below 0 counts from the end."""
         value = self._types.constant(node)
         if isinstance(value, int) and value < 0:
-            return f"{size} - {-value}"
-        return self.text(node) if self._types.is_positive(node) else f"at({self.text(node)}, {size})"
+            return f"({size} - {-value})" if least > LEAST else f"{size} - {-value}"
+        return self.text(node, least) if self._types.is_positive(node) else f"at({self.text(node)}, {size})"
 
     def _print_call(self, node: ast.Call) -> tuple[str, int]:
         if (called := self._types.called(node)) is not None:

@@ -146,7 +146,8 @@ class CFunction:
             return
         made = [each for each in getattr(node.value, "args", ()) if self.types.takes_memory(each)]
         if not made:
-            yield f"{self._in_c.text(node.value)};"
+            unused = "" if self.types.kind(node.value) == NONE else "(void)"
+            yield f"{unused}{self._in_c.text(node.value)};"
             return
         assert isinstance(node.value, ast.Call), "it has arguments"
         yield "{"

@@ -23,22 +23,31 @@ from lathe_export.c_library.library import Library
 from lathe_export.c_library.templates import TEMPLATES
 from lathe_rc import __version__, extras
 from lathe_rc.cell.scenario import Scenario
-from lathe_rc.errors import InputError, LatheError, shown
+from lathe_rc.errors import LatheError, shown
 from lathe_rc.fmi.units import BASE, powers
 
 with extras.named():
     import fmpy
     from fmpy import validation
 
-_PLATFORMS = {2: "linux64", 3: "x86_64-linux"}  # folder of the binary, by version of FMI
+# Of each platform, the folders of the binary by version of FMI, the end of its name, and flags of the compiler.
+_PLATFORMS: dict[str, tuple[dict[int, str], str, Sequence[str]]] = {
+    "linux64": ({2: "linux64", 3: "x86_64-linux"}, "so", ("-fPIC", "-fvisibility=hidden", "-Wl,-Bsymbolic")),
+    "win64": ({2: "win64", 3: "x86_64-windows"}, "dll", ("-static-libgcc", "-D__USE_MINGW_ANSI_STDIO=1")),
+}
 _HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
 # Functions for integers: name, C type, and whether they are for octets and for whole parameters.
 _INTEGERS = {2: [("Integer", "fmi2Integer", 1, 1)], 3: [("UInt8", "fmi3UInt8", 1, 0), ("Int32", "fmi3Int32", 0, 1)]}
-_FLAGS = ("-shared", "-fPIC", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-Wl,-Bsymbolic")
+_FLAGS = ("-shared", "-O2", "-ffp-contract=off")
 _DECLARED = re.compile(r"FMI[23]_Export\s+\w+TYPE\s+(\w+);")
+_EXPORTED = """#ifdef _WIN32
+#define EXPORTED __declspec(dllexport)
+#else
+#define EXPORTED __attribute__((visibility("default")))
+#endif"""
 _BESIDE = ("main.c", "CMakeLists.txt", "README.md")  # files of a library that an FMU does not need
 
 
@@ -88,6 +97,7 @@ def export_fmu(
     fmi: int = 3,
     name: str | None = None,
     tune: Sequence[str] = (),
+    platform: Sequence[str] = ("linux64",),
 ) -> tuple[Path, Library]:
     """Write stages of a scenario as an FMU.
 
@@ -98,6 +108,7 @@ def export_fmu(
         fmi: version of FMI, 2 or 3.
         name: name of the model; None: that of the only node or of the scenario.
         tune: see `lathe_export.c_library.library.Library`.
+        platform: platforms of the binaries, ``linux64`` or ``win64``.
 
     Returns:
         The file, and the stages as a library.
@@ -108,9 +119,8 @@ def export_fmu(
     """
     library = sources.library_of(scenario, nodes, name, block=1, tune=tune)
     place = place or Path(f"{library.name}.fmu")
-    if place.exists() or not place.absolute().parent.is_dir():
-        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new file in a folder that exists")
-    compiler = sources.compiler("builds the FMU")
+    sources.check_new(place, "file")
+    compilers = {each: sources.compiler("builds the FMU", each) for each in platform}
     made = _files(library, scenario.name, fmi)
     try:
         with tempfile.TemporaryDirectory(dir=place.absolute().parent) as folder:
@@ -118,14 +128,8 @@ def export_fmu(
             for file, text in made.items():
                 (new / file).parent.mkdir(parents=True, exist_ok=True)
                 (new / file).write_text(text, encoding="utf-8")
-            binary = new / "binaries" / _PLATFORMS[fmi] / f"{library.name}.so"
-            binary.parent.mkdir(parents=True)
-            parts = sorted((new / "sources").glob("*.c"))
-            built = subprocess.run(
-                [compiler, *_FLAGS, "-o", binary, *parts, "-lm"], capture_output=True, text=True, check=False
-            )
-            if built.returncode:
-                raise LatheError(f"{compiler} cannot build the FMU: {shown(built.stderr)}")
+            for each, compiler in compilers.items():
+                _build(compiler, new, each, fmi, library.name)
             archive = Path(folder) / "archive"
             with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file_of:
                 for path in sorted(new.rglob("*.*")):
@@ -137,6 +141,18 @@ def export_fmu(
     except OSError as error:
         raise LatheError(f"{place}: cannot be written ({error.strerror})") from None
     return place, library
+
+
+def _build(compiler: str, content: Path, platform: str, fmi: int, name: str) -> None:
+    """Compile the sources of an FMU into its binary for a platform."""
+    folders, end, flags = _PLATFORMS[platform]
+    binary = content / "binaries" / folders[fmi] / f"{name}.{end}"
+    binary.parent.mkdir(parents=True)
+    parts = sorted((content / "sources").glob("*.c"))
+    command = [compiler, *_FLAGS, *flags, "-o", str(binary), *map(str, parts), "-lm"]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    if built.returncode:
+        raise LatheError(f"{compiler} cannot build the FMU: {shown(built.stderr)}")
 
 
 def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
@@ -153,8 +169,8 @@ def _files(library: Library, scenario: str, fmi: int) -> dict[str, str]:
     compiled = [each for each in code if each.endswith(".c")]
     found = {f"sources/{each}": text for each, text in (code | headers).items()}
     if fmi == 3:
-        found["sources/buildDescription.xml"] = _text(_build(library.name, compiled))
-    return found | {"modelDescription.xml": _text(_model(library, scenario, fmi, token, compiled))}
+        found["sources/buildDescription.xml"] = xml_text(_build_description(library.name, compiled))
+    return found | {"modelDescription.xml": xml_text(_model(library, scenario, fmi, token, compiled))}
 
 
 def _composed(code: str, fmi: int) -> set[str]:
@@ -167,12 +183,10 @@ def _composed(code: str, fmi: int) -> set[str]:
 
 def _unsupported(names: Sequence[str]) -> str:
     """Return the functions of the standard that an FMU must have and does not support; declared without a header."""
-    lines = ["/* Functions of the standard that this FMU does not support: an error, or no instance. */"]
+    lines = ["/* Functions of the standard that this FMU does not support: an error, or no instance. */", _EXPORTED]
     for name in names:
         kind, value = ("void *", "0") if "Instantiate" in name else ("int ", "3")
-        lines.append(
-            f'__attribute__((visibility("default"))) {kind}{name}(void);\n{kind}{name}(void) {{ return {value}; }}'
-        )
+        lines.append(f"EXPORTED {kind}{name}(void);\n{kind}{name}(void) {{ return {value}; }}")
     return "\n".join(lines) + "\n"
 
 
@@ -246,7 +260,7 @@ def _variable(each: Variable, reference: int, fmi: int) -> ET.Element:
     return variable
 
 
-def _build(name: str, compiled: Sequence[str]) -> ET.Element:
+def _build_description(name: str, compiled: Sequence[str]) -> ET.Element:
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     files = ET.SubElement(
         ET.SubElement(root, "BuildConfiguration", modelIdentifier=name), "SourceFileSet", language="C11"
@@ -256,6 +270,7 @@ def _build(name: str, compiled: Sequence[str]) -> ET.Element:
     return root
 
 
-def _text(root: ET.Element) -> str:
+def xml_text(root: ET.Element) -> str:
+    """Return an XML file."""
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'

@@ -7,7 +7,7 @@ its table, which hold addresses, and room for temporary arrays. ``lathe.c`` runs
 `lathe_export.c_library.sources` writes its tables. No size depends on the processor: those of addresses are bounds.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from math import inf, nextafter
@@ -160,8 +160,8 @@ class Library:
         nodes: names of the stages; all others of the cell give inputs.
         name: name of the library, a C identifier.
         block: largest number of samples in a call.
-        tune: further parameters that the caller may change, as NODE.PARAM; those that the event ``set`` may change and
-            whose values the step reads are always among them.
+        tune: further parameters that the caller may change, as NODE.PARAM, or a NODE for all whose values its step
+            reads as they are; those that the event ``set`` may change are always among them.
         real: type of real numbers in C, ``double`` or ``float``.
 
     Attributes:
@@ -174,7 +174,8 @@ class Library:
         room: offset of the room for temporary arrays [B].
         size: size of the block [B].
         left_out: events and faults of the scenario, which the caller has to cause; one line each.
-        fixed: parameters that the event ``set`` may change, and whose values the step does not read as they are.
+        fixed: other parameters of nodes in ``tune``, and those that the event ``set`` may change, whose values the step
+            does not read as they are, with the members of its memory that depend on them.
 
     Raises:
         InputError: a stage is unknown or needs Python, a stage that is left out lies between two others, the block is
@@ -194,7 +195,7 @@ class Library:
     tapes: list[Tape] = field(default_factory=list)
     streams: list[Stream] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    fixed: list[str] = field(default_factory=list)
+    fixed: dict[str, list[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = self.cell.stages
@@ -219,7 +220,7 @@ class Library:
             memory = self._append(8 * max(part.stage.native().view.size, 1))
             self.parts[place] = replace(part, memory=memory, table=self._append(8 * len(part.reads)))
         for name in self.tune:
-            if name not in {parameter.name for parameter in self.parameters}:
+            if name not in {*self.nodes, *(parameter.name for parameter in self.parameters)}:
                 node, _, parameter = name.partition(".")
                 if node not in self.nodes or parameter not in type(known[node].shared).rows():
                     raise InputError(f"--tune {name}; allowed: NODE.PARAM of {', '.join(sorted(self.nodes))}")
@@ -355,12 +356,12 @@ class Library:
         found = {name: [(paths[address(array)], index)] for name, (array, index) in stage.handles.items()}
         asked = [name.partition(".")[2] for name in self.tune if name.partition(".")[0] == stage.name]
         rows = type(stage.shared).rows()
-        for name in dict.fromkeys((*stage.tunable, *asked)):
-            row = rows.get(name)
-            if row and row.type is float and not row.is_list and (places := _places(stage, name)):
+        numbers = [name for name, row in rows.items() if row.type is float and not row.is_list]
+        for name in dict.fromkeys((*stage.tunable, *asked, *(numbers if stage.name in self.tune else ()))):
+            if name in numbers and (places := _places(stage, name)):
                 found[name] = places
-            else:
-                self.fixed.append(f"{stage.name}.{name}")
+            elif (members := _members(stage, name) if name in numbers else []) or name in stage.tunable:
+                self.fixed[f"{stage.name}.{name}"] = members
         return found
 
     def _parameter(self, stage: Stage, name: str, places: Sequence[int]) -> Parameter:
@@ -420,21 +421,37 @@ def _range(msgtype: str, name: str) -> tuple[float, float]:
     return -bound, bound
 
 
-def _places(stage: Stage, name: str) -> list[Place]:
-    """Return the numbers in a stage's memory that a parameter is stored as, as it is; empty if it acts elsewhere."""
-    value, found = getattr(stage.shared, name), list[list[Place]]()
+def _changes(stage: Stage, name: str) -> Iterator[tuple[float, Stage]]:
+    """Yield other values of a parameter, each with the stage that has it."""
+    value = getattr(stage.shared, name)
     for other in (value * 0.75, value * 1.25, value + 0.125, 0.375):
         try:
             changed = type(stage)(stage.name, stage.shared.changed(stage.name, {name: other}))
-        except InputError:
+        except LatheError:
             continue
-        if other == value:
-            continue
+        if other != value:
+            yield other, changed
+
+
+def _places(stage: Stage, name: str) -> list[Place]:
+    """Return the numbers in a stage's memory that a parameter is stored as, as it is; empty if it acts elsewhere."""
+    found = list[list[Place]]()
+    for other, changed in _changes(stage, name):
         places = _differences(stage.memory, changed.memory, other)
         if places is None:
             return []
         found.append(places)
     return found[0] if len(found) > 1 and all(each == found[0] for each in found) else []
+
+
+def _members(stage: Stage, name: str) -> list[str]:
+    """Return the members of a stage's memory that depend on a parameter."""
+    known, found = dict(leaves(stage.memory)), dict[str, None]()
+    for _, changed in _changes(stage, name):
+        new = dict(leaves(changed.memory))
+        same = {path for path in new if path in known and np.array_equal(known[path], new[path], equal_nan=True)}
+        found |= dict.fromkeys(".".join(path) for path in known if path not in same)
+    return list(found)
 
 
 def _differences(memory: tuple[Any, ...], changed: tuple[Any, ...], value: float) -> list[Place] | None:

@@ -49,6 +49,7 @@ rebuild_cache fmu unsupported words
 """
 _FIXED = ("lathe.h", "lathe.c", "main.c", "CMakeLists.txt", "README.md")
 KERNELS = "kernels.h"
+_COMPILERS = {"linux64": (("cc", "gcc"), "gcc"), "win64": (("x86_64-w64-mingw32-gcc",), "gcc-mingw-w64-x86-64")}
 
 
 def context(library: Library, scenario: str) -> dict[str, Any]:
@@ -170,8 +171,7 @@ def export_nodes(
     library = library_of(scenario, nodes, name, block, tune, real)
     name = library.name
     place = place or Path(f"{name}-c")
-    if place.exists() or not place.absolute().parent.is_dir():
-        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new folder in one that exists")
+    check_new(place, "folder")
     texts = sources(library, scenario.name) | further(library, scenario.name)
     reference = Reference(library, Cell(scenario.nodes), samples)
     try:
@@ -189,15 +189,26 @@ def export_nodes(
     return Exported(place, library, reference)
 
 
-def compiler(needed_for: str) -> str:
-    """Return the C compiler of the machine.
+def check_new(place: Path, what: str) -> None:
+    """Check that a file or folder can be made at a place.
+
+    Raises:
+        InputError: it exists, or its parent folder does not.
+    """
+    if place.exists() or not place.absolute().parent.is_dir():
+        raise InputError(f"{place}: exists, or has no parent folder; allowed: a new {what} in a folder that exists")
+
+
+def compiler(needed_for: str, platform: str = "linux64") -> str:
+    """Return the C compiler of the machine for a platform.
 
     Raises:
         LatheError: there is none.
     """
-    if found := shutil.which("cc") or shutil.which("gcc"):
+    names, package = _COMPILERS[platform]
+    if found := next(filter(None, map(shutil.which, names)), None):
         return found
-    raise LatheError(f"no C compiler (cc or gcc) {needed_for}; allowed: apt install gcc")
+    raise LatheError(f"no C compiler ({' or '.join(names)}) {needed_for}; allowed: apt install {package}")
 
 
 def _loss(place: Path) -> str:

@@ -101,7 +101,7 @@ class StepMemory:
         yield from (f"state->{name} = {number(value)};" for name, value in self._numbers.items())
         for name, part in self._arrays.items():
             if part.any():
-                yield f"memcpy(state->{name}, start_{name}, sizeof start_{name});"
+                yield f"(void)memcpy(state->{name}, start_{name}, sizeof start_{name});"
 
     def members(self) -> Iterator[str]:
         """Yield the lines of the initialiser of the memory: constants, and addresses of tables and state."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command group ``lathe export``: signals of a bag as tables, and stages as C libraries, FMUs or components of HAL."""
+"""Command group ``lathe export``: signals of a bag as tables; stages as C libraries, FMUs, SSP or components of HAL."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,13 @@ from lathe_rc.errors import InputError, LossyRunError
 
 if TYPE_CHECKING:
     from lathe_export.c_library.library import Library
+
+_TUNE = click.option(
+    "--tune",
+    multiple=True,
+    metavar="NODE[.PARAM]",
+    help="a further parameter that may be changed, or all of a node that can; repeatable",
+)
 
 
 @click.group(cls=options.GroupWithDefault, default="bag")
@@ -61,7 +68,7 @@ def bag(ctx: click.Context, bag: Path, kinds: tuple[str, ...], output: Path | No
 @click.option("--name", help="of the library, a C identifier; default: that of the node or, if several, the scenario")
 @click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-c, here")
 @click.option("--block", type=int, help="most samples in a call, and the delay of fed-back inputs; default: block_size")
-@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@_TUNE
 @click.option(
     "--real",
     type=click.Choice(["double", "float"]),
@@ -111,7 +118,15 @@ def _tell(library: "Library", left_out: str) -> None:
 @click.option("--name", help="of the model, a C identifier; default: that of the node or, if several, the scenario")
 @click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: NAME.fmu, here")
 @click.option("--fmi", type=click.Choice(["2", "3"]), default="3", show_default=True, help="version of FMI: 2.0 or 3.0")
-@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@_TUNE
+@click.option(
+    "--platform",
+    multiple=True,
+    default=("linux64",),
+    show_default=True,
+    type=click.Choice(["linux64", "win64"]),
+    help="of a binary; win64 needs the compiler mingw-w64; repeatable",
+)
 @options.allow_code
 def fmu(
     nodes: tuple[str, ...], scenario: str, overrides: tuple[str, ...], output: Path | None, fmi: str, **how: Any
@@ -133,7 +148,7 @@ def fmu(
 @options.overrides
 @click.option("--name", help="of the component, a C identifier; default: that of the node")
 @click.option("-o", "--output", type=options.PATH, help="folder to make; must not exist; default: NAME-hal, here")
-@click.option("--tune", multiple=True, metavar="NODE.PARAM", help="a further parameter that may be changed; repeatable")
+@_TUNE
 @options.allow_code
 def hal(node: str, scenario: str, overrides: tuple[str, ...], output: Path | None, **how: Any) -> None:
     """Export a NODE of a scenario as a component for HAL, the hardware layer of LinuxCNC."""
@@ -144,3 +159,19 @@ def hal(node: str, scenario: str, overrides: tuple[str, ...], output: Path | Non
     _tell(done.library, "not in the component, HAL has to cause it")
     click.echo(f"{done.place}: {node}, {done.library.step * 1e9:.9g} ns a sample; state of {done.library.size} bytes")
     click.echo(f"next: cd {done.place} && make && sudo make install")
+
+
+@export.command()
+@click.option("--scenario", required=True, shell_complete=completers.scenarios, help="whose tables the nodes have")
+@options.overrides
+@click.option("-o", "--output", type=options.PATH, help="file to make; must not exist; default: SCENARIO.ssp, here")
+@options.allow_code
+def ssp(scenario: str, overrides: tuple[str, ...], output: Path | None) -> None:
+    """Export the cell of a scenario as connected FMUs, one for each stage (SSP 1.0, FMI 2.0)."""
+    from lathe_export.c_library.ssp import connections, export_ssp
+    from lathe_rc.commands import scenario as scenarios
+
+    place, libraries = export_ssp(scenarios.load(scenario, overrides), output)
+    for line in (line for library in libraries.values() for line in library.left_out):
+        click.echo(f"warning: not in the system, the importer has to cause it: {line}", err=True)
+    click.echo(f"{place}: {len(connections(libraries))} connections; step in this order: {', '.join(libraries)}")

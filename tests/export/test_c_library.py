@@ -117,6 +117,22 @@ def test_a_changed_parameter_acts_as_in_the_engine(law, tmp_path):
     assert found[: first + 64].tobytes() == wanted[: first + 64].tobytes()
 
 
+def test_all_parameters_of_a_node_that_its_step_reads_can_be_tuned(tmp_path):
+    """A drive takes another resolution as the engine does; the README tells by which members the others act."""
+    node = "electrodynamic_actuator"
+    changed = export_nodes(scenario(**{node: {"resolution": 1e-7}}), [node], tmp_path / "changed", name="drive")
+    (command,) = [changed.reference.signal(each) for each in changed.library.inputs]
+    plain = export_nodes(scenario(), [node], tmp_path / "plain", name="drive", tune=[node], samples=1)
+    made, found = Loaded(plain.place, plain.library.size), np.zeros((4, command.size))
+    assert made.set(f"{node}.resolution", 1e-7) == DONE
+    for first in range(0, command.size // 64 * 64, 64):
+        assert made.step([command], [*found], first, 64) == DONE
+    for signal, values in zip(changed.library.outputs, found, strict=True):
+        assert values[: first + 64].tobytes() == changed.reference.signal(signal)[: first + 64].tobytes()
+    readme = (plain.place / "README.md").read_text(encoding="utf-8")
+    assert f"- `{node}.damping`: plant.drive.transition, plant.drive.weights, plant.drive.damper\n" in readme
+
+
 def test_calls_that_do_not_fit_are_refused(law):
     made = Loaded(law.place, law.library.size)
     assert made.c.lathe_init(made.cell, ctypes.c_void_p(made.block.value + 8)) == REFUSED

@@ -68,6 +68,13 @@ def places(values, out):
 
 
 @kernel
+def rows(table, out):
+    out[0] = table[0, 0] + table[0, 2] + table[1, 0] + table[1, out.size & 3]
+    for k in range(8):
+        out[k] = table[k & 1, k & 3]
+
+
+@kernel
 def loops(values, out):
     end, last = 3, 0
     for k in range(end):
@@ -178,6 +185,13 @@ def test_a_printed_kernel_has_the_bits_of_the_compiled_one(made, tmp_path):
     assert found.tobytes() == expected.tobytes(), text
     assert head[0] == begin, "temporary arrays are given back"
     assert head[2] == 0
+
+
+def test_an_index_of_a_row_binds_as_it_does_in_python():
+    printer = Printer()
+    text = "\n".join(CFunction(printer.function(rows.py_func, [ArrayType(FLOAT, 2), REAL]), printer).body())
+    assert "table.data[0] + table.data[2] + table.data[table.columns] + table.data[table.columns + (" in text
+    assert "table.data[(k & 1) * table.columns + (k & 3)]" in text
 
 
 def test_nothing_is_written_once_the_memory_is_used_up(tmp_path):

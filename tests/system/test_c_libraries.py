@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every law, drive and cell of the scenarios as a C library; with CMake, valgrind, a sanitizer, and on 64-bit ARM."""
+"""Every law, drive and cell of the scenarios as a C library; with CMake, valgrind, sanitizers, cppcheck, on ARM."""
 
+import re
 import subprocess
 from itertools import product
 from pathlib import Path
@@ -18,6 +19,7 @@ from lathe_rc.errors import InputError
 
 pytestmark = pytest.mark.system
 
+LEVELS = (("-std=c99", "-O0"), ("-std=c11", "-O1"), ("-std=c17", "-O2"), ("-std=c11", "-O3"))
 SAMPLES = 200_000  # beyond the event of each scenario that has one
 #: scenarios that Python changes beside the steps, with what they are refused for
 REFUSED = {
@@ -79,7 +81,7 @@ def test_each_cell_has_the_bits_of_the_engine(path, tmp_path):
 
 @pytest.mark.timeout(1500)
 def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
-    """One of each different compiled step that the scenarios have; by GCC and Clang, as C99 and C11, at -O0 and -O3."""
+    """One of each different compiled step that the scenarios have; by GCC and Clang, as C99 to C17, at all levels."""
     steps = {}
     for path in SCENARIOS:
         for name, stage in Cell(load(path).nodes).stages.items() if path.stem not in REFUSED else ():
@@ -87,7 +89,7 @@ def test_each_stage_alone_has_the_bits_of_the_engine(tmp_path):
     assert len(steps) >= 25
     for number, (path, name) in enumerate(some([*steps.values()], 4)):
         exported = export_nodes(load(path), [name], tmp_path / str(number), name="alone", samples=20_000)
-        for compiler, flags in product(("gcc", "clang"), (("-std=c99", "-O0"), ("-std=c11", "-O3"))):
+        for compiler, flags in product(("gcc", "clang"), LEVELS):
             told(exported, built(exported.place, *flags, compiler=compiler))
 
 
@@ -194,3 +196,24 @@ def test_each_name_compiles_or_is_refused(tmp_path):
         told(exported, built(exported.place))
         compiled.append(name)
     assert compiled == ["stage_0", "law", "y"]
+
+
+# Of MISRA C:2012, which has mandatory, required and advisory rules.
+ADVISORY = """2.3 2.4 2.5 2.6 2.7 4.2 5.9 8.7 8.9 8.11 8.13 10.5 11.4 11.5 12.1 12.3 12.4 13.3 13.4 15.1 15.4 15.5 17.5
+17.8 18.4 18.5 19.2 20.1 20.5 20.10 21.12"""
+
+
+def test_the_page_lists_the_rules_of_misra_that_laws_break(tmp_path):
+    """The mandatory and required rules that cppcheck finds broken in two laws are those with a reason on the page."""
+    broken = set()
+    for name, node in (("piston", "learning_controller"), ("robust", "disturbance_controller")):
+        place = export_nodes(load(name), [node], tmp_path / name, block=1, samples=100).place
+        code = ["lathe.c", f"{node}.c", f"{node}_step.c"]
+        check = ["cppcheck", "--addon=misra", "--enable=style", "--std=c99", "--quiet", "--template={id}", *code]
+        told = subprocess.run(check, cwd=place, capture_output=True, text=True, check=True).stderr
+        broken |= set(re.findall(r"misra-c2012-([\d.]+)", told))
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
+    section = re.search(r"## MISRA C\n(.*?)\n## ", page, re.DOTALL)[1]
+    listed = [rule for row in re.findall(r"^\| ([\d., ]+) \|", section, re.MULTILINE) for rule in row.split(", ")]
+    assert set(listed) == broken - {*ADVISORY.split()}
+    assert len(listed) == len(set(listed))

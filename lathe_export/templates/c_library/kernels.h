@@ -51,7 +51,7 @@
     static inline void name##_put(name##_array into, name##_array values)                                              \
     {                                                                                                                  \
         if (into.size > 0)                                                                                             \
-            memmove(into.data, values.data, (size_t)into.size * sizeof *into.data);                                    \
+            (void)memmove(into.data, values.data, (size_t)into.size * sizeof *into.data);                              \
     }                                                                                                                  \
     static inline void name##_fill(name##_array into, type value)                                                      \
     {                                                                                                                  \
