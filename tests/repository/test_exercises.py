@@ -40,6 +40,7 @@ def test_a_solution_has_no_number_that_its_command_does_not_print(part: str, giv
 def test_a_solution_fills_each_gap_of_a_notebook(unit: Path) -> None:
     """A unit of the course holds no output, asks for the names that its solutions define, and links to them."""
     notebook = nbformat.read(unit, as_version=4)
+    assert notebook.metadata.language_info.file_extension == ".py"  # of jupyter nbconvert --to script
     assert not any(cell.get("outputs") for cell in notebook.cells)
     filling = course.solutions(unit)
     asked = [cell.source.partition("\n\n")[0] for cell in course.gaps(notebook)]
