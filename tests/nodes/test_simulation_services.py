@@ -108,7 +108,7 @@ def test_a_thousand_steps_give_the_digest_of_the_free_run(ghost, domain, tmp_pat
 
 def test_a_run_pauses_goes_on_and_refuses_what_a_cell_cannot_do(ghost, domain, tmp_path):
     """A pause leaves nothing under way; each refusal says why; a step beyond the end says where the run ended."""
-    given = ["simulation_services=playing", "speed_factor=0.1", "revolutions=6.0"]
+    given = ["simulation_services=playing", "speed_factor=0.1", "revolutions=15.0"]
     paced = cell(tmp_path, *(f"spindle_encoder.{text}" for text in given))
     allowed = {profile.node: profile.reply for group in security.policy(paced).values() for profile in group}
     state = SimulationState
@@ -144,5 +144,5 @@ def test_a_run_pauses_goes_on_and_refuses_what_a_cell_cannot_do(ghost, domain, t
         processes.wait_for_end()
     assert (
         reader.read_bag(tmp_path / "bag").digests()
-        == harness.run(cell(tmp_path, "spindle_encoder.revolutions=6.0")).digest
+        == harness.run(cell(tmp_path, "spindle_encoder.revolutions=15.0")).digest
     )
