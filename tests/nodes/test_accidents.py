@@ -83,7 +83,7 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
         until(ear.get_publisher_count)
         assert not manager.change("electrodynamic_actuator", Transition.TRANSITION_ACTIVATE), "from now on it answers"
         begin()
-        until(lambda: len(blocks) * cell.shared.block_size > full, lambda: rclpy.spin_once(ghost, timeout_sec=1.0))
+        until(lambda: blocks and blocks[-1].block.first_index > full, lambda: rclpy.spin_once(ghost, timeout_sec=1.0))
         listener.kill()
         assert manager.change("electrodynamic_actuator", Transition.TRANSITION_DEACTIVATE)  # the cell waits for it
         ghost.create_publisher(ToolBlock, "/tool", 10)  # as ``ros2 topic pub`` does
