@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import lathe, sized
+from bags import lathe, sized, some
 from test_restart import OWN, Killer
 
 import lathe_rc
@@ -81,7 +81,7 @@ def test_a_run_goes_on_from_twenty_samples_with_the_same_bits(name: str, tmp_pat
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", some(SCENARIOS, 3))
 def test_nodes_go_on_from_twenty_samples_with_the_same_bits(name: str, tmp_path: Path) -> None:
     """The same composed and as processes."""
     gone_on(name, tmp_path, sized(20), seed=3, modes=("composed", "processes"))

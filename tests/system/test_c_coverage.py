@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Branches of the printed steps that runs of the engine take, and those that none takes, by kind.
 
-``./lathe python -m pytest -s tests/system/test_c_coverage.py`` prints them.
+``LATHE_CAMPAIGN=whole ./lathe python -m pytest -s tests/system/test_c_coverage.py`` prints them.
 """
 
 import json
@@ -11,6 +11,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from bags import some
 from c_libraries import built
 
 from lathe_export.c_library.sources import export_nodes
@@ -134,7 +135,8 @@ def test_runs_of_the_engine_take_the_branches_of_the_printed_steps(tmp_path):
     for name, text in FILES.items():
         (tmp_path / f"{name}.csv").write_text(text)
     found = Counter[Branch]()
-    for number, (name, values) in enumerate(RUNS):
+    runs = some(RUNS, 4)
+    for number, (name, values) in enumerate(runs):
         cell = load(name, [each.format(folder=tmp_path) for each in values])
         found.update(counted(export_nodes(cell, place=tmp_path / str(number), name="printed", samples=SAMPLES).place))
     left = [f"{function}: {line}" for (function, line, *_), count in found.items() if not count]
@@ -143,7 +145,7 @@ def test_runs_of_the_engine_take_the_branches_of_the_printed_steps(tmp_path):
     for each, times in sorted(Counter(left).items(), key=lambda each: (kind_of[each[0]], each[0])):
         print(f"{kind_of[each] or 'no run has the case'}: {times} of {each}")
     taken, other = len(found) - len(left), kinds.pop("")
-    print(f"{len(RUNS)} runs take {taken} of {len(found)} branches ({taken / len(found):.1%}); not taken:", dict(kinds))
+    print(f"{len(runs)} runs take {taken} of {len(found)} branches ({taken / len(found):.1%}); not taken:", dict(kinds))
     print(f"of the others, {taken / (taken + other):.1%} are taken; {other} are not")
-    assert taken > 0.75 * len(found)
-    assert taken > 0.9 * (taken + other)
+    assert taken > (0.75 if runs is RUNS else 0.5) * len(found)
+    assert taken > (0.9 if runs is RUNS else 0.6) * (taken + other)

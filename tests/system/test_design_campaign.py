@@ -128,7 +128,7 @@ def thinned(monkeypatch):
 
 
 @pytest.mark.usefixtures("thinned")
-@pytest.mark.parametrize("number", some(list(range(200)), 66))
+@pytest.mark.parametrize("number", some(list(range(200)), 100))
 def test_campaign_no_law_that_is_offered_diverges_on_the_true_drive(number, tmp_path):
     """Drives of the class of `lathe fit drive`, measured with 40 to 2000 points; what is not offered has a reason."""
     found = one(number, tmp_path)
