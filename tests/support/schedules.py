@@ -257,7 +257,8 @@ class Schedule:
 
     def _lose_patience(self) -> None:
         """End a cell that waits for a machine that does not answer, as an operator does."""
-        if self.cell.culprits or self.cell.killed:
+        stalled = any(event == "stall" for _, _, event, _ in self.cell.reports)
+        if self.cell.culprits or self.cell.killed or stalled:
             self._ctrl_c()
 
     def _ctrl_c(self) -> None:
@@ -328,9 +329,10 @@ def hanging(cell: Simulation) -> list[str]:
     left = [each for each in cell.members.values() if not _waits_for_another(each)]
     found = [f"{each.identity} hangs" for each in left if not (each.process.stopped and cell.stalls == "safe")]
     everyone, _, lost = _outcome(cell)
-    died = any(event == "dead" and not values["restarts"] for _, _, event, values in cell.reports)
-    if not (cell.culprits or lost or died or cell.loses):
-        found += [f"{each.identity}: {each.protocol.failure}" for each in everyone if each.protocol.exit_code]
+    if not (cell.culprits or lost or cell.loses):
+        failed = [(each.identity, str(each.protocol.failure)) for each in everyone if each.protocol.exit_code]
+        # A member may leave in the instant in which the run begins.
+        found += [f"{name}: {why}" for name, why in failed if not any(gone in why for gone in cell.killed)]
         recorders = [each for each in everyone if each.design.records and each.role.blocks == cell.length]
         if not recorders and not cell.killed:
             found.append("no recorder has every block")
