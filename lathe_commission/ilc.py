@@ -24,7 +24,7 @@ Example:
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -287,35 +287,49 @@ def q_filter(
     filters = sorted(LAWS["lead, flat Q"].filters, key=lambda each: -_number(each["q_pass"]))
     if response.model is None:  # nothing is known above the points
         filters = [each for each in filters if _number(each["q_stop"]) <= highest]
-    found, refused = [], None
+    if not filters:
+        needed = min(_number(each["q_stop"]) for each in LAWS["lead, flat Q"].filters)
+        raise InputError(
+            f"Q of a response without a model, with points up to {highest / _TURN:.4g} Hz; allowed: up to "
+            f"{needed / _TURN:.4g} Hz or more, or response = response.fit()"
+        )
+    speeds = rpm, speed_deviation
+    found, best = _widest(response, learning, filters, least, *speeds)
+    if found is None:
+        smaller = (each for each in _GAINS if each < _number(learning.get("learning_gain", 1.0)))
+        cures = (
+            f"gain={gain:g} or "
+            for gain in smaller
+            if _widest(response, {**learning, "learning_gain": gain}, filters, least, *speeds)[0]
+        )
+        raise InputError(
+            f"Q with a drive margin of {margin:g}; allowed: up to {best.error:.3g}, which {best.frequency:.4g} Hz "
+            f"limits (more by {next(cures, '')}another filter)"
+        )
+    return found
+
+
+def _widest(
+    response: Response, learning: Values, filters: Sequence[Values], least: float, rpm: float, speed_deviation: float
+) -> tuple[Values | None, "Margin"]:
+    """Return the first filter with which a loop has a margin, or None, and the largest margin found.
+
+    Raises:
+        InputError: an argument is wrong, or no filter fits into the memory.
+    """
+    margins, refused = list[Margin](), None
     for values in filters:
         made: Values = {"q_filter": "fir", **values}
         try:
-            found.append(Loop(response, learning, made, rpm, speed_deviation).margin())
+            margins.append(Loop(response, learning, made, rpm, speed_deviation).margin())
         except InputError as error:  # such as a filter that does not fit into the memory
             refused = error
             continue
-        if found[-1].error >= least:
-            return made
-    if not found and refused:
+        if margins[-1].error >= least:
+            return made, margins[-1]
+    if not margins and refused:
         raise refused
-    best = max(found, key=lambda each: each.error)
-    raise InputError(
-        f"Q with a drive margin of {margin:g}; allowed: up to {best.error:.3g}, which {best.frequency:.4g} Hz limits "
-        f"(more by {_gain_with(response, learning, margin, rpm, speed_deviation)}another filter)"
-    )
-
-
-def _gain_with(response: Response, learning: Values, margin: float, rpm: float, speed_deviation: float) -> str:
-    """Return a smaller gain with which some Q has a margin, and "or", in words; empty: none was found."""
-    for gain in (each for each in _GAINS if each < _number(learning.get("learning_gain", 1.0))):
-        smaller: Values = {**learning, "learning_gain": gain}
-        try:
-            q_filter(response, smaller, margin=margin, rpm=rpm, speed_deviation=speed_deviation)
-        except InputError:
-            continue
-        return f"gain={gain:g} or "
-    return ""
+    return None, max(margins, key=lambda each: each.error)
 
 
 def _number(value: Value) -> float:

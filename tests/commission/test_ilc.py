@@ -168,6 +168,10 @@ LOOP = "ilc.Loop(G, {}, {})"
             "ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)",
             r"0.9; allowed: up to \S+, which \S+ Hz limits \(more",
         ),
+        (
+            "ilc.q_filter(ilc.frequency_response(F[:60], ONES[:60]), {'lead_time': 0.0})",
+            r"points up to \S+ Hz; allowed: up to \S+ Hz or more, or response = response.fit\(\)",
+        ),
         ("ilc.q_filter(G, {'lead_tme': 1e-3})", "lead_tme: unknown parameter; did you mean lead_time"),
         ("ilc.q_filter(G, {}, rpm='1000')", "rpm = '1000'; allowed: a number above 0"),
         ("ilc.Loop(G, None, {})", "learning = None: NoneType; allowed: dict"),
