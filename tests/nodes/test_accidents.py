@@ -24,9 +24,9 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes.ports import latched_qos
 
-#: keeps all messages, takes none
+#: keeps all messages, takes none, until its input is closed
 DEAF = """
-import rclpy, signal
+import rclpy, sys
 from lathe_rc_msgs.msg import ToolBlock
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 rclpy.init()
@@ -35,7 +35,7 @@ subscription = rclpy.create_node("deaf").create_subscription(ToolBlock, "/tool",
 while not subscription.get_publisher_count():
     pass
 print("matched", flush=True)
-signal.pause()
+sys.stdin.read()
 """
 STRANGERS = [
     "/members: message of run 'test' from /second_spindle; the time master is /spindle_encoder",
@@ -75,9 +75,9 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
     full = 2 * signal_depth(cell.shared.window) * cell.shared.block_size  # more samples than a queue holds
     manager, heard = Manager(ghost), {}
-    deaf, blocks = [sys.executable, "-c", DEAF], []
+    deaf, pipes, blocks = [sys.executable, "-c", DEAF], dict.fromkeys(("stdin", "stdout"), subprocess.PIPE), []
     ear = ghost.create_subscription(ToolBlock, "/tool", blocks.append, 10)
-    with held(recorded, domain) as (processes, begin), subprocess.Popen(deaf, stdout=subprocess.PIPE) as listener:
+    with held(recorded, domain) as (processes, begin), subprocess.Popen(deaf, **pipes) as listener:
         manager.processes, seen = processes, Seen(processes)
         assert listener.stdout.readline() == b"matched\n"
         until(ear.get_publisher_count)
