@@ -140,7 +140,7 @@ function drawHeader(now) {
   $("ground").textContent = part ? part.text : "";
   $("part").className = `part ${old.samples ? "old" : part ? part.mood : ""}`;
   const { retract, reset } = now.next || {};
-  const next = [reset && reset.text != "nothing to reset" ? reset.text : "", now.advice].filter(Boolean);
+  const next = [reset && reset.due ? reset.text : "", now.advice].filter(Boolean);
   $("next").textContent = can("command") && next.length ? `next: ${next.join("; ")}` : "";
   for (const [id, step] of [["retract", retract], ["reset", reset]]) {
     $(id).disabled = Boolean(step) && !step.allowed && !old.safety;

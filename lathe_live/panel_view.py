@@ -38,7 +38,7 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.loops import Loop, loops, watches
 from lathe_rc.judge.part import Tolerances, error_growth
 from lathe_rc.messages import Samples, Signals, full
-from lathe_rc.view.form_limits import NOT_OVER, form_limits, varying_speed
+from lathe_rc.view.form_limits import Finding, form_limits, varying_speed
 
 CELLS = 180  #: cells of a row of the map
 PERIOD = 0.125  #: least time between two snapshots [s]
@@ -216,7 +216,7 @@ class View:
         self._open: Row | None = None
         self._newest: list[Row] = []
         self._forms: list[Revolution] = []  # of the newest rows
-        self._limits: tuple[int, list[str]] = (0, [])  # number of revolutions, and what limits the form error then
+        self._limits: tuple[int, list[Finding]] = (0, [])  # number of revolutions, and what limits the form error then
         self._part = None
         self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
         self._conditions = event_log.Conditions()
@@ -252,7 +252,7 @@ class View:
             now["state"] = "running"
         out = lamp["next"]["retract"]["text"] if lamp["next"] and lamp["safety"]["state"] in OUT else ""
         part = snapshot.situation.evaluation.headline(out)
-        alarmed = bool(lamp["next"]) and lamp["next"]["reset"]["text"] != "nothing to reset"
+        alarmed = bool(lamp["next"]) and lamp["next"]["reset"]["due"]
         advice = snapshot.situation.advice(self.outlook, alarmed=alarmed)
         return {**now, "age": age, "live": self.live, "part": asdict(part), "advice": advice}
 
@@ -378,7 +378,7 @@ class View:
             self._evaluated(unjudged),
             np.array([form.error for form in self._forms[-LAST:]]).reshape(-1, ANGLES),
             (self._now["margin"] or 0.0) < 0.0,
-            any(text.startswith(NOT_OVER) for text in self._limits[1]),
+            any(each.falls for each in self._limits[1]),
             any(self._now["learning"].values()),
             self.memories,
             sorted(self._conditions.limited),
@@ -409,13 +409,13 @@ class View:
                 learning=messages.LEARNING in self._types.values(),
                 causes=[*self.outlook.get("changing", []), *varying_speed(*self._speeds)],
             )
-            out = ["The supervisor's retraction makes the form error of the last revolutions."]
-            self._limits = self._complete, out if self.was_out else [each.text for each in found]
+            out = [Finding("The supervisor's retraction makes the form error of the last revolutions.")]
+            self._limits = self._complete, out if self.was_out else list(found)
         margin = self._now["margin"]
         return [
             *(f"{node} is at the limits of its command." for node in sorted(self._conditions.limited)),
             *(["Learning diverges: its stability margin is below 0."] if margin is not None and margin < 0.0 else []),
-            *self._limits[1],
+            *(each.text for each in self._limits[1]),
         ]
 
     def _looped(self) -> list[str]:

@@ -36,10 +36,12 @@ class Step:
     Attributes:
         text: what it does or needs, in words.
         allowed: whether the supervisor carries it out now.
+        due: whether it is to be taken, now or after what the text says.
     """
 
     text: str
     allowed: bool = False
+    due: bool = True
 
 
 def retraction(state: State) -> Step:
@@ -69,7 +71,7 @@ def reset(
         stuck = state is State.RETRACTING and faults
         return Step(f"repair {_listed(faults)}, with which the tool may not come out; {why}" if stuck else why)
     if reaction is Reaction.NONE:
-        return Step("nothing to reset")
+        return Step("nothing to reset", due=False)
     before, reasons = [], []
     if faults:
         before.append(f"repair {_listed(faults)}")

@@ -13,7 +13,6 @@ import numpy as np
 from lathe_rc.messages import Samples
 
 WARN = "warn"
-NOT_OVER = "Learning is not over"  #: begin of the finding on a form error that still falls
 
 _FEWEST = 4  # smallest number of revolutions for a trend
 _CHANGE = 0.05  # change of the form error over the last revolutions below which it counts as constant
@@ -23,10 +22,11 @@ _SOME = 0.1  # smallest share of the power that is reported
 
 @dataclass(frozen=True)
 class Finding:
-    """Sentence about a run, and whether it is good or bad news."""
+    """Sentence about a run, whether it is good or bad news, and whether it says that the form error still falls."""
 
     text: str
     mood: str = ""
+    falls: bool = False
 
 
 def form_limits(profiles: Samples, *, excess: float, learning: bool, causes: Iterable[str]) -> Iterator[Finding]:
@@ -79,7 +79,8 @@ def _trend(rms: Samples, excess: float) -> Finding | None:
     if after.max() < before.min() and factor < 1.0 - _CHANGE and each < 1.0:
         turns = math.ceil(math.log(1.0 / excess) / math.log(each)) if excess > 1.0 else 0
         more = f"; in tolerance after some {turns} more, if it goes on like this" if turns else ""
-        return Finding(f"{NOT_OVER}: the form error falls by {1.0 - each:.1%} a revolution{more}.", WARN)
+        text = f"Learning is not over: the form error falls by {1.0 - each:.1%} a revolution{more}."
+        return Finding(text, WARN, falls=True)
     if after.min() > before.max() and factor > 1.0 + _CHANGE and each > 1.0:
         return Finding(f"The form error grows by {each - 1.0:.1%} a revolution in the last {len(rms)}.", WARN)
     return None
