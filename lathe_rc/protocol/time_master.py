@@ -258,9 +258,10 @@ class TimeMasterProtocol(MemberProtocol):
     def hold(self, blocks: int | None, now: float) -> None:
         """Hold the run after a total number of blocks, or let it go on: None; a held run changes no sample.
 
-        A safe state ends the hold.
+        A safe state ends the hold; an early end has one of its own, until the members know of it.
         """
-        self.held_at = None if self._declared else blocks
+        if not self.ends_early:
+            self.held_at = None if self._declared else blocks
         self._heard = now  # nobody was silent meanwhile
         self.actions.append(do.Release())
 

@@ -373,6 +373,19 @@ def test_the_safe_state_ends_a_hold():
     assert protocol.held_at is None, "the members shall reach their safe state"
 
 
+@pytest.mark.parametrize("blocks", [None, 2])
+def test_a_hold_does_not_change_an_early_end(blocks):
+    """A reader that had not heard of the end yet rejected the last block, and its sender was lost."""
+    protocol = leads()
+    release(protocol, 2)
+    protocol.hold(2, 0.0)
+    protocol.end_run("asked to end", 1.0)
+    protocol.hold(blocks, 1.01)
+    assert protocol.credit == 0, "the members hear of the end first"
+    protocol.look(1.06, {}, ())
+    assert protocol.credit > 0, "then the last block follows"
+
+
 @pytest.mark.parametrize("waits", ["for its own input", "for a report"])
 def test_a_silent_member_is_lost_although_the_window_is_not_used_up(waits):
     """A time master in a chain with a controller waits for the feedback of the member, shorter than the window."""
