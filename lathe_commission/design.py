@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design of the learning law of a cell for a drive that is known within a set: laws and filters compared.
 
-For each law, settings on a grid are reduced to those whose drive margin (`lathe_rc.analysis.learning.drive_margin`) is
-large enough with the nominal drive and at every measured point, with the lead that has the largest margin. An even
-choice of these runs with the nominal drive. The setting with the smallest error that keeps the margin with every drive
-of the set then runs with each of them, at the speed of the scenario and at another one.
+For each law, settings on a grid are reduced to those whose drive margin
+(`lathe_rc.analysis.cycle_factors.drive_margin`) is large enough with the nominal drive and at every measured point,
+with the lead that has the largest margin. An even choice of these runs with the nominal drive. The setting with the
+smallest error that keeps the margin with every drive of the set then runs with each of them, at the speed of the
+scenario and at another one.
 """
 
 import math
@@ -19,8 +20,8 @@ import numpy as np
 from lathe_commission.cycle_weights import of_gaussian_process
 from lathe_commission.fir_inverse import fir_inverse
 from lathe_rc import messages
+from lathe_rc.analysis.cycle_factors import DriveMargin, Response
 from lathe_rc.analysis.frequency_response import FrequencyResponse
-from lathe_rc.analysis.learning import DriveMargin, Response
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.tolerance import LAST, growth, judge
 from lathe_rc.arrays import Array, Complex

@@ -38,6 +38,7 @@ from lathe_commission import given
 from lathe_commission.design import LAWS, Known
 from lathe_commission.modal_fit import MOST_MODES, ResponseData, fit
 from lathe_commission.trials import Trials
+from lathe_rc.analysis.cycle_factors import DriveMargin
 from lathe_rc.analysis.frequency_response import (
     AVERAGES,
     FrequencyResponse,
@@ -45,7 +46,6 @@ from lathe_rc.analysis.frequency_response import (
     of_measurement,
     write_states,
 )
-from lathe_rc.analysis.learning import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex

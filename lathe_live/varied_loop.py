@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.analysis.cycle_factors import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lathe_rc.analysis.learning import DriveMargin
+from lathe_rc.analysis.cycle_factors import DriveMargin
 from lathe_rc.analysis.resonance_grid import NO_POLES, Grid, with_images
 from lathe_rc.arrays import Array, Complex
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.analysis.resonance_grid import poles_of
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array
 from lathe_rc.control.rational_fit import RATIONAL_BAND, damped

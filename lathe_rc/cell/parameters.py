@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from lathe_rc.cell.judged import Judged
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import Named
-from lathe_rc.messages import MAX_BLOCK
+from lathe_rc.messages import MAX_BLOCK, Samples
 from lathe_rc.names import instead
 
 NonNegative = Annotated[float, Ge(0)]  #: most quantities, including those that 0 switches off
@@ -29,6 +29,7 @@ Positive = Annotated[float, Gt(0)]  #: quantities that are used as divisors
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 Values = Mapping[str, Value]  #: values by parameter name
+Off = dict[str, dict[str, Value]]  #: values that switch causes of a form error off, by cause and NODE.PARAM
 
 T = TypeVar("T", bound="Table")
 
@@ -339,6 +340,16 @@ class NodeParameters(SharedParameters):
 
     def known(self) -> Values:
         """Return the values of the node that other nodes may use, by parameter name."""
+        return {}
+
+    def causes_off(self, node: str, nodes: Mapping[str, "NodeParameters"], height: Samples) -> Off:
+        """Return the values that switch further causes of a form error off, by cause and NODE.PARAM.
+
+        Args:
+            node: name of the node.
+            nodes: tables of the cell by node.
+            height: height of the tool along the part in the revolutions that are judged [m], shape (n,).
+        """
         return {}
 
     def judged(self) -> Judged | None:

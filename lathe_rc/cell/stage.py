@@ -25,7 +25,7 @@ from lathe_rc import messages
 from lathe_rc.blocks.ports import CLOCK, Input, Joint, Output, Sparse
 from lathe_rc.cell import events, ros_yaml
 from lathe_rc.cell.events import Trigger
-from lathe_rc.cell.parameters import NodeParameters, about, remapped
+from lathe_rc.cell.parameters import NodeParameters, Values, about, remapped
 from lathe_rc.compiled.step import CompiledStep, Step, is_compiled
 from lathe_rc.compiled.struct_view import explain_unfit
 from lathe_rc.errors import InputError, LatheError
@@ -179,6 +179,14 @@ class Stage(ABC):
                     f"{self.name}: feedback of {port.topic} is delayed by {port.delay} samples, block_size = "
                     f"{self.shared.block_size}; allowed: block_size up to the delay"
                 )
+
+    def causes_off(self, cell: WiredCell) -> dict[str, Values | str]:
+        """Return the values that switch causes of a form error off, which depend on the wired cell.
+
+        Returns:
+            By cause, the values by NODE.PARAM, or the reason for which nothing switches it off.
+        """
+        return {}
 
     def declare(self, *, inputs: Sequence[Input] = (), outputs: Sequence[Output] = (), tells: bool = False) -> None:
         """Set the ports; call once, at the end of the constructor.

@@ -22,7 +22,7 @@ from lathe_rc.signals.form_errors import FormErrors
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from lathe_rc.analysis.learning import DriveMargin
+    from lathe_rc.analysis.cycle_factors import DriveMargin
     from lathe_rc.event_log import LogEntry
     from lathe_rc.judge.loops import LoopResult
 

@@ -11,25 +11,18 @@ from lathe_rc.analysis.budget import TOLD, Budget, Causes, Decomposition
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.blocks.ports import Sparse
-from lathe_rc.cell import batch, models
-from lathe_rc.cell.parameters import NodeParameters, Value, Values
+from lathe_rc.cell import batch
+from lathe_rc.cell.parameters import Off, Value, Values
 from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.judge.causes import EVERYWHERE, PREFIXES
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.signals.form_errors import form_errors
-from lathe_rc.stages.learning.learning_controller import LearningController
-from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
-from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
-from lathe_rc.stages.tool.form import FormParameters
-from lathe_rc.stages.tool.tool import ToolParameters
 
 _TURN = 2.0 * np.pi
-_FACTOR = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
-_CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
-
-_SPEED = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
+_FIRST = ("Q floor", "model", "speed", "lead", "feed")  # causes in the order of a budget, before those of parameters
+_NEEDS = {"lead": "speed"}  # cause without which another has no effect
 
 
 @dataclass(frozen=True)
@@ -115,60 +108,21 @@ def _simple(scenario: Scenario) -> dict[str, Cause]:
     }
 
 
-def _learners(scenario: Scenario) -> dict[str, LearningControllerParameters]:
-    return {node: table for node, table in scenario.nodes.items() if isinstance(table, LearningControllerParameters)}
-
-
-def _speed(scenario: Scenario) -> dict[str, Cause]:
-    """Return the causes ``speed`` (it varies) and ``lead`` (it follows the speed; off: exact preview of the speed)."""
-    (master,) = scenario.masters
-    law, learners = scenario.nodes[master], _learners(scenario)
-    if not isinstance(law, SpeedLawParameters):
-        return {}
-    rows = type(law).rows()
-    steady = {name: rows[name].default for name in _SPEED}
-    if all(getattr(law, name) == value for name, value in steady.items()):
-        return {}
-    followed = {f"{node}.{name}": getattr(law, name) for node in learners for name in _SPEED}
-    followed |= {f"{node}.law": "angle_domain" for node in learners}
-    followed |= {f"{node}.lead_law": "exact_preview" for node in learners}
-    everywhere = {f"{node}.{name}": value for node in (master, *learners) for name, value in steady.items()}
-    return {"speed": Cause(everywhere), "lead": Cause(followed, needs="speed")}
-
-
-def _feed(scenario: Scenario, height: Samples) -> dict[str, Cause]:
-    """Return the cause ``feed``: the form changes along the part. Off: the tool stays at the middle reported height."""
-    forms = {node: table for node, table in scenario.nodes.items() if isinstance(table, FormParameters)}
-    off: dict[str, Value] = {}
-    for node, table in forms.items():
-        still = not (isinstance(table, ToolParameters) and table.reference == "topic")
-        if still and not table.part_revolutions and np.ptp(height) > 0.0:
-            middle = max(float(height.min() + height.max()) / 2.0, 0.0)
-            off |= {f"{node}.height_from": "feed", f"{node}.feed": 0.0, f"{node}.start_height": middle}
-    return {"feed": Cause(off)}
-
-
-def _model(scenario: Scenario) -> dict[str, Cause]:
-    """Return the cause ``model``: the model of a correction differs from the drive."""
-    off: dict[str, Value] = {}
-    for node, table in _learners(scenario).items():
-        if table.correction not in ("none", "lead_lag", "fir"):
-            off |= {f"{node}.{name}": value for name, value in models.of_drives(node, scenario.nodes).items()}
-    return {"model": Cause(off)}
-
-
-def _q_floor(cell: Cell, left_out: dict[str, str]) -> dict[str, Cause]:
-    """Return the cause ``Q floor``: Q is below 1. Off: each Q is 1 as far as its channel then converges."""
-    off: dict[str, Value] = {}
+def _of_cell(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
+    """Return the causes that nodes and stages find in this cell; and those that stay, with the reasons."""
+    cell = Cell(scenario.nodes)
+    off: Off = {name: {} for name in _FIRST}
+    left_out: dict[str, str] = {}
     for stage in cell.stages.values():
-        if isinstance(stage, LearningController):
-            loop = stage.checked_loop(cell)
-            flat = loop.flat(min(max(loop.factor({}), _FACTOR), _CONVERGES))
-            if flat is None:
-                left_out["Q floor"] = f"{stage.name} converges with no flat Q"
-                return {}
-            off |= {f"{stage.name}.{name}": value for name, value in flat.items()}
-    return {"Q floor": Cause(off)}
+        for name, values in stage.causes_off(cell).items():
+            if isinstance(values, str):
+                left_out[name] = values
+            else:
+                off.setdefault(name, {}).update(values)
+    for node, table in scenario.nodes.items():
+        for name, each in table.causes_off(node, scenario.nodes, height).items():
+            off.setdefault(name, {}).update(each)
+    return {name: Cause(off[name], _NEEDS.get(name, "")) for name in off if name not in left_out}, left_out
 
 
 def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
@@ -181,14 +135,8 @@ def causes(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[
     Returns:
         The causes, each after its prerequisite; and the causes that cannot be switched off, with the reasons.
     """
-    left_out: dict[str, str] = {}
-    found = {
-        **_q_floor(Cell(scenario.nodes), left_out),
-        **_model(scenario),
-        **_speed(scenario),
-        **_feed(scenario, height),
-        **_simple(scenario),
-    }
+    found, left_out = _of_cell(scenario, height)
+    found |= _simple(scenario)
     kept: dict[str, Cause] = {}
     for name, cause in found.items():
         off = _not_yet(scenario, cause.off)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lathe_rc.analysis.learning import DriveMargin, poles_in_waves
+from lathe_rc.analysis.cycle_factors import DriveMargin, poles_in_waves
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.analysis.resonance_grid import Grid
 from lathe_rc.arrays import Array, Complex

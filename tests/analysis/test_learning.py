@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_rc import messages
-from lathe_rc.analysis import learning
-from lathe_rc.analysis.learning import LearningLoop, supremum
+from lathe_rc.analysis import cycle_factors
+from lathe_rc.analysis.cycle_factors import supremum
+from lathe_rc.analysis.learning import LearningLoop
 from lathe_rc.analysis.resonance_grid import Grid
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
@@ -126,7 +127,7 @@ def test_an_error_of_the_drive_margin_is_the_smallest_with_which_learning_diverg
         # Nowhere else a smaller error suffices.
         waves = np.linspace(0.0, loop.stage.highest_waves(margin.speed), 4001)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(learning, "_waves_up_to", lambda _, waves=waves: Grid.even(waves))
+            patch.setattr(cycle_factors, "_waves_up_to", lambda _, waves=waves: Grid.even(waves))
             assert loop.drive_margin().error == pytest.approx(margin.error, rel=1e-3)
 
 

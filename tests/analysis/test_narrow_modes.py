@@ -9,7 +9,7 @@ from cells import config, scenario
 
 from lathe_rc import harness
 from lathe_rc.analysis import feedback
-from lathe_rc.analysis.learning import smallest_errors
+from lathe_rc.analysis.cycle_factors import smallest_errors
 from lathe_rc.analysis.resonance_grid import with_images
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError

@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import FREE, LIMITED
 from lathe_rc.cell.parameters import NodeParameters, Positive, parameter

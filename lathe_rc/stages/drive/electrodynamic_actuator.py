@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 from annotated_types import Ge, Le
 
 from lathe_rc import resources
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.analysis.measured_drive import DriftedDrive, MeasuredDrive, read_points
 from lathe_rc.analysis.modal_drive import OPTIONAL, ModalDrive
 from lathe_rc.analysis.rational_model import of_modal_drive

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached

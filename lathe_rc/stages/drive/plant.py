@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.analysis.resonance_grid import NO_POLES
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.blocks.ports import Input, Joint, Output

@@ -15,7 +15,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.parameters import NonNegative, Positive, Value, about, parameter

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.events import OUT_OF_REACH

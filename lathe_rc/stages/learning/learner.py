@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc.analysis import feedback
-from lathe_rc.analysis.learning import (
+from lathe_rc.analysis.cycle_factors import (
     DriveMargin,
     Response,
     drive_margin,

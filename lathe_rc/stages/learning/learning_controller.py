@@ -11,12 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lathe_rc import messages
-from lathe_rc.analysis.learning import LearningLoop, Response, highest_waves
+from lathe_rc.analysis.cycle_factors import Response, highest_waves
+from lathe_rc.analysis.learning import LearningLoop
 from lathe_rc.analysis.measured_drive import MeasuredDrive
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.events import OUT_OF_REACH
-from lathe_rc.cell.parameters import Value, about
+from lathe_rc.cell.parameters import Value, Values, about
 from lathe_rc.cell.stage import WiredCell
 from lathe_rc.control import angle_memory, memory_file
 from lathe_rc.control.correction import Correction, CorrectionLaw
@@ -37,6 +38,8 @@ _OF_Q = {"fir": ("q_pass", "q_stop")}  # parameters that act, by Q filter; of al
 _STATUS = "coarse/learning"  # topic
 _MOST = 1024  # largest number of entries in a table of margins
 _LEAST_Q = 1e-6  # [s] smallest Q width from which a wider Q is searched
+_FLAT = 0.9  # largest factor per cycle for a flat Q, unless the scenario's own Q has a larger one
+_CONVERGES = 0.98  # upper limit of this factor: the scenario may run with allow_unstable
 _QS = 30  # number of candidates, each 25 % wider than the previous one
 # Candidate leads, in lags: more for a drive that rings.
 _LEADS = (1.0, 0.9, 1.1, 0.8, 1.2, 0.7, 1.3, 1.5, 1.75, 2.0, 2.25, 2.5)
@@ -120,6 +123,14 @@ class LearningController(Learner):
     def adjustable(self) -> Sequence[str]:
         """Return gain, lead and Q."""
         return self.tunable
+
+    def causes_off(self, cell: WiredCell) -> dict[str, Values | str]:
+        """Return the cause ``Q floor``: Q is below 1. Off: it is 1 as far as the channel then converges."""
+        loop = self.checked_loop(cell)
+        flat = loop.flat(min(max(loop.factor({}), _FLAT), _CONVERGES))
+        if flat is None:
+            return {"Q floor": f"{self.name} converges with no flat Q"}
+        return {"Q floor": {f"{self.name}.{name}": value for name, value in flat.items()}}
 
     @property
     def correction(self) -> Correction:

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the learning controller, and construction of the elements of its law."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Annotated, ClassVar, Literal, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
-from lathe_rc.cell.parameters import NonNegative, Positive, about, parameter
+from lathe_rc.cell import models
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Positive, about, parameter
+from lathe_rc.cell.time_master import TimeMasterParameters
 from lathe_rc.control.correction import Correction, CorrectionLaw
 from lathe_rc.control.lead import LeadLaw, Preview
 from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, QFilter, check
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
+from lathe_rc.messages import Samples
 from lathe_rc.stages.learning.learner import LawParameters
 from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
 
@@ -121,6 +124,22 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
     model_delay: Annotated[float, Ge(0), Le(0.1)] = parameter(0.36e-3, "drive model: delay", "s", drive="delay")
 
     commanded_topic: ClassVar[str] = "coarse/command"
+
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+        """Return the causes ``model`` (of a correction, it differs from the drive), ``speed`` and ``lead``.
+
+        The lead follows the speed; off: an exact preview of the speed (implements `NodeParameters.causes_off`).
+        """
+        found: Off = {}
+        if self.correction not in ("none", "lead_lag", "fir"):
+            found["model"] = {f"{node}.{name}": value for name, value in models.of_drives(node, nodes).items()}
+        for law in nodes.values():
+            if isinstance(law, TimeMasterParameters) and isinstance(law, SpeedLawParameters) and law.varies:
+                followed = {name: getattr(law, name) for name in self.steady()}
+                followed |= {"law": "angle_domain", "lead_law": "exact_preview"}
+                found["speed"] = {f"{node}.{name}": value for name, value in self.steady().items()}
+                found["lead"] = {f"{node}.{name}": value for name, value in followed.items()}
+        return found
 
     @property
     def cycle_points(self) -> int:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from annotated_types import Ge, Le
 
-from lathe_rc.analysis.learning import Response
+from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import Positive, parameter
 from lathe_rc.control.angle_filter import at

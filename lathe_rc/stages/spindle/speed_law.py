@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the spindle's speed law, for the spindle and for control laws that know the speed in advance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
@@ -10,9 +10,10 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from lathe_rc import resources
-from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Positive, Values, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
+from lathe_rc.messages import Samples
 from lathe_rc.signals import speed
 from lathe_rc.signals.deviation_law import DeviationLaw, tabulated
 from lathe_rc.stages.common.tables import made_of
@@ -51,6 +52,21 @@ class SpeedLawParameters(NodeParameters):
     deviation_law_end: Positive = parameter(
         60.0, "end of its tachogram, not before the end of the run; an endless one goes on with the last deviation", "s"
     )
+
+    @classmethod
+    def steady(cls) -> Values:
+        """Return the values of a constant speed."""
+        own = [name for name in SpeedLawParameters.model_fields if name not in NodeParameters.model_fields]
+        return {name: cls.rows()[name].default for name in own}
+
+    @property
+    def varies(self) -> bool:
+        """Whether the speed is not constant."""
+        return any(getattr(self, name) != value for name, value in self.steady().items())
+
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+        """Return the cause ``speed``: it varies (extends `NodeParameters`)."""
+        return {"speed": {f"{node}.{name}": value for name, value in self.steady().items()}} if self.varies else {}
 
     def speed_law(self, node: str) -> speed.SpeedLaw:
         """Return the speed law of a node, the sum of all deviations.
