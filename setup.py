@@ -14,7 +14,7 @@ from setuptools import Distribution, find_packages, setup
 HERE = Path(__file__).resolve().parent
 # read, not imported: nothing that the package needs is there yet
 CATALOGUE = runpy.run_path(str(HERE / "lathe_rc/catalogue.py"))
-NODES = [*CATALOGUE["STAGES"], "recorder"]
+NODES = [*CATALOGUE["MACHINE"], "recorder"]
 PACKAGES, ALONE = sorted(CATALOGUE["OURS"]), CATALOGUE["STANDALONE"]
 PAPERS = sorted((HERE / "lathe_papers").glob("*.py"))
 STUDIES = [path.stem for path in PAPERS if "\nSTUDY = " in path.read_text(encoding="utf-8")]
@@ -99,6 +99,7 @@ setup(
         "lathe_commission": ["py.typed", "__init__.pyi"],
         "lathe_explore": ["py.typed", "__init__.pyi", "sweep/*.j2"],
         "lathe_export": ["py.typed", "__init__.pyi", "templates/*/*.j2", "templates/*/*.h"],
+        "lathe_machine": ["py.typed", "__init__.pyi"],
         "lathe_live": ["py.typed", "*.j2", "*.css", "*.html", "*.js"],
     },
     data_files=shared_files(),

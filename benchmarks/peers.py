@@ -24,14 +24,14 @@ from scipy import signal
 
 from benchmarks import sides
 from benchmarks.others.peer import Peer, missing
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.linear import second_order
 from lathe_rc import messages, resources
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.linear import second_order
 from lathe_rc.signals.form_errors import form_errors
 
 Array = npt.NDArray[np.float64]

@@ -12,24 +12,24 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from lathe_machine.control.lead import LeadLaw
+from lathe_machine.signals.encoder import EncoderTable
+from lathe_machine.stages.cut.cutting_process import CuttingProcessStage
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_machine.stages.drive.piezo_actuator import PiezoActuator
+from lathe_machine.stages.feed.decoupler import DecouplerStage
+from lathe_machine.stages.feed.feed_drive import FeedDriveStage
+from lathe_machine.stages.feed.force_controller import ForceController
+from lathe_machine.stages.feed.position_controller import PositionController
+from lathe_machine.stages.learning.learning_controller import LearningController
+from lathe_machine.stages.spindle.spindle_encoder import SpindleEncoder
+from lathe_machine.stages.tool.tool import Tool
+from lathe_machine.transfer import System
 from lathe_rc import messages
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.lead import LeadLaw
 from lathe_rc.errors import LatheError
-from lathe_rc.signals.encoder import EncoderTable
 from lathe_rc.signals.noise import DRAWN
-from lathe_rc.stages.cut.cutting_process import CuttingProcessStage
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
-from lathe_rc.stages.drive.piezo_actuator import PiezoActuator
-from lathe_rc.stages.feed.decoupler import DecouplerStage
-from lathe_rc.stages.feed.feed_drive import FeedDriveStage
-from lathe_rc.stages.feed.force_controller import ForceController
-from lathe_rc.stages.feed.position_controller import PositionController
-from lathe_rc.stages.learning.learning_controller import LearningController
-from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
-from lathe_rc.stages.tool.tool import Tool
-from lathe_rc.transfer import System
 
 FLAGS = ("-O3", "-march=native", "-std=c11")
 _FOLDER = Path(__file__).parent / "c"

@@ -28,6 +28,10 @@ LAYERS = (
             "lathe_live": "panel, Rerun",
         },
     ),
+    Layer(
+        "the machine",
+        {"lathe_machine": "spindle, learning, drives, cut, tool, feed, supervisor: physics, laws, stages"},
+    ),
     Layer("command line", {"commands": "lathe run, bag, report, …"}),
     Layer("Python", {"harness": "runs a scenario, scores it"}),
     Layer("hosts", {"nodes": "ROS 2 nodes, processes, DDS"}),
@@ -40,23 +44,20 @@ LAYERS = (
         },
     ),
     Layer("judgement", {"judge": "part, loops, budget, against tolerances"}),
-    Layer("the catalogue", {"stages": "spindle, learning, drives, cut, tool, feed, supervisor"}),
     Layer("the framework", {"cell": "wiring, scenario, stage, checks, offline run"}),
     Layer("between nodes", {"blocks": "ports, messages as arrays and bytes, delays"}),
     Layer(
         "around it",
         {
             "drawing": "pages, charts, pictures",
-            "analysis": "formulas, metrology, fits",
-            "safety": "faults, monitors, safe state",
+            "analysis": "form, loops, responses",
         },
     ),
-    Layer("physics, laws", {"plants": "drives, cut, slides, spindle", "control": "learning, PID, decoupling"}),
-    Layer("signals", {"signals": "speed, encoder, form"}),
-    Layer("compiled code", {"compiled": "memories and addresses of steps", "fmi": "models of other tools"}),
+    Layer("signals", {"signals": "speed, noise, measured data", "safety": "faults, states"}),
+    Layer("compiled code", {"compiled": "memories and addresses of steps"}),
 )
 #: Arrows within a layer.
-BESIDE = (("plants", "control"),)
+BESIDE: tuple[tuple[str, str], ...] = ()
 
 LEFT, WIDTH, RIGHT = 112, 640, 4
 HEIGHT, GAP, SPACE = 50, 22, 36  # of a box, between layers, between boxes

@@ -7,12 +7,12 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from lathe_machine.plants.hysteresis import PrandtlIshlinskii
 from lathe_papers import marks
 from lathe_papers.formulas.responses import Response, in_series
 from lathe_papers.formulas.structures import limit_frequency, uncompensated
 from lathe_papers.formulas.tuning import FREQUENCIES, START
 from lathe_papers.formulas.vibration import describing_function, reduction, widest_band
-from lathe_rc.plants.hysteresis import PrandtlIshlinskii
 from place import PICTURES
 
 HERTZ = 2 * np.pi

@@ -5,12 +5,12 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_rc.analysis.regeneration import Regeneration, lobes
-from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, SpecificForce
-from lathe_rc.plants.workpiece import HardSpot, Part
-from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
-from lathe_rc.transfer import TransferFunction
+from lathe_machine.analysis.regeneration import Regeneration, lobes
+from lathe_machine.plants.cutting import CuttingProcess
+from lathe_machine.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, SpecificForce
+from lathe_machine.plants.workpiece import HardSpot, Part
+from lathe_machine.signals.allowance import PAPER_RMS, Allowance, mean_reverting
+from lathe_machine.transfer import TransferFunction
 from place import PICTURES
 
 Array = npt.NDArray[np.float64]

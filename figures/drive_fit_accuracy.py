@@ -10,9 +10,9 @@ import scipy
 
 from lathe_commission import modal_fit
 from lathe_commission.modal_fit import ResponseData
+from lathe_machine.analysis.modal_drive import ModalDrive
+from lathe_machine.transfer import LinearSystem, TransferFunction
 from lathe_rc.analysis.frequency_response import FrequencyResponse, deviation_of, estimate
-from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.transfer import LinearSystem, TransferFunction
 
 Array = npt.NDArray[np.float64]
 

@@ -5,10 +5,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from lathe_rc.plants.feed import FeedDrive
-from lathe_rc.plants.feed_models import dc_screw
-from lathe_rc.plants.friction import Friction, mobility
-from lathe_rc.plants.screw import Screw
+from lathe_machine.plants.feed import FeedDrive
+from lathe_machine.plants.feed_models import dc_screw
+from lathe_machine.plants.friction import Friction, mobility
+from lathe_machine.plants.screw import Screw
 from place import PICTURES
 
 Array = npt.NDArray[np.float64]

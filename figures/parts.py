@@ -10,12 +10,12 @@ import scipy
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from lathe_machine.control.q_filter import Weights
+from lathe_machine.safety.monitors import Alarm, PlainMonitor
+from lathe_machine.signals.deviation_law import DeviationLaw
+from lathe_machine.signals.part_profile import PartProfile
 from lathe_rc import parameter
 from lathe_rc.arrays import Array
-from lathe_rc.control.q_filter import Weights
-from lathe_rc.safety.monitors import Alarm, PlainMonitor
-from lathe_rc.signals.deviation_law import DeviationLaw
-from lathe_rc.signals.part_profile import PartProfile
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 

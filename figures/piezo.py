@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 
 import lathe_rc
 from lathe_commission.hysteresis_fit import Loop, identify
+from lathe_machine.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
+from lathe_machine.stages.drive.series_drive import SeriesDriveParameters, SeriesDriveStage
 from lathe_rc import messages
 from lathe_rc.cell import scenario
 from lathe_rc.cell.parameters import SharedParameters
-from lathe_rc.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
-from lathe_rc.stages.drive.series_drive import SeriesDriveParameters, SeriesDriveStage
 from place import CONFIG, PICTURES
 
 STROKE, RATE = 15e-6, 64_000  # [m], [Hz]

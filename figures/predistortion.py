@@ -4,8 +4,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from lathe_rc.analysis.shaft import Shaft
-from lathe_rc.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
+from lathe_machine.analysis.shaft import Shaft
+from lathe_machine.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
 from place import PICTURES
 
 STIFFNESS = 233.3e3  # W4 of paper 004 [N/m]

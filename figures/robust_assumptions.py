@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lathe_machine.stages.learning.learner import Loop
 from lathe_papers import cells, judge, robust
 from lathe_rc.arrays import Complex
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.stages.learning.learner import Loop
 from lathe_rc.study import untracked
 
 SEEDS = range(5)

@@ -4,9 +4,9 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from lathe_rc.signals.profile import Harmonics
-from lathe_rc.signals.profile_table import ProfileTable
-from lathe_rc.signals.tip_path import TipPath, steepest_fall
+from lathe_machine.signals.profile import Harmonics
+from lathe_machine.signals.profile_table import ProfileTable
+from lathe_machine.signals.tip_path import TipPath, steepest_fall
 from place import PICTURES
 
 RADIUS, TIP = 2e-3, 0.4e-3

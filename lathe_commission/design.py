@@ -19,6 +19,8 @@ import numpy as np
 
 from lathe_commission.cycle_weights import of_gaussian_process
 from lathe_commission.fir_inverse import fir_inverse
+from lathe_machine.stages.learning.learner import Learner, Loop, lag
+from lathe_machine.stages.spindle.speed_law import SpeedLawParameters
 from lathe_rc import messages
 from lathe_rc.analysis.cycle_factors import DriveMargin, Response
 from lathe_rc.analysis.frequency_response import FrequencyResponse
@@ -34,8 +36,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.judge.part import strictest
 from lathe_rc.messages import Signals
 from lathe_rc.signals.form_errors import FormErrors
-from lathe_rc.stages.learning.learner import Learner, Loop, lag
-from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
 
 _LEADS = np.linspace(0.5, 1.3, 9)  # over the lag that the correction leaves
 _GAINS = (1.0, 0.5)

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from lathe_machine.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
-from lathe_rc.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
 from lathe_rc.signals.measurement_file import Measurement
 
 _WHOLE = 0.95  # fraction of the range that counts as the full range

@@ -38,6 +38,8 @@ from lathe_commission import given
 from lathe_commission.design import LAWS, Known
 from lathe_commission.modal_fit import MOST_MODES, ResponseData, fit
 from lathe_commission.trials import Trials
+from lathe_machine.analysis.modal_drive import ModalDrive
+from lathe_machine.stages.learning.learning_controller import LearningController
 from lathe_rc.analysis.cycle_factors import DriveMargin
 from lathe_rc.analysis.frequency_response import (
     AVERAGES,
@@ -47,7 +49,6 @@ from lathe_rc.analysis.frequency_response import (
     write_states,
 )
 from lathe_rc.analysis.measured_drive import MeasuredDrive
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import Value, Values
 from lathe_rc.cell.scenario import Scenario, load
@@ -56,7 +57,6 @@ from lathe_rc.errors import InputError
 from lathe_rc.harness.result import Result
 from lathe_rc.harness.runner import run
 from lathe_rc.signals import measurement_file
-from lathe_rc.stages.learning.learning_controller import LearningController
 
 if TYPE_CHECKING:
     from lathe_rc.drawing.form import RunFigure

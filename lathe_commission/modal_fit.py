@@ -6,7 +6,7 @@ the model, is as large as the residuals require: 0 for residuals within σ. So p
 something out do not depend on the few points with the least noise, and their covariance includes its error. Where
 neighbouring residuals have the same sign, the covariance grows until the region of confidence covers their mean.
 
-The model is rational with a delay (`lathe_rc.analysis.modal_drive`). The search starts from the poles of vector
+The model is rational with a delay (`lathe_machine.analysis.modal_drive`). The search starts from the poles of vector
 fitting, for trial delays and each order. Normal modes and complex residues with lags compete; the model is that
 of the least BIC, -2·ln(likelihood) + k·ln(m) with k parameters and m real numbers, two for each point of a frequency
 response, among those whose parameters the points determine.
@@ -23,8 +23,8 @@ import scipy
 from lathe_commission import vector_fitting
 from lathe_commission.reduced_order import refuse_unusable
 from lathe_commission.vector_fitting import real_and_imaginary
+from lathe_machine.analysis.modal_drive import BASE, MILLI, ModalDrive, composed, resonance
 from lathe_rc.analysis.frequency_response import FrequencyResponse
-from lathe_rc.analysis.modal_drive import BASE, MILLI, ModalDrive, composed, resonance
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError, LatheError
 

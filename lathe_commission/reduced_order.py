@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from lathe_machine.control.decoupler import LAG, inverse
+from lathe_machine.transfer import Hold, LinearSystem, TransferFunction
 from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.arrays import Array, Complex
-from lathe_rc.control.decoupler import LAG, inverse
 from lathe_rc.errors import InputError, at_least
 from lathe_rc.signals.measurement_file import Measurement
-from lathe_rc.transfer import Hold, LinearSystem, TransferFunction
 
 _SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, relative to the length of the record
 _DAMPINGS = (0.2, 1.2)

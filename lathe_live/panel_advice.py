@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Advice to the operator on the part, in words, where a run's state tells it; one line of the panel's header.
 
-The steps after an alarm are those of the supervisor (`lathe_rc.safety.next_step`).
+The steps after an alarm are those of the supervisor (`lathe_machine.safety.next_step`).
 """
 
 from collections.abc import Collection, Mapping

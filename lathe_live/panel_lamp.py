@@ -11,10 +11,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from lathe_machine.safety import next_step
 from lathe_rc import event_log, messages
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import Signals
-from lathe_rc.safety import next_step
 from lathe_rc.safety.state_machine import RESET, Reaction, State
 
 OUT = (State.RETRACTING.name.lower(), State.SAFE.name.lower())  #: states in which the tool is out of the part

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
+from lathe_machine.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.cycle_factors import DriveMargin
 from lathe_rc.analysis.measured_drive import MeasuredDrive
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.batch import CellRunner, Errors
 from lathe_rc.cell.parameters import Values
@@ -21,7 +21,7 @@ from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
 from lathe_rc.signals.form_errors import FormErrors
 
 if TYPE_CHECKING:
-    from lathe_rc.stages.learning.learner import Learner
+    from lathe_machine.stages.learning.learner import Learner
 
 _WIDEST = 2.5  # end of a range, in values of the scenario
 _POINTS = 400  # of a response

@@ -13,7 +13,7 @@ The model is discretised exactly for a command that is linear between samples. T
 place the poles of the discrete observer at exp(-ωo·T), with the sampling step T; for a short step they approach T times
 l0, l1 and l2. The position is ``feedback_delay`` samples old, so the observer uses the command u that had reached the
 drive by then, and the form r of that sample. u_form is the form with its velocity and acceleration, fed forward through
-the inverse of the model (`lathe_rc.stages.learning.form_law`); the feedback gives the error two poles at -ωc.
+the inverse of the model (`lathe_machine.stages.learning.form_law`); the feedback gives the error two poles at -ωc.
 
 Source: Wu, Chen, Design and analysis of precision active disturbance rejection control for noncircular turning
 process, IEEE Trans. Industrial Electronics 56 (2009), for the structure: observer, feedback of its states, and
@@ -26,15 +26,15 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from lathe_machine.control.angle_filter import at
+from lathe_machine.plants.linear import discretise
+from lathe_machine.signals.profile_table import derivatives_at
+from lathe_machine.stages.learning.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
+from lathe_machine.stages.learning.law import Now
 from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import Positive, parameter
-from lathe_rc.control.angle_filter import at
 from lathe_rc.jit import kernel
-from lathe_rc.plants.linear import discretise
-from lathe_rc.signals.profile_table import derivatives_at
-from lathe_rc.stages.learning.form_law import FormLaw, FormLawParameters, ForwardTable, fed_forward
-from lathe_rc.stages.learning.law import Now
 
 
 class AdrcParameters(FormLawParameters):

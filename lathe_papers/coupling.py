@@ -3,7 +3,7 @@
 
 An electrodynamic drive follows an oval and cuts a part with two keyways. In one stage, drive and cut are computed
 sample by sample; in two stages, the force would reach the drive some samples late. The stability limit is that of
-`lathe_rc.analysis.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
+`lathe_machine.analysis.regeneration` at an overlap of 1, including the delay: K = -1/(2·min Re G·e^{-jωD}). The loop of
 cut and loaded spindle contains such a delay; longer delays are compared with a delay of one sample.
 """
 
@@ -14,14 +14,14 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
+from lathe_machine.plants.cutting import CuttingProcess
+from lathe_machine.plants.cutting_force import RIGID, SpecificForce
+from lathe_machine.plants.spindle import LoadedSpindle, SpeedLoop
+from lathe_machine.plants.tool_drive import ToolDrive
+from lathe_machine.plants.workpiece import Part
 from lathe_papers.formulas.loaded import compliance
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import RIGID, SpecificForce
-from lathe_rc.plants.spindle import LoadedSpindle, SpeedLoop
-from lathe_rc.plants.tool_drive import ToolDrive
-from lathe_rc.plants.workpiece import Part
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -14,6 +14,9 @@ import numpy as np
 from rich.console import Group
 
 from lathe_commission.reduced_order import ChannelStep, Fit, fit, fit_inverse, step_of
+from lathe_machine.analysis.pid_tuning import Loop, closed_loop, evaluate
+from lathe_machine.control.decoupler import FULL_W1, gain
+from lathe_machine.control.pid import FORCE, POSITION, PidGains
 from lathe_papers.decoupling_runs import (
     CROSS,
     Behaviour,
@@ -26,9 +29,6 @@ from lathe_papers.decoupling_runs import (
     times,
 )
 from lathe_papers.formulas.coupled_loops import CONNECTIONS, loops, with_errors
-from lathe_rc.analysis.pid_tuning import Loop, closed_loop, evaluate
-from lathe_rc.control.decoupler import FULL_W1, gain
-from lathe_rc.control.pid import FORCE, POSITION, PidGains
 from lathe_rc.study import Study, Track, comparison, untracked
 
 if TYPE_CHECKING:

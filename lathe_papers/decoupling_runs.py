@@ -8,16 +8,16 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_machine.analysis.pid_tuning import Loop, evaluate
+from lathe_machine.control.decoupler import PRESETS
+from lathe_machine.control.pid import FORCE, POSITION
+from lathe_machine.signals.allowance import Allowance, mean_reverting
+from lathe_machine.transfer import LinearSystem
 from lathe_papers.formulas.coupled_loops import CONNECTIONS, CoupledLoops, loops
 from lathe_papers.formulas.coupled_simulation import STEP, CoupledSimulation
-from lathe_rc.analysis.pid_tuning import Loop, evaluate
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.control.decoupler import PRESETS
-from lathe_rc.control.pid import FORCE, POSITION
-from lathe_rc.signals.allowance import Allowance, mean_reverting
 from lathe_rc.study import StudyParameters
-from lathe_rc.transfer import LinearSystem
 
 SETTLED = 2.0  #: time from which the paper computes the RMS of the force [s]
 CROSS = 3.0  #: simulated duration of a step [s]

@@ -14,6 +14,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
 from lathe_papers import marks
 from lathe_papers.formulas.responses import smoothing
 from lathe_papers.formulas.step_fit import (
@@ -29,7 +30,6 @@ from lathe_papers.formulas.step_fit import (
 )
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

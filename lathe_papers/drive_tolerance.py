@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_machine.stages.drive.drive import Drive
 from lathe_papers import cells, marks, sweeps
 from lathe_papers.judge import finite
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.stages.drive.drive import Drive
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ import scipy
 from annotated_types import Ge, Gt, Le
 from rich.console import Group
 
+from lathe_machine.plants.linear import discretise
 from lathe_papers.formulas.invariance import FirstOrderInvariance
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.errors import InputError
-from lathe_rc.plants.linear import discretise
 from lathe_rc.signals import speed
 from lathe_rc.signals.speed import SpeedLaw
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked

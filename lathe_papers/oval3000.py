@@ -18,6 +18,8 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
+from lathe_machine.stages.drive.drive import Drive
+from lathe_machine.stages.learning.learner import LawParameters, Learner, Loop
 from lathe_papers import cells, marks, robust
 from lathe_papers.judge import Judge, Judged, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
@@ -28,8 +30,6 @@ from lathe_rc.cell.scenario import TABLES, Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import in_words
-from lathe_rc.stages.drive.drive import Drive
-from lathe_rc.stages.learning.learner import LawParameters, Learner, Loop
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 from rich.table import Table as RichTable
 
+from lathe_machine.stages.tool.form import FormParameters
 from lathe_papers import cells
 from lathe_papers.formulas.tuning import PLAIN, ROWS
 from lathe_papers.multichannel import SCENARIOS, analytic
 from lathe_rc import messages
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.stages.tool.form import FormParameters
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

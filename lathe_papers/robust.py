@@ -15,6 +15,8 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
+from lathe_machine.stages.drive.drive import Drive
+from lathe_machine.stages.learning.learner import Learner
 from lathe_papers import cells, marks
 from lathe_papers.judge import Judge, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
@@ -22,8 +24,6 @@ from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import Values, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.stages.drive.drive import Drive
-from lathe_rc.stages.learning.learner import Learner
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lathe_machine.control.sampled_link import NONE, Link, SampledDrive, paper, ripple_free, towards
 from lathe_papers import sampled_servo_figure, sampled_servo_table
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import Measures, PseudoFrequency
@@ -26,7 +27,6 @@ from lathe_papers.sampled_servo_numbers import (
     SampledServoParameters,
 )
 from lathe_rc.arrays import Array
-from lathe_rc.control.sampled_link import NONE, Link, SampledDrive, paper, ripple_free, towards
 from lathe_rc.study import Study, Track, untracked
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lathe_machine.control.sampled_link import ripple_free
 from lathe_papers import marks
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import Measures
 from lathe_papers.sampled_servo_numbers import DESIRED, numbers, stable
 from lathe_rc.arrays import Array
-from lathe_rc.control.sampled_link import ripple_free
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from lathe_machine.plants.feed import Feedback
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import DesignReport, Measures, PseudoFrequency, StepResponse
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.plants.feed import Feedback
 from lathe_rc.study import StudyParameters
 
 RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.775, 1.0, 1.125, 1.25, 1.5)

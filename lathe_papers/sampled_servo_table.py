@@ -8,6 +8,7 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table as RichTable
 
+from lathe_machine.control.sampled_link import Link
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import Measures
 from lathe_papers.sampled_servo_numbers import (
@@ -20,7 +21,6 @@ from lathe_papers.sampled_servo_numbers import (
     numbers,
     stable,
 )
-from lathe_rc.control.sampled_link import Link
 from lathe_rc.study import comparison
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table
 
+from lathe_machine.control.periodic import PRESETS, PeriodicGains
 from lathe_papers.formulas import hyperstability
 from lathe_papers.formulas.hyperstability import BOX, NAMES, NOMINAL, Learning, Positivity
 from lathe_papers.formulas.periodic_example import Case, Outcome, ideal_input, limited_ideal_error, simulate, times
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
-from lathe_rc.control.periodic import PRESETS, PeriodicGains
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

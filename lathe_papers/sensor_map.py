@@ -18,6 +18,7 @@ from annotated_types import Ge, Gt, Le
 from rich.console import Group
 from rich.table import Table as RichTable
 
+from lathe_machine.stages.learning.learner import Learner
 from lathe_papers import cells
 from lathe_rc import messages
 from lathe_rc.arrays import Array
@@ -26,7 +27,6 @@ from lathe_rc.cell.parameters import Value, Values, parameter
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.messages import Signals
-from lathe_rc.stages.learning.learner import Learner
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
 
 if TYPE_CHECKING:

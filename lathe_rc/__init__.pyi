@@ -20,11 +20,6 @@ from lathe_rc.harness.result import Result as Result
 from lathe_rc.harness.runner import run as run
 from lathe_rc.jit import kernel as kernel
 from lathe_rc.judge.budget import budget as budget
-from lathe_rc.stages.drive.plant import Plant as Plant
-from lathe_rc.stages.drive.plant import PlantParameters as PlantParameters
-from lathe_rc.stages.learning.law import Law as Law
-from lathe_rc.stages.learning.law import Now as Now
-from lathe_rc.stages.learning.learner import LawParameters as LawParameters
 from lathe_rc.view.report import write_report as write_report
 
 __version__: str

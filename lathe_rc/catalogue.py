@@ -3,8 +3,9 @@
 
 Nothing is imported here, and nothing else in the core names what lies beside or above it.
 
-The core, ``lathe_rc``, runs cells, reads and writes bags, and judges and shows a run. The other packages import the
-core and never each other; only this table knows all of them. A package that is taken away takes its commands along.
+The core, ``lathe_rc``, runs cells, reads and writes bags, and judges and shows a run. ``lathe_machine`` has physics,
+laws and stages. The other packages import both and never each other; only this table knows all of them. A package that
+is taken away takes its stages or commands along.
 """
 
 from importlib.util import find_spec
@@ -49,7 +50,7 @@ COMMANDS_OF = {
     },
 }  #: summaries of the commands, by package and name
 
-OURS = frozenset([*COMMANDS_OF, "lathe_papers"])  #: packages of this distribution
+OURS = frozenset([*COMMANDS_OF, "lathe_machine", "lathe_papers"])  #: packages of this distribution
 _HERE = {package: table for package, table in COMMANDS_OF.items() if find_spec(package)}
 COMMANDS = dict(sorted((name, text) for table in _HERE.values() for name, text in table.items()))
 _BESIDES = {"container": "node"}  # commands defined in another command's module
@@ -65,36 +66,42 @@ STANDALONE = {
 
 DRAWN = "lathe_live.rerun_signals:is_drawn"  #: function that tells which message types a scene shows
 
-#: built-in stages by kind; their modules are imported on demand, which for all takes as long as a hundred revolutions
-STAGES = {
-    "spindle_encoder": "lathe_rc.stages.spindle.spindle_encoder:SpindleEncoder",
-    "encoder_device": "lathe_rc.stages.spindle.encoder_device:EncoderDevice",
-    "loaded_spindle": "lathe_rc.stages.spindle.loaded_spindle:LoadedSpindleStage",
-    "learning_controller": "lathe_rc.stages.learning.learning_controller:LearningController",
-    "disturbance_controller": "lathe_rc.stages.learning.disturbance_controller:DisturbanceController",
-    "compound_controller": "lathe_rc.stages.learning.compound_controller:CompoundController",
-    "resonant_controller": "lathe_rc.stages.learning.resonant_controller:ResonantController",
-    "norm_optimal_controller": "lathe_rc.stages.learning.norm_optimal_controller:NormOptimalController",
-    "electrodynamic_actuator": "lathe_rc.stages.drive.electrodynamic_actuator:ElectrodynamicActuator",
-    "piezo_actuator": "lathe_rc.stages.drive.piezo_actuator:PiezoActuator",
-    "series_drive": "lathe_rc.stages.drive.series_drive:SeriesDriveStage",
-    "loaded_drive": "lathe_rc.stages.drive.loaded_drive:LoadedDriveStage",
-    "loaded_series_drive": "lathe_rc.stages.drive.loaded_drive:LoadedSeriesDrive",
-    "vibration": "lathe_rc.stages.cut.vibration:Vibration",
-    "profile": "lathe_rc.stages.tool.form:ProfileStage",
-    "tool": "lathe_rc.stages.tool.tool:Tool",
-    "gauge": "lathe_rc.stages.tool.gauge:Gauge",
-    "feed_drive": "lathe_rc.stages.feed.feed_drive:FeedDriveStage",
-    "cutting_process": "lathe_rc.stages.cut.cutting_process:CuttingProcessStage",
-    "position_controller": "lathe_rc.stages.feed.position_controller:PositionController",
-    "force_controller": "lathe_rc.stages.feed.force_controller:ForceController",
-    "decoupler": "lathe_rc.stages.feed.decoupler:DecouplerStage",
-    "supervisor": "lathe_rc.stages.supervisor:Supervisor",
-    "fmu": "lathe_rc.stages.fmu:FmuStage",
+#: stages of the machine by kind; their modules are imported on demand, which for all takes as long as a hundred
+#: revolutions
+MACHINE = {
+    "spindle_encoder": "lathe_machine.stages.spindle.spindle_encoder:SpindleEncoder",
+    "encoder_device": "lathe_machine.stages.spindle.encoder_device:EncoderDevice",
+    "loaded_spindle": "lathe_machine.stages.spindle.loaded_spindle:LoadedSpindleStage",
+    "learning_controller": "lathe_machine.stages.learning.learning_controller:LearningController",
+    "disturbance_controller": "lathe_machine.stages.learning.disturbance_controller:DisturbanceController",
+    "compound_controller": "lathe_machine.stages.learning.compound_controller:CompoundController",
+    "resonant_controller": "lathe_machine.stages.learning.resonant_controller:ResonantController",
+    "norm_optimal_controller": "lathe_machine.stages.learning.norm_optimal_controller:NormOptimalController",
+    "electrodynamic_actuator": "lathe_machine.stages.drive.electrodynamic_actuator:ElectrodynamicActuator",
+    "piezo_actuator": "lathe_machine.stages.drive.piezo_actuator:PiezoActuator",
+    "series_drive": "lathe_machine.stages.drive.series_drive:SeriesDriveStage",
+    "loaded_drive": "lathe_machine.stages.drive.loaded_drive:LoadedDriveStage",
+    "loaded_series_drive": "lathe_machine.stages.drive.loaded_drive:LoadedSeriesDrive",
+    "vibration": "lathe_machine.stages.cut.vibration:Vibration",
+    "profile": "lathe_machine.stages.tool.form:ProfileStage",
+    "tool": "lathe_machine.stages.tool.tool:Tool",
+    "gauge": "lathe_machine.stages.tool.gauge:Gauge",
+    "feed_drive": "lathe_machine.stages.feed.feed_drive:FeedDriveStage",
+    "cutting_process": "lathe_machine.stages.cut.cutting_process:CuttingProcessStage",
+    "position_controller": "lathe_machine.stages.feed.position_controller:PositionController",
+    "force_controller": "lathe_machine.stages.feed.force_controller:ForceController",
+    "decoupler": "lathe_machine.stages.feed.decoupler:DecouplerStage",
+    "supervisor": "lathe_machine.stages.supervisor:Supervisor",
+    "fmu": "lathe_machine.stages.fmu:FmuStage",
 }
+_IS_HERE = find_spec("lathe_machine") is not None
+STAGES = MACHINE if _IS_HERE else {}  #: built-in stages by kind
 #: kinds of built-in stages that can be the time master of a cell
-MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle")
-DEVICES = ("encoder_device",)  #: those that follow a real encoder, instead of a clock of their own
+MASTERS = ("spindle_encoder", "encoder_device", "loaded_spindle") if _IS_HERE else ()
+#: roles of those that follow a real encoder, instead of a clock of their own
+DEVICES = {"encoder_device": "lathe_machine.nodes.encoder_role:EncoderRole"} if _IS_HERE else {}
+#: functions that a process calls before its run, so that no import stalls the run
+PREPARE = ("lathe_machine.control.bounded:prepare",) if _IS_HERE else ()
 
 
 def module_of(command: str) -> str:

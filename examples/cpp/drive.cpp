@@ -19,7 +19,7 @@ constexpr double PART = 0.0400000000000027;            // the rest of it [sample
 constexpr double CURRENT = 1.2 / 30.0;                 // moving mass over force constant [A/(m/s²)]
 
 // Position and velocity after a step of 15 625 ns, from those before and from the commands 23, 24 and 25 samples ago:
-// exact for a command that is linear between its samples. As lathe_rc.plants.linear.discretise gives them.
+// exact for a command that is linear between its samples. As lathe_machine.plants.linear.discretise gives them.
 constexpr uint32_t STEP_NS = 15625;
 constexpr double TRANSITION[2][2] = {
     {0.9998696148817827, 1.542233554902411e-05},

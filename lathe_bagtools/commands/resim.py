@@ -13,7 +13,7 @@ from lathe_bagtools.resimulation import identify
 from lathe_bagtools.resimulation.bag_spindle import asked_for
 from lathe_bagtools.resimulation.identify import Identified
 from lathe_bagtools.resimulation.resim import Resimulation, resimulate
-from lathe_rc.analysis import drive_fit
+from lathe_machine.analysis import drive_fit
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.bag.reading.source import Source

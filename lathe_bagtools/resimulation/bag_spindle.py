@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lathe_machine.signals.encoder import EncoderSamples
+from lathe_machine.stages.tool.tool import Tool
 from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
@@ -25,8 +27,6 @@ from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.signals.encoder import EncoderSamples
-from lathe_rc.stages.tool.tool import Tool
 
 
 class Memory(NamedTuple):

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from lathe_machine.analysis import drive_fit
+from lathe_machine.analysis.drive_fit import DriveFit
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 from lathe_rc import messages
-from lathe_rc.analysis import drive_fit, profile_csv
-from lathe_rc.analysis.drive_fit import DriveFit
+from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import evenly
 from lathe_rc.bag.reading.recorded import Recorded
 from lathe_rc.cell import models
@@ -19,7 +21,6 @@ from lathe_rc.cell.parameters import NodeParameters, remapped
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError
 from lathe_rc.files import replacing
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 
 _BEYOND = ("mode_frequency", "lag_time")  # parameters of which the identified model has none
 _FORM_POINTS = 720

@@ -12,6 +12,8 @@ from rich.console import RenderableType
 
 from lathe_commission import form_correction, part_record
 from lathe_commission.form_correction import Alignment, Correction, Revolution
+from lathe_machine.signals.profile import Profile
+from lathe_machine.stages.tool.form import FormParameters
 from lathe_rc import messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.arrays import Complex
@@ -24,9 +26,7 @@ from lathe_rc.commands import scenario as scenarios
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.judge import part
-from lathe_rc.signals.profile import Profile
 from lathe_rc.signals.quantities import parse_columns
-from lathe_rc.stages.tool.form import FormParameters
 
 _TURN = 2.0 * np.pi
 _ANGLES = _TURN * np.arange(1024) / 1024  # of the file

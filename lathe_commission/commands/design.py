@@ -116,8 +116,8 @@ def _points(measured: Path) -> list[Path]:
 def _other_speed(scenario: "Scenario", swing: float | None, drift: float | None) -> tuple["Scenario | None", list[str]]:
     """Return the scenario with the other speed at which laws run, and both speeds in words."""
     from lathe_commission.design import SWING_FREQUENCY, with_swing
+    from lathe_machine.stages.spindle.speed_law import SpeedLawParameters
     from lathe_rc.cell.wiring import Cell
-    from lathe_rc.stages.spindle.speed_law import SpeedLawParameters
 
     low, high = Cell(scenario.nodes).speed_range
     asked = swing is not None or drift is not None
@@ -137,8 +137,8 @@ def _drives(path: Path) -> list["Values"]:
     Raises:
         InputError: a file cannot be read, or describes no electrodynamic drive.
     """
+    from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
     from lathe_rc.cell import cells_file, ros_yaml
-    from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 
     nominal: list[Any] = [values for values in ros_yaml.read(path).values() if values]
     if len(nominal) != 1:

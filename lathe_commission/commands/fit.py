@@ -10,12 +10,12 @@ import numpy as np
 
 from lathe_commission import hysteresis_fit, reduced_order
 from lathe_commission.commands.fit_drive import drive
+from lathe_machine.control.decoupler import LAG
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.analysis import frequency_response
 from lathe_rc.commands import lossy, options, picture, tables
 from lathe_rc.commands import measured as measured_options
-from lathe_rc.control.decoupler import LAG
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.transfer import TransferFunction
 
 
 @click.group()
@@ -173,7 +173,7 @@ def _tuned(model: TransferFunction, phase_margin: float, gain_margin: float, del
     Raises:
         InputError: there is no such PID.
     """
-    from lathe_rc.analysis import pid_tuning  # SciPy's optimisers take a second
+    from lathe_machine.analysis import pid_tuning  # SciPy's optimisers take a second
 
     corners = np.abs(model.poles)
     corners = corners[corners > 0.0]

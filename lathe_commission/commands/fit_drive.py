@@ -17,16 +17,16 @@ from rich.table import Table
 
 from lathe_commission import drive_measurement, modal_fit
 from lathe_commission.modal_fit import ModalFit, NoFitError, ResponseData, StepData, Structure
+from lathe_machine.analysis.modal_drive import ModalDrive
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 from lathe_rc import files
 from lathe_rc.analysis import frequency_response
 from lathe_rc.analysis.frequency_response import Hold
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.arrays import Array
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture, tables
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals.measurement_file import Measurement
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

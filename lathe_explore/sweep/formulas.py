@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of a cell from closed-form rules, as a reference for a search.
 
-For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and interpolators as implemented:
+For a learning controller (`lathe_machine.analysis.learning`), with Q, drive and interpolators as implemented:
 
 - ``learning_gain``: γ = 1, as in paper 001, eqs 1-5;
 - ``q_time``: the shortest time with sup|Q - γZ| <= 1 - margin, since the remaining error (1 - Q)/(γZ + 1 - Q) grows
@@ -11,9 +11,10 @@ For a learning controller (`lathe_rc.analysis.learning`), with Q, drive and inte
   the margin with this lead, the lead that allows the shortest ``q_time``; if Q is not free, the lead with the smallest
   sup|Q - γZ|.
 
-For a force controller (`lathe_rc.analysis.pid_tuning`): the PID with the highest crossover that has margins of 60° and
-6 dB. Its plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T), where
-v0 is the velocity that causes F0. The plant includes the feedback delay, but neither limits nor elasticity nor keyways.
+For a force controller (`lathe_machine.analysis.pid_tuning`): the PID with the highest crossover that has margins of 60°
+and 6 dB. Its plant is the longitudinal slide W with the cut at the last set point F0: (1 - mc)·F0/v0·p·W/(1 + p·T),
+where v0 is the velocity that causes F0. The plant includes the feedback delay, but neither limits nor elasticity nor
+keyways.
 """
 
 import math
@@ -24,19 +25,19 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from lathe_rc.analysis.pid_tuning import fastest
+from lathe_machine.analysis.pid_tuning import fastest
+from lathe_machine.plants.cutting_force import SpecificForce
+from lathe_machine.stages.cut.cutting_process import CuttingProcessParameters
+from lathe_machine.stages.feed.feed_drive import FeedDriveParameters
+from lathe_machine.stages.feed.force_controller import ForceController
+from lathe_machine.stages.learning.learner import Loop
+from lathe_machine.stages.learning.learner import lag as drive_lag
+from lathe_machine.stages.learning.learning_controller import LearningController
+from lathe_machine.stages.learning.learning_parameters import LearningControllerParameters
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.plants.cutting_force import SpecificForce
-from lathe_rc.stages.cut.cutting_process import CuttingProcessParameters
-from lathe_rc.stages.feed.feed_drive import FeedDriveParameters
-from lathe_rc.stages.feed.force_controller import ForceController
-from lathe_rc.stages.learning.learner import Loop
-from lathe_rc.stages.learning.learner import lag as drive_lag
-from lathe_rc.stages.learning.learning_controller import LearningController
-from lathe_rc.stages.learning.learning_parameters import LearningControllerParameters
-from lathe_rc.transfer import TransferFunction
 
 _PID = ("proportional", "integral", "derivative", "derivative_filter")
 _LEARNING = {"lead_time", "q_time", "q_pass", "q_stop", "q_ripple", "learning_gain"}

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from lathe_explore.sweep import NUMBERS, OF_LEARNING, row
 from lathe_explore.sweep.expression import Expression
 from lathe_explore.sweep.row import Measure
+from lathe_machine.stages.learning.learner import Learner
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, shown
 from lathe_rc.names import instead
-from lathe_rc.stages.learning.learner import Learner
 
 _CONSTRAINT = re.compile(r"(?P<column>.+?)\s*(?P<sense>>=|<=)\s*(?P<bound>\S+)")
 

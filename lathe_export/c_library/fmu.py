@@ -21,10 +21,10 @@ import numpy as np
 from lathe_export.c_library import sources
 from lathe_export.c_library.library import Library
 from lathe_export.c_library.templates import TEMPLATES
+from lathe_machine.fmi.units import BASE, powers
 from lathe_rc import __version__, extras
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.fmi.units import BASE, powers
 
 with extras.named():
     import fmpy

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import control
 import numpy as np
 
-from lathe_rc.analysis.pid_tuning import Lti, delay, state_space
+from lathe_machine.analysis.pid_tuning import Lti, delay, state_space
+from lathe_machine.control.decoupler import FULL_W1, PRESETS, Channels, compensators, gain
+from lathe_machine.control.pid import FORCE, POSITION, PidGains
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.arrays import Array, Complex
-from lathe_rc.control.decoupler import FULL_W1, PRESETS, Channels, compensators, gain
-from lathe_rc.control.pid import FORCE, POSITION, PidGains
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import TransferFunction
 
 CONNECTIONS = {"none": (False, False), "k1": (True, False), "k2": (False, True), "both": (True, True)}
 #: active compensators (K1, K2), by name
@@ -96,7 +96,7 @@ def loops(
     """Return the loops of paper 004, with compensators of its approximate plant.
 
     Args:
-        preset: ``paper`` or ``realistic``, see `lathe_rc.control.decoupler.PRESETS`.
+        preset: ``paper`` or ``realistic``, see `lathe_machine.control.decoupler.PRESETS`.
         force_plant: ``approximate``: W1 as printed; ``full``: the W1 that underlies Fig. 12.
         connection: ``none``, ``k1``, ``k2`` or ``both``.
         wait: delay τ from a measurement to its command [s], as in `CoupledLoops`.

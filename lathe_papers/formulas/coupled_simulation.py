@@ -12,11 +12,11 @@ from typing import NamedTuple
 import control
 import numpy as np
 
+from lathe_machine.control.decoupler import Decoupler, DecouplerTable, decouple
+from lathe_machine.control.pid import Pid, PidTable
+from lathe_machine.control.pid import control as command_of
 from lathe_papers.formulas.coupled_loops import CoupledLoops, plant
 from lathe_rc.arrays import Array
-from lathe_rc.control.decoupler import Decoupler, DecouplerTable, decouple
-from lathe_rc.control.pid import Pid, PidTable
-from lathe_rc.control.pid import control as command_of
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import control
 import numpy as np
 
+from lathe_machine.control.periodic import PeriodicGains
+from lathe_machine.plants.feed_models import fourth_order
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.arrays import Array, Complex
-from lathe_rc.control.periodic import PeriodicGains
-from lathe_rc.plants.feed_models import fourth_order
-from lathe_rc.transfer import TransferFunction
 
 NAMES = ("K", "a1", "a2", "a3", "a4")
 NOMINAL = np.array([19.0, 21.5, 48.0, 46.9, 10.2])  #: eq. 19

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compliance of the tool drives: x/F of `lathe_rc.plants.tool_drive` in continuous time.
+"""Compliance of the tool drives: x/F of `lathe_machine.plants.tool_drive` in continuous time.
 
 Its inverse is the dynamic stiffness, and at p = 0 the static stiffness. The compliance, multiplied by the radial part
-of the cutting force, is the deflection for `lathe_rc.analysis.regeneration`.
+of the cutting force, is the deflection for `lathe_machine.analysis.regeneration`.
 """
 
 import numpy as np
 
-from lathe_rc.plants.coil import Coil
-from lathe_rc.transfer import TransferFunction
+from lathe_machine.plants.coil import Coil
+from lathe_machine.transfer import TransferFunction
 
 
 def compliance(

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lathe_machine.control.periodic import PRESETS, PeriodicController, PeriodicGains, samples_in
+from lathe_machine.signals.example_002 import PERIOD
+from lathe_machine.transfer import LinearSystem
 from lathe_papers.formulas.hyperstability import plant, required_input
 from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives, transient
 from lathe_rc.arrays import Array
-from lathe_rc.control.periodic import PRESETS, PeriodicController, PeriodicGains, samples_in
-from lathe_rc.signals.example_002 import PERIOD
-from lathe_rc.transfer import LinearSystem
 
 SHOWN = 3  #: number of periods in the curves
 _POINTS = 250  # points per period in the curves

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Example from paper 002, as in `lathe_rc.signals.example_002`: terms, derivatives, and the loop without delay."""
+"""Example from paper 002, as in `lathe_machine.signals.example_002`: terms, derivatives, and the loop without delay."""
 
 import numpy as np
 
+from lathe_machine.control.periodic import PeriodicController, PeriodicLaw, PeriodicState, advance
+from lathe_machine.signals.example_002 import OMEGA
+from lathe_machine.transfer import System, TransferFunction, discretise, rest, step
 from lathe_rc.arrays import Array
-from lathe_rc.control.periodic import PeriodicController, PeriodicLaw, PeriodicState, advance
 from lathe_rc.jit import kernel
-from lathe_rc.signals.example_002 import OMEGA
-from lathe_rc.transfer import System, TransferFunction, discretise, rest, step
 
 
 def transient(time: Array) -> Array:

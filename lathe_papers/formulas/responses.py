@@ -2,7 +2,7 @@
 """Frequency responses of drives, corrections and filters in continuous time.
 
 Papers 000 and 001 calculate with these ideal responses. A cell runs discrete systems, which have their own responses
-(`lathe_rc.plants.linear.DiscretePlant.response`); the formulas of `lathe_papers.formulas.structures` accept both.
+(`lathe_machine.plants.linear.DiscretePlant.response`); the formulas of `lathe_papers.formulas.structures` accept both.
 """
 
 from collections.abc import Callable

@@ -13,11 +13,20 @@ import control
 import numpy as np
 import numpy.typing as npt
 
+from lathe_machine.control.sampled_link import (
+    Link,
+    LinkTable,
+    SampledDrive,
+    closed_loop,
+    correct,
+    largest_pole,
+    rest,
+    table,
+)
+from lathe_machine.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move
+from lathe_machine.plants.feed_models import sampled
 from lathe_rc.arrays import Array, Complex
-from lathe_rc.control.sampled_link import Link, LinkTable, SampledDrive, closed_loop, correct, largest_pole, rest, table
 from lathe_rc.jit import kernel
-from lathe_rc.plants.feed import DriveTable, Feedback, FeedDrive, hold, load_of, motor_of, move
-from lathe_rc.plants.feed_models import sampled
 
 _BAND = 0.05  # settling band, relative to the step
 STEPS = 400  #: simulation steps per period, to resolve the motion between samples

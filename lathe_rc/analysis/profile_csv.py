@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles as CSV files, with the columns of `lathe_rc.signals.measured_profile.read_csv`."""
+"""Profiles as CSV files, with the columns of `lathe_machine.signals.measured_profile.read_csv`."""
 
 from pathlib import Path
 

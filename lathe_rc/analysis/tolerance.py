@@ -67,7 +67,7 @@ class Verdict:
         quantity: quantity that is judged.
         unjudged: reason why the end of the run cannot be judged; empty if it can.
         doubt: how far the desired form may be off between the points of its table [m]
-            (`lathe_rc.signals.interpolation_doubt`); a revolution is in tolerance if error and doubt together are.
+            (`lathe_machine.signals.interpolation_doubt`); a revolution is in tolerance if error and doubt together are.
         place: part of the surface that the figures are of; empty: all of it.
         zones: verdicts on the parts of the surface, if they have tolerances of their own: the part is in tolerance if
             each is, and the other figures are those of the part with the least to spare.

@@ -5,7 +5,7 @@ from lathe_rc import catalogue
 from lathe_rc.cell.stage import Stage
 from lathe_rc.extensions import Registry
 
-MASTERS, DEVICES = catalogue.MASTERS, catalogue.DEVICES
+MASTERS = catalogue.MASTERS
 
 #: built-in and third-party stages, by name
 STAGES: Registry[Stage] = Registry("stage", Stage, catalogue.STAGES, "lathe_rc.stages")

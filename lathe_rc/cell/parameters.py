@@ -50,8 +50,8 @@ def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, dr
     Example:
         >>> from typing import Annotated
         >>> from annotated_types import Gt
-        >>> from lathe_rc import LawParameters, parameter
-        >>> class Gains(LawParameters):
+        >>> from lathe_rc import NodeParameters, parameter
+        >>> class Gains(NodeParameters):
         ...     learning_gain: Annotated[float, Gt(0)] = parameter(1.0, "part of the error that a revolution learns")
         ...     lead_time: float = parameter(0.0, "lead of the memory", "s")
     """

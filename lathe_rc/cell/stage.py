@@ -111,11 +111,19 @@ class Stage(ABC):
         ...
         ...     def __init__(self, name, parameters):
         ...         super().__init__(name, parameters)
-        ...         self.memory = parameters.share
         ...         self.declare(
         ...             inputs=[Input("coarse/command", messages.COMMAND, ("position",))],
         ...             outputs=[Output("coarse/half", messages.COMMAND)],
         ...         )
+        ...
+        ...     @property
+        ...     def memory(self):
+        ...         return self.parameters.share
+        >>> half, out = Half("half", HalfParameters()), {"position": np.empty(2)}
+        >>> half.advance(0, [{"position": np.array([1.0, 2.0])}], [out])
+        []
+        >>> out["position"].tolist()
+        [0.5, 1.0]
     """
 
     kind: ClassVar[str]

@@ -20,9 +20,9 @@ from lathe_rc.cell.time_master import START_FROM, TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
 
 if TYPE_CHECKING:
+    from lathe_machine.stages.learning.learner import Loop
     from lathe_rc.analysis.cycle_factors import DriveMargin
     from lathe_rc.cell.checkpoint import Checkpoint
-    from lathe_rc.stages.learning.learner import Loop
 
 
 def _begun(nodes: Mapping[str, NodeParameters]) -> "Checkpoint | None":

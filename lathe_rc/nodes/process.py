@@ -8,6 +8,7 @@ import gc
 import importlib
 import inspect
 import os
+import pkgutil
 import signal
 import sys
 import time
@@ -23,17 +24,16 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.type_support import check_for_type_support
 
 from lathe_rc import allowed_code
+from lathe_rc.catalogue import DEVICES, PREPARE
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.kinds import DEVICES, MASTERS, STAGES
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
-from lathe_rc.control import bounded
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
-from lathe_rc.nodes.encoder_role import EncoderRole
 from lathe_rc.nodes.executor import Events
 from lathe_rc.nodes.recorder_role import RecorderRole
 from lathe_rc.nodes.report import THROUGHPUT, Reporter
@@ -58,12 +58,19 @@ def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellN
     roles: dict[str, Callable[[CellNode], Role]] = {
         RECORDER: RecorderRole,
         **dict.fromkeys(MASTERS, SpindleRole),
-        **dict.fromkeys(DEVICES, EncoderRole),
     }
+    if kind in DEVICES:
+        roles[kind] = pkgutil.resolve_name(DEVICES[kind])
     try:
         return CellNode(name, kind, roles.get(kind, StageRole), reporter, exchange)
     except RuntimeError as error:
         raise LatheError(f"{name}: {_words(error)}") from None
+
+
+def _prepare() -> None:
+    """Prepare the machine, so that no import stalls a run."""
+    for location in PREPARE:
+        pkgutil.resolve_name(location)()
 
 
 def _words(error: RuntimeError) -> str:
@@ -205,7 +212,7 @@ def run(members: Sequence[tuple[str, str]], args: Sequence[str]) -> int:
     _tune(members[0][0])
     reporter = Reporter()
     dds.settle()
-    bounded.prepare()
+    _prepare()
     np.seterr(over="ignore", invalid="ignore")  # each node names its own numbers that are not finite
     try:
         rclpy.init(args=["lathe", *args], signal_handler_options=SignalHandlerOptions.NO)
@@ -264,7 +271,7 @@ def preload(nodes: Mapping[str, tuple[str, Mapping[str, Any]]]) -> None:
         nodes: kind and parameters of each node; nodes with third-party classes load these themselves, since they may
             have changed.
     """
-    bounded.prepare()
+    _prepare()
     inspect.getframeinfo(cast("FrameType", inspect.currentframe()))  # rclpy's first log message reads all modules
     for package in _MESSAGES:
         for found in vars(importlib.import_module(package)).values():

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults, monitors and reactions.
+"""Faults and reactions: `faults` defines the kinds of faults, `injection` applies them at ports.
 
-The modules in ``__all__`` are public; all others may change. `faults` defines the kinds of faults, and `injection`
-applies them at ports. The alarms of `monitors`, which check signals by `rules`, drive the `state_machine`.
+`state_machine`: the states of a supervised cell.
 """
 
-__all__ = ["monitors"]
+__all__: list[str] = []  # no public names, see lathe_rc/__init__.pyi

@@ -9,11 +9,12 @@ import pytest
 from cells import assert_resimulated, config, form_error, scenario
 from shown_page import ShownPage
 
-from lathe_rc import Plant, PlantParameters, allowed_code, harness, kernel, parameter
+from lathe_machine import Plant, PlantParameters
+from lathe_machine.plants.linear import discretise, second_order
+from lathe_rc import allowed_code, harness, kernel, parameter
 from lathe_rc.analysis.frequency_response import FrequencyResponse, write_points
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.plants.linear import discretise, second_order
 from lathe_rc.view.report import write_report
 
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_machine.analysis.learning import LearningLoop
 from lathe_rc import messages
 from lathe_rc.analysis import cycle_factors
 from lathe_rc.analysis.cycle_factors import supremum
-from lathe_rc.analysis.learning import LearningLoop
 from lathe_rc.analysis.resonance_grid import Grid
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError

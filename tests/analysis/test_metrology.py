@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.signals.measured_profile import read_csv
+from lathe_machine.signals.profile import Harmonics
 from lathe_rc import cli, harness, messages
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.metrology import (
@@ -28,8 +30,6 @@ from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 from lathe_rc.signals.form_errors import RunningErrors, form_errors, that_count
-from lathe_rc.signals.measured_profile import read_csv
-from lathe_rc.signals.profile import Harmonics
 
 TURN = 2 * np.pi
 EVEN = np.arange(POINTS) * (TURN / POINTS)

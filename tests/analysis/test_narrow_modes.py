@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from cells import config, scenario
 
+from lathe_machine.analysis import feedback
 from lathe_rc import harness
-from lathe_rc.analysis import feedback
 from lathe_rc.analysis.cycle_factors import smallest_errors
 from lathe_rc.analysis.resonance_grid import with_images
 from lathe_rc.cell.wiring import Cell

@@ -8,11 +8,11 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.pid_tuning import delay, evaluate, fastest, response, state_space, tune
-from lathe_rc.control.decoupler import FULL_W1, PAPER, compensators, gain, lags
-from lathe_rc.control.pid import FORCE, POSITION, PidGains
+from lathe_machine.analysis.pid_tuning import delay, evaluate, fastest, response, state_space, tune
+from lathe_machine.control.decoupler import FULL_W1, PAPER, compensators, gain, lags
+from lathe_machine.control.pid import FORCE, POSITION, PidGains
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import TransferFunction
 
 
 def test_force_loop_is_that_of_the_paper():

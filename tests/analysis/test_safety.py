@@ -17,22 +17,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.control.bounded import Bounds, Mode, Takeover, motion, take_over
+from lathe_machine.safety.monitors import Clearance, Lookout, Monitor, below, growth, index_pulses, rate, threshold
+from lathe_machine.safety.rules import walk
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_machine.stages.feed.feed_drive import FeedDriveParameters, FeedDriveStage
+from lathe_machine.stages.learning.learning_controller import LearningController
+from lathe_machine.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 from lathe_rc import event_log, harness, messages
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.bounded import Bounds, Mode, Takeover, motion, take_over
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.protocol import MemberState, Phase
 from lathe_rc.safety import state_machine
-from lathe_rc.safety.monitors import Clearance, Lookout, Monitor, below, growth, index_pulses, rate, threshold
-from lathe_rc.safety.rules import walk
 from lathe_rc.safety.state_machine import RESET, RETRACTED, Reaction, State
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
-from lathe_rc.stages.feed.feed_drive import FeedDriveParameters, FeedDriveStage
-from lathe_rc.stages.learning.learning_controller import LearningController
-from lathe_rc.stages.supervisor import MEMBERS_LOST, SupervisorParameters
 
 STEP = 1.0 / 64000
 CONFIG = SCENARIOS[0].parent

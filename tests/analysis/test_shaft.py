@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.shaft import Shaft
+from lathe_machine.analysis.shaft import Shaft
 
 LENGTH, DIAMETER = 0.6, 0.034
 BENDING = 2.1e11 * np.pi * DIAMETER**4 / 64

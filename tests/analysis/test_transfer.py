@@ -13,7 +13,7 @@ from machines import run as run_in_blocks
 from numpy.testing import assert_allclose
 from scipy import signal
 
-from lathe_rc.transfer import LinearSystem, TransferFunction, discretise
+from lathe_machine.transfer import LinearSystem, TransferFunction, discretise
 
 STEP = 1e-3
 SYSTEMS = [

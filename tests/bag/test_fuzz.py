@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC
 
+from lathe_machine.control import memory_file
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
@@ -27,7 +28,6 @@ from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.reading.unpacking import unpack
 from lathe_rc.bag.repairing.salvage import Salvage
-from lathe_rc.control import memory_file
 from lathe_rc.errors import InputError, LatheError, shown
 
 

@@ -20,6 +20,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lathe_bagtools.resimulation.resim import resimulate
+from lathe_machine.control.q_filter import Exponential, Gaussian, QFilter, Weights
+from lathe_machine.safety.monitors import Alarm, PlainMonitor
+from lathe_machine.signals.deviation_law import DeviationLaw
+from lathe_machine.signals.part_profile import PartProfile
 from lathe_rc import allowed_code, extensions, harness, messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.source import Source
@@ -27,11 +31,7 @@ from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.q_filter import Exponential, Gaussian, QFilter, Weights
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.safety.monitors import Alarm, PlainMonitor
-from lathe_rc.signals.deviation_law import DeviationLaw
-from lathe_rc.signals.part_profile import PartProfile
 from lathe_rc.study import STUDIES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -249,7 +249,7 @@ class Careless(PartProfile):
     [
         ("q_filter", "nowhere:Hann", "Q filter 'nowhere:Hann' cannot be imported: ModuleNotFoundError: No module"),
         ("q_filter", "parts:Ham", "Q filter 'parts:Ham': parts has no 'Ham'"),
-        ("q_filter", "parts:Chirp", "allowed: a class that derives from lathe_rc.control.q_filter.QFilter"),
+        ("q_filter", "parts:Chirp", "allowed: a class that derives from lathe_machine.control.q_filter.QFilter"),
         ("q_filter", "hann", "= 'hann'; allowed: one of fir, exponential, gaussian, moving_average, or PACKAGE.MODULE"),
         ("q_filter", "test_parts:Leaky", "learning_controller.q_filter: 'test_parts:Leaky': Q(0) = 0.9; allowed: 1"),
         ("q_filter", "test_parts:Late", "smooth differs from response by "),
@@ -263,7 +263,7 @@ class Careless(PartProfile):
         ("profile", "test_parts:Upside", "heights of shape (2,); allowed: one or more finite positions that increase"),
         ("profile", "test_parts:Careless", "tool.profile = 'test_parts:Careless': IndexError in test_parts.py, line "),
         ("monitors", "test_parts:Unmade", "monitor test_parts:Unmade: TypeError in "),
-        ("monitors", "parts:Hann", "allowed: a class that derives from lathe_rc.safety.monitors.PlainMonitor"),
+        ("monitors", "parts:Hann", "allowed: a class that derives from lathe_machine.safety.monitors.PlainMonitor"),
     ],
 )
 def test_what_is_no_such_part_is_refused_with_its_node_and_parameter(parameter, name, says):

@@ -13,13 +13,13 @@ from numpy.testing import assert_allclose
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from lathe_bagtools.resimulation.resim import resimulate
+from lathe_machine.analysis import drive_fit
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.signals.measured_profile import read_csv
 from lathe_rc import harness, messages, resources
-from lathe_rc.analysis import drive_fit
 from lathe_rc.bag.reading.source import Source
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.errors import InputError
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.signals.measured_profile import read_csv
 
 STEP = 1.0 / 64000.0
 PISTON = resources.find(Path("piston.yaml"))

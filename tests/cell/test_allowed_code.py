@@ -63,9 +63,8 @@ class Received:
         here.mkdir()
         os.chdir(here)
         shutil.copytree(bag, self.bag)
-        text = (
-            f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\nfrom lathe_rc.stages.tool.tool import Tool\n"
-        )
+        text = f"from pathlib import Path\nPath({str(self.mark)!r}).touch()\n"
+        text += "from lathe_machine.stages.tool.tool import Tool\n"
         for place in (here, self.bag):
             (place / f"{self.module}.py").write_text(text)
 

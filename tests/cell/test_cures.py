@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lathe_commission.reduced_order import ChannelStep, fit_inverse
+from lathe_machine.stages.learning.learner import Learner
+from lathe_machine.transfer import TransferFunction
 from lathe_rc import harness, resources
 from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, at_least, at_most
-from lathe_rc.stages.learning.learner import Learner
-from lathe_rc.transfer import TransferFunction
 
 CONFIG = Path(__file__).parents[2] / "config"
 FAST = ("nominal_rpm=3000.0",)

@@ -7,14 +7,14 @@ from cells import scenario
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
+from lathe_machine.plants.drift import Drift
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.modes import Modes
+from lathe_machine.plants.tool_drive import ToolDrive
+from lathe_machine.plants.tool_motion import advance
 from lathe_rc import harness
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.plants.drift import Drift
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.modes import Modes
-from lathe_rc.plants.tool_drive import ToolDrive
-from lathe_rc.plants.tool_motion import advance
 
 STEP = 1 / 64000
 SERVO = {"natural_frequency": 1036.7, "damping": 0.7, "delay": 0.2e-3, "stroke": 1.0, "moving_mass": 1.2}

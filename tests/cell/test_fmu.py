@@ -16,12 +16,12 @@ from test_extending import lathe
 
 from lathe_bagtools import hosts
 from lathe_export.c_library.sources import export_nodes
+from lathe_machine.fmi import imported
 from lathe_rc import harness
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.wiring import Cell, new_stage
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.fmi import imported
 from lathe_rc.nodes import graph
 
 SPINDLE = "/spindle_encoder: {ros__parameters: {revolutions: 3.0}}\n"

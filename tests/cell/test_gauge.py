@@ -7,9 +7,9 @@ from cells import config, form_error, of_nodes
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.stages.tool.gauge import Gauge, GaugeParameters
 from lathe_rc import harness, messages
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.stages.tool.gauge import Gauge, GaugeParameters
 
 TURN = 2 * np.pi
 DELAY = 64

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from lathe_machine.control import memory_file
 from lathe_rc import data_file
-from lathe_rc.control import memory_file
 from lathe_rc.errors import InputError, LatheError
 
 POINTS = np.random.default_rng(1).standard_normal(256)

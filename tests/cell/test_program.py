@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lathe_machine.stages.spindle.spindle_encoder import SpindleEncoder
+from lathe_machine.stages.tool.form import FormTable
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Input, Output, Sparse
 from lathe_rc.cell.parameters import NodeParameters
@@ -17,8 +19,6 @@ from lathe_rc.compiled.step import CompiledStep
 from lathe_rc.errors import LatheError
 from lathe_rc.jit import kernel
 from lathe_rc.messages import COMMAND, ENCODER
-from lathe_rc.stages.spindle.spindle_encoder import SpindleEncoder
-from lathe_rc.stages.tool.form import FormTable
 
 
 @given(

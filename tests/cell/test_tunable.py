@@ -8,7 +8,8 @@ import pytest
 from cells import assert_resimulated, config, run, scenario
 from numpy.testing import assert_allclose
 
-from lathe_rc import Law, LawParameters, allowed_code, harness, parameter
+from lathe_machine import Law, LawParameters
+from lathe_rc import allowed_code, harness, parameter
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
 

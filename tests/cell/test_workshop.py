@@ -9,9 +9,9 @@ from bags import lathe
 from cells import scenario
 from numpy.testing import assert_allclose
 
+from lathe_machine.signals import measured_profile
 from lathe_rc import harness
 from lathe_rc.judge import part
-from lathe_rc.signals import measured_profile
 
 ORDERS, AMPLITUDES = [1, 2, 12], [20e-6, 100e-6, 2e-6]
 

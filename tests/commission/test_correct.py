@@ -16,10 +16,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_commission import form_correction, part_record
 from lathe_commission.form_correction import align, correction, evaluate, harmonics, outliers
+from lathe_machine.signals.measured_profile import read_csv as read_profile
 from lathe_rc import cli, harness
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.signals.measured_profile import read_csv as read_profile
 from lathe_rc.signals.quantities import parse_columns
 
 TURN = 2 * np.pi

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 import lathe_rc
 from lathe_commission import design
 from lathe_commission.design import Design
+from lathe_machine.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.frequency_response import FrequencyResponse, write_points
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
 from lathe_rc.errors import InputError

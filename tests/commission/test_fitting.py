@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 
 from lathe_commission.commands import fit
 from lathe_commission.reduced_order import step_of
-from lathe_rc.analysis import pid_tuning
+from lathe_machine.analysis import pid_tuning
+from lathe_machine.control.decoupler import PAPER
+from lathe_machine.plants.hysteresis import THRESHOLDS, WEIGHTS, PrandtlIshlinskii
 from lathe_rc.cli import main
-from lathe_rc.control.decoupler import PAPER
-from lathe_rc.plants.hysteresis import THRESHOLDS, WEIGHTS, PrandtlIshlinskii
 
 PROPORTIONAL = 0.7617
 

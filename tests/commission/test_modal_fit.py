@@ -21,9 +21,9 @@ from lathe_commission import modal_fit
 from lathe_commission.drive_measurement import data, step_response
 from lathe_commission.modal_fit import ResponseData, StepData
 from lathe_explore.sweep.space import Space
+from lathe_machine.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis import frequency_response
 from lathe_rc.analysis.frequency_response import FrequencyResponse, estimate
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.cell import cells_file
 from lathe_rc.cli import main
 from lathe_rc.commands import measured as measured_options

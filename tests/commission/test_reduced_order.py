@@ -6,10 +6,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from lathe_commission.reduced_order import ChannelStep, fit, fit_inverse, of_measurement, step_of
-from lathe_rc.control.decoupler import FULL_W1, LAG, PAPER, REALISTIC, gain, lags
+from lathe_machine.control.decoupler import FULL_W1, LAG, PAPER, REALISTIC, gain, lags
+from lathe_machine.transfer import TransferFunction
 from lathe_rc.errors import InputError
 from lathe_rc.signals.measurement_file import read
-from lathe_rc.transfer import TransferFunction
 
 TIME = np.arange(1001) * 1e-3
 FREQUENCY = np.geomspace(0.3, 100.0, 40)

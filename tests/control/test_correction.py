@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from test_identification import respond
 from test_repetitive import GRID, STEP, TURN, make
 
-from lathe_rc.control.correction import Correction, CorrectionLaw
-from lathe_rc.control.interpolation import derivative_responses, read_derivatives
-from lathe_rc.control.lead import LeadLaw
+from lathe_machine.control.correction import Correction, CorrectionLaw
+from lathe_machine.control.interpolation import derivative_responses, read_derivatives
+from lathe_machine.control.lead import LeadLaw
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 

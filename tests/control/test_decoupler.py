@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.decoupler import (
+from lathe_machine.control.decoupler import (
     FULL_W1,
     LEAK,
     PAPER,
@@ -20,8 +20,8 @@ from lathe_rc.control.decoupler import (
     inverse,
     lags,
 )
+from lathe_machine.transfer import LinearSystem, TransferFunction
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import LinearSystem, TransferFunction
 
 STEP = 1 / 64000
 FREQUENCY = np.geomspace(0.5, 500.0, 60)

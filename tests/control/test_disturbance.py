@@ -9,19 +9,19 @@ from cells import config, scenario
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.control import disturbance_memory
+from lathe_machine.control.angle_filter import angle_filter, at, follow
+from lathe_machine.signals.encoder import Encoder
+from lathe_machine.signals.profile import Piston
+from lathe_machine.signals.profile_table import derivatives_at, deviation_along, height_along, tabulated
+from lathe_machine.stages.learning.law import Law
 from lathe_rc import messages
 from lathe_rc.cell import batch
 from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
-from lathe_rc.control import disturbance_memory
-from lathe_rc.control.angle_filter import angle_filter, at, follow
 from lathe_rc.errors import DivergedError, InputError
 from lathe_rc.signals import speed
-from lathe_rc.signals.encoder import Encoder
-from lathe_rc.signals.profile import Piston
-from lathe_rc.signals.profile_table import derivatives_at, deviation_along, height_along, tabulated
-from lathe_rc.stages.learning.law import Law
 from lathe_rc.study import STUDIES
 
 STEP = 1 / 64000

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.identification import DriveIdentifier
+from lathe_machine.control.identification import DriveIdentifier
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
 from lathe_rc.errors import InputError
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
 
 STATUS = "/coarse/learning"
 STEP = 1 / 64000

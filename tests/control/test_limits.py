@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.control.limits import CommandLimits, limit, limiter
 from lathe_rc import harness, messages
-from lathe_rc.control.limits import CommandLimits, limit, limiter
 from lathe_rc.errors import InputError
 
 STEP = 1.0 / 64000

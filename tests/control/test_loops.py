@@ -15,11 +15,11 @@ from shown_page import ShownPage
 
 from lathe_explore.sweep import LOOP_FIGURES, row
 from lathe_explore.sweep.objectives import objectives
+from lathe_machine.control.pid import Pid, PidGains
 from lathe_rc import harness
 from lathe_rc.analysis.loop_errors import RunningLoop
 from lathe_rc.analysis.tolerance import FORCE, growth, swing_growth
 from lathe_rc.cli import main
-from lathe_rc.control.pid import Pid, PidGains
 from lathe_rc.errors import InputError
 from lathe_rc.judge.loops import FIGURES
 from lathe_rc.signals.form_errors import form_errors

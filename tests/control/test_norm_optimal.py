@@ -6,10 +6,10 @@ import pytest
 from cells import config
 
 import lathe_rc
+from lathe_machine.control.norm_optimal import nearest, waves
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.norm_optimal import nearest, waves
 
 QUIET = ["nominal_rpm=3000.0", "spindle_encoder.deviation_amplitude=[]", "spindle_encoder.deviation_frequency=[]"]
 QUIET += ["spindle_encoder.deviation_phase=[]", "tool.profile=harmonics", "tool.harmonic_order=[2,6]"]

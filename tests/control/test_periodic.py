@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
+from lathe_machine.control.periodic import _SWITCH, PRESETS, PeriodicController, samples_in
+from lathe_machine.transfer import LinearSystem
 from lathe_papers.formulas.hyperstability import NOMINAL, plant, popov_bound
 from lathe_papers.formulas.periodic_loop import PeriodicLoop, disturbance, steady_derivatives
-from lathe_rc.control.periodic import _SWITCH, PRESETS, PeriodicController, samples_in
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import LinearSystem
 
 STEP = 0.01
 SAMPLES = 100

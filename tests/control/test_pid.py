@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.pid import FORCE, POSITION, Pid, PidGains, enable_integrator
+from lathe_machine.control.pid import FORCE, POSITION, Pid, PidGains, enable_integrator
+from lathe_machine.transfer import LinearSystem
 from lathe_rc.errors import InputError
-from lathe_rc.transfer import LinearSystem
 
 STEP = 1 / 64000
 GAINS, ONLY_GAIN = PidGains(0.8, 5.0, 0.02, 900.0), PidGains(1.0, 0.0, 0.0, 1.0)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, Weights
+from lathe_machine.control.q_filter import Exponential, Gaussian, LowPass, MovingAverage, Weights
 from lathe_rc.errors import InputError
 
 CYCLE = 4096

@@ -8,12 +8,12 @@ from cells import config
 from numpy.testing import assert_allclose
 
 import lathe_rc
+from lathe_machine.analysis.modal_drive import ModalDrive
+from lathe_machine.analysis.rational_model import rational_model
+from lathe_machine.control import rational_fit, rational_inverse
 from lathe_rc import messages
-from lathe_rc.analysis.modal_drive import ModalDrive
-from lathe_rc.analysis.rational_model import rational_model
 from lathe_rc.cell import batch
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control import rational_fit, rational_inverse
 from lathe_rc.errors import InputError
 
 STEP = 1 / 64000

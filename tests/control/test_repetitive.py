@@ -8,11 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.control.correction import Correction, CorrectionLaw
-from lathe_rc.control.interpolation import cubic, cubic_response
-from lathe_rc.control.lead import LeadLaw, Preview
-from lathe_rc.control.q_filter import Exponential
-from lathe_rc.control.repetitive import LEARNING_DELAY, AngleLostError, RepetitiveController, largest_feedback_delay
+from lathe_machine.control.correction import Correction, CorrectionLaw
+from lathe_machine.control.interpolation import cubic, cubic_response
+from lathe_machine.control.lead import LeadLaw, Preview
+from lathe_machine.control.q_filter import Exponential
+from lathe_machine.control.repetitive import (
+    LEARNING_DELAY,
+    AngleLostError,
+    RepetitiveController,
+    largest_feedback_delay,
+)
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
 

@@ -130,7 +130,7 @@ def test_a_further_axis_survives_an_end_at_any_write(call, piston, tmp_path, mon
 
 
 LAW = '''
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 import my_gain
 
 class Drive(ElectrodynamicActuator):

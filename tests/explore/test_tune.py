@@ -18,12 +18,12 @@ from lathe_explore.sweep import formulas, history, row, sweep, tune
 from lathe_explore.sweep.objectives import objectives
 from lathe_explore.sweep.search_space import Dimension, search_space
 from lathe_explore.sweep.space import Space
+from lathe_machine.analysis.pid_tuning import evaluate
+from lathe_machine.control.decoupler import PAPER
+from lathe_machine.control.pid import PidGains
 from lathe_rc import cli, harness, resources
-from lathe_rc.analysis.pid_tuning import evaluate
 from lathe_rc.cell import batch, scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control.decoupler import PAPER
-from lathe_rc.control.pid import PidGains
 from lathe_rc.errors import InputError
 
 LEAD, Q = "learning_controller.lead_time", "learning_controller.q_time"

@@ -15,11 +15,11 @@ from cells import scenario
 
 from lathe_export.c_library.single_precision import single
 from lathe_export.c_library.sources import export_nodes, library_of, sources
+from lathe_machine.stages.learning.learning_controller import LearningController
+from lathe_machine.stages.tool.tool import Tool
 from lathe_rc import InputError
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
-from lathe_rc.stages.learning.learning_controller import LearningController
-from lathe_rc.stages.tool.tool import Tool
 
 WORDS = ("int", "lathe", "lathe_cell", "class", "main", "memcpy", "tapes", "math", "all", "write")
 
@@ -191,7 +191,7 @@ def test_the_steps_read_as_the_kernels_do_and_need_libm_alone(law):
     text = (law.place / "learning_controller_step.c").read_text()
     assert "real.data[SQUARES] = squares;" in text
     assert "/* Points to be read must already be learned, and not yet be overwritten by the next cycle. */" in text
-    assert "lathe_rc.control.angle_memory.find: Assign the grid points" in text
+    assert "lathe_machine.control.angle_memory.find: Assign the grid points" in text
     page = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
     section = re.search(r"## A step as C\n(.*?)\n## ", page, re.DOTALL)[1]
     shown = re.findall(r"```c\n(.*?)```", section, re.DOTALL)

@@ -18,11 +18,11 @@ from fmpy.ssp import ssd
 from lathe_export.c_library import sources
 from lathe_export.c_library.fmu import export_fmu
 from lathe_export.c_library.reference import Reference
+from lathe_machine.fmi import imported
 from lathe_rc import LatheError, harness
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.scenario import TABLES, load
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.fmi import imported
 
 STEP = 1.0 / 64_000
 

@@ -28,6 +28,7 @@ from lathe_live.panel_run import Driver, LiveCell
 from lathe_live.panel_verdict import Evaluation
 from lathe_live.panel_view import Have, news
 from lathe_live.rerun_signals import is_drawn
+from lathe_machine.safety import next_step
 from lathe_rc import event_log, harness, messages
 from lathe_rc.analysis.tolerance import growth, judge
 from lathe_rc.bag.reading.source import Source
@@ -36,7 +37,6 @@ from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import DivergedError, InputError, LatheError
 from lathe_rc.judge import part
-from lathe_rc.safety import next_step
 from lathe_rc.safety.state_machine import Reaction, State
 
 ROOT = Path(__file__).parents[2]

@@ -17,6 +17,8 @@ from machines import assert_refused
 from numpy.testing import assert_allclose
 
 from lathe_bagtools.resimulation.resim import resimulate
+from lathe_machine.signals.counts import CountedAngle, CsvReader, LineReader
+from lathe_machine.stages.spindle.encoder_device import EncoderDevice
 from lathe_rc import harness
 from lathe_rc.bag.reading import stream
 from lathe_rc.cell import scenario as scenarios
@@ -24,8 +26,6 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
-from lathe_rc.signals.counts import CountedAngle, CsvReader, LineReader
-from lathe_rc.stages.spindle.encoder_device import EncoderDevice
 from lathe_rc.view.report_form import Form
 
 STEP_NS, COUNTS = 15_625, 1000

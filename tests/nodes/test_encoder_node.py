@@ -13,12 +13,12 @@ from cells import until
 from test_counts import COUNTS, TURN, follower, write_counts, write_edges
 
 from lathe_bagtools.resimulation.resim import resimulate
+from lathe_machine.nodes import encoder_role
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
 from lathe_rc.errors import LatheError
-from lathe_rc.nodes import encoder_role
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 
 pytest.importorskip("rclpy")
 

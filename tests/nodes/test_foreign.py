@@ -21,6 +21,7 @@ pytest.importorskip("rclpy")
 
 from ament_index_python.packages import get_package_prefix, get_packages_with_prefixes
 
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
@@ -30,7 +31,6 @@ from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import graph
 from lathe_rc.protocol import Announcement
 from lathe_rc.signals.form_errors import form_errors
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PROGRAMS = {

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lathe_machine.stages.tool.tool import ToolParameters
 from lathe_rc import messages
 from lathe_rc.blocks.delay_buffer import DelayBuffer
 from lathe_rc.blocks.wire import Encoder
@@ -17,7 +18,6 @@ from lathe_rc.protocol import BadBlock, ForeignMessage
 from lathe_rc.protocol.block_queue import BlockQueue
 from lathe_rc.protocol.exchange import Run
 from lathe_rc.protocol.inputs import Inputs
-from lathe_rc.stages.tool.tool import ToolParameters
 
 SIZE = 4
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_machine.analysis.pid_tuning import response
+from lathe_machine.control.decoupler import LEAK, PAPER, Channels, gain
+from lathe_machine.control.pid import FORCE, POSITION
 from lathe_papers.formulas.coupled_loops import CONNECTIONS, loops, with_errors
 from lathe_papers.formulas.coupled_simulation import STEP, CoupledSimulation
-from lathe_rc.analysis.pid_tuning import response
-from lathe_rc.control.decoupler import LEAK, PAPER, Channels, gain
-from lathe_rc.control.pid import FORCE, POSITION
 from lathe_rc.errors import InputError
 
 FREQUENCY = np.geomspace(0.1, 300.0, 40)

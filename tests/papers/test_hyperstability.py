@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from lathe_machine.control.periodic import PRESETS
+from lathe_machine.signals.example_002 import PERIOD, fill_disturbance, fill_reference
 from lathe_papers.formulas import hyperstability as hs
 from lathe_papers.formulas.periodic_loop import disturbance, steady_derivatives, transient
-from lathe_rc.control.periodic import PRESETS
-from lathe_rc.signals.example_002 import PERIOD, fill_disturbance, fill_reference
 
 PUBLISHED = PRESETS["published"]
 TIME = np.arange(5000) * PERIOD / 5000

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 from rich.console import Console
 
+from lathe_machine.control.sampled_link import NONE, Link, SampledDrive, closed_loop, paper, ripple_free, towards
 from lathe_papers import sampled_servo
 from lathe_papers.formulas import sampled_loop
 from lathe_papers.formulas.sampled_loop import STEPS, measures, periods_to_settle, report, step_response
 from lathe_papers.sampled_servo_numbers import DESIRED, RATIOS, SampledServoParameters
-from lathe_rc.control.sampled_link import NONE, Link, SampledDrive, closed_loop, paper, ripple_free, towards
 
 DRIVE = SampledDrive(6.25, 0.08, 0.16)
 ROUNDING = 1e-9

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from lathe_machine.control.periodic import PRESETS
 from lathe_papers.formulas.hyperstability import NOMINAL, corners
 from lathe_papers.formulas.periodic_example import Case, limited_ideal_error, simulate
-from lathe_rc.control.periodic import PRESETS
 from lathe_rc.errors import InputError
 from lathe_rc.study import STUDIES
 

@@ -15,20 +15,20 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 
+from lathe_machine.analysis.regeneration import Regeneration
+from lathe_machine.transfer import TransferFunction
 from lathe_papers import angle_domain, drive_models, invariance
 from lathe_papers.angle_domain import AngleDomainParameters
 from lathe_papers.formulas.invariance import FirstOrderInvariance
 from lathe_papers.formulas.loaded import compliance
 from lathe_papers.formulas.step_fit import SecondOrder
 from lathe_papers.invariance import InvarianceParameters
-from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.cli import main
 from lathe_rc.commands import study as commands_study
 from lathe_rc.commands.study import read
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.signals import speed
 from lathe_rc.study import STUDIES
-from lathe_rc.transfer import TransferFunction
 
 KEYS = {
     "invariance": "speeds angles corrected uncorrected max_spread_corrected max_spread_uncorrected "

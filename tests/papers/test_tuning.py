@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from lathe_machine.plants.linear import discretise
+from lathe_machine.plants.linear import second_order as matrices
 from lathe_papers.formulas.responses import lead, lead_lag
 from lathe_papers.formulas.structures import cycles, steady_error, supremum
 from lathe_papers.formulas.tuning import (
@@ -21,8 +23,6 @@ from lathe_papers.formulas.tuning import (
     smallest_deviation,
 )
 from lathe_rc.errors import LatheError
-from lathe_rc.plants.linear import discretise
-from lathe_rc.plants.linear import second_order as matrices
 
 
 @pytest.mark.parametrize(

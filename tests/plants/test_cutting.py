@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose
 
+from lathe_machine.plants.cutting import GIVEN, MADE, CuttingProcess
+from lathe_machine.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
+from lathe_machine.plants.workpiece import HardSpot, Part
+from lathe_machine.signals.allowance import PAPER_RMS, Allowance, mean_reverting
+from lathe_machine.transfer import LinearSystem, TransferFunction
 from lathe_rc.errors import LatheError
-from lathe_rc.plants.cutting import GIVEN, MADE, CuttingProcess
-from lathe_rc.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
-from lathe_rc.plants.workpiece import HardSpot, Part
 from lathe_rc.signals import speed as speeds
-from lathe_rc.signals.allowance import PAPER_RMS, Allowance, mean_reverting
-from lathe_rc.transfer import LinearSystem, TransferFunction
 
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]

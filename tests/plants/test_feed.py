@@ -13,13 +13,13 @@ from machines import assert_refused, refusals
 from machines import run as run_in_blocks
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lathe_rc.control.limits import CommandLimits
-from lathe_rc.plants.feed import FeedDrive
-from lathe_rc.plants.feed_models import APPROXIMATE_LAGS, FULL_LAGS, dc_screw, fourth_order, sampled
-from lathe_rc.plants.friction import Friction, mobility
-from lathe_rc.plants.hysteresis import plays
-from lathe_rc.plants.screw import Screw
-from lathe_rc.transfer import LinearSystem, TransferFunction
+from lathe_machine.control.limits import CommandLimits
+from lathe_machine.plants.feed import FeedDrive
+from lathe_machine.plants.feed_models import APPROXIMATE_LAGS, FULL_LAGS, dc_screw, fourth_order, sampled
+from lathe_machine.plants.friction import Friction, mobility
+from lathe_machine.plants.hysteresis import plays
+from lathe_machine.plants.screw import Screw
+from lathe_machine.transfer import LinearSystem, TransferFunction
 
 STEP = 1 / 64000
 COARSE = 1e-3

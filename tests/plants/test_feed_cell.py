@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from lathe_machine.control.predistortion import Predistortion, cancelling, proportional
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-from lathe_rc.control.predistortion import Predistortion, cancelling, proportional
 from lathe_rc.errors import InputError
 
 

@@ -14,9 +14,9 @@ from machines import run as run_in_blocks
 from numpy.testing import assert_allclose
 
 from lathe_commission.hysteresis_fit import Loop, from_signals, identify, of_measurement
+from lathe_machine.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
 from lathe_papers.formulas.vibration import describing_function
 from lathe_rc.errors import InputError
-from lathe_rc.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
 from lathe_rc.signals.measurement_file import read
 
 FORWARD = [PrandtlIshlinskii, BoucWen]

@@ -10,18 +10,18 @@ from cells import scenario
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
+from lathe_machine.analysis.regeneration import Regeneration
+from lathe_machine.plants.coil import Coil
+from lathe_machine.plants.cutting import CuttingProcess
+from lathe_machine.plants.cutting_force import RIGID, SpecificForce
+from lathe_machine.plants.piezo import Stack
+from lathe_machine.plants.tool_drive import Piezo, ToolDrive
+from lathe_machine.plants.workpiece import Part
+from lathe_machine.transfer import TransferFunction
 from lathe_papers.formulas.loaded import compliance, compliance_in_series
 from lathe_rc import harness
-from lathe_rc.analysis.regeneration import Regeneration
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError
-from lathe_rc.plants.coil import Coil
-from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import RIGID, SpecificForce
-from lathe_rc.plants.piezo import Stack
-from lathe_rc.plants.tool_drive import Piezo, ToolDrive
-from lathe_rc.plants.workpiece import Part
-from lathe_rc.transfer import TransferFunction
 
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]

@@ -8,11 +8,11 @@ from machines import assert_refused
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
+from lathe_machine.plants.spindle import Belt, LoadedSpindle, SpeedLoop
+from lathe_machine.transfer import TransferFunction
 from lathe_rc import harness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import LatheError
-from lathe_rc.plants.spindle import Belt, LoadedSpindle, SpeedLoop
-from lathe_rc.transfer import TransferFunction
 
 STEP = 1 / 64000
 SPEED = 100.0  # [rad/s]

@@ -7,11 +7,11 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 import lathe_rc
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.modes import Modes, carriage
+from lathe_machine.plants.piezo import Stack
+from lathe_machine.plants.tool_drive import Piezo, ToolDrive
 from lathe_rc.errors import InputError
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.modes import Modes, carriage
-from lathe_rc.plants.piezo import Stack
-from lathe_rc.plants.tool_drive import Piezo, ToolDrive
 
 STEP = 1 / 64000
 LOOP = (2 * np.pi * 165.0, 0.7)  # ω1, ζ1

@@ -11,13 +11,13 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 from lathe_commission.hysteresis_fit import from_signals, identify
+from lathe_machine.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii
+from lathe_machine.plants.linear import second_order
+from lathe_machine.plants.piezo import PiezoDrive, Stack, extend
+from lathe_machine.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_papers.formulas.responses import second_order as ideal
 from lathe_rc import messages
 from lathe_rc.cell.stage import compile_kernels
-from lathe_rc.plants.hysteresis import WEIGHTS, BoucWen, PrandtlIshlinskii
-from lathe_rc.plants.linear import second_order
-from lathe_rc.plants.piezo import PiezoDrive, Stack, extend
-from lathe_rc.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 
 WN, ZETA, STROKE, VOLTS = 14600.0, 0.299, 15e-6, 100.0
 STEP = 1 / 64000

@@ -10,8 +10,8 @@ from machines import amplitude, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.linear import DiscretePlant, discretise, second_order
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.linear import DiscretePlant, discretise, second_order
 from lathe_rc.signals.noise import Sensor
 
 WN, ZETA, TAU = 1038.0, 0.804, 0.36e-3

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lathe_rc.analysis.shaft import Shaft
-from lathe_rc.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
+from lathe_machine.analysis.shaft import Shaft
+from lathe_machine.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
+from lathe_machine.plants.cutting import CuttingProcess
+from lathe_machine.plants.cutting_force import STEEL, Elasticity
+from lathe_machine.plants.workpiece import Part
 from lathe_rc.errors import InputError
-from lathe_rc.plants.cutting import CuttingProcess
-from lathe_rc.plants.cutting_force import STEEL, Elasticity
-from lathe_rc.plants.workpiece import Part
 
 STIFFNESS = 233.3e3  # [N/m]
 DEPTH = 150.0 / STIFFNESS  # [m]

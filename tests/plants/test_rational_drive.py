@@ -7,13 +7,13 @@ from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
 import lathe_rc
+from lathe_machine.plants.coil import Coil
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.modes import Modes, carriage
+from lathe_machine.plants.tool_drive import ToolDrive
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError
-from lathe_rc.plants.coil import Coil
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.modes import Modes, carriage
-from lathe_rc.plants.tool_drive import ToolDrive
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
 
 STEP = 1 / 64000
 LOOP = (2 * np.pi * 165.0, 0.7)  # ω1, ζ1

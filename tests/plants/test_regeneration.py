@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_array_equal
 
-from lathe_rc.analysis.regeneration import Regeneration, lobes
-from lathe_rc.plants.cutting import GIVEN, MADE, CuttingProcess
-from lathe_rc.plants.cutting_force import PAPER, REALISTIC, Elasticity, Flank, SpecificForce, flank_damping
-from lathe_rc.transfer import TransferFunction
+from lathe_machine.analysis.regeneration import Regeneration, lobes
+from lathe_machine.plants.cutting import GIVEN, MADE, CuttingProcess
+from lathe_machine.plants.cutting_force import PAPER, REALISTIC, Elasticity, Flank, SpecificForce, flank_damping
+from lathe_machine.transfer import TransferFunction
 
 PRESETS = {"paper": (PAPER, 1e-3), "realistic": (REALISTIC, 5e-5)}  # and a step that resolves the mode [s]
 

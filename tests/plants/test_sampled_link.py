@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.signal import cont2discrete, lfilter
 
-from lathe_rc.control.sampled_link import (
+from lathe_machine.control.sampled_link import (
     SampledDrive,
     SampledLink,
     closed_loop,
@@ -18,9 +18,9 @@ from lathe_rc.control.sampled_link import (
     ripple_free,
     towards,
 )
+from lathe_machine.plants.feed import FeedDrive
+from lathe_machine.plants.feed_models import sampled
 from lathe_rc.errors import InputError
-from lathe_rc.plants.feed import FeedDrive
-from lathe_rc.plants.feed_models import sampled
 
 DRIVE = SampledDrive(6.25, 0.08, 0.16)
 STEP = 1 / 64000

@@ -10,18 +10,18 @@ from machines import amplitude, assert_refused, refusals, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
+from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
+from lathe_machine.plants.hysteresis import BoucWen, PrandtlIshlinskii
+from lathe_machine.plants.piezo import PiezoDrive, Stack
+from lathe_machine.plants.tool_drive import Piezo, ToolDrive
+from lathe_machine.plants.tool_motion import advance as move
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
+from lathe_machine.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
+from lathe_machine.stages.drive.series_drive import SeriesDriveParameters, SeriesDriveStage
 from lathe_papers.formulas.responses import in_series
 from lathe_rc import messages
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.stage import compile_kernels
-from lathe_rc.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.plants.hysteresis import BoucWen, PrandtlIshlinskii
-from lathe_rc.plants.piezo import PiezoDrive, Stack
-from lathe_rc.plants.tool_drive import Piezo, ToolDrive
-from lathe_rc.plants.tool_motion import advance as move
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator, ElectrodynamicActuatorParameters
-from lathe_rc.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
-from lathe_rc.stages.drive.series_drive import SeriesDriveParameters, SeriesDriveStage
 
 W1, Z1, TAU = 1038.0, 0.804, 0.36e-3
 W2, Z2, STROKE = 14600.0, 0.299, 15e-6

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose
 
+from lathe_machine.signals.vibration import band_limited_random, evaluate, harmonic
+from lathe_machine.stages.cut.vibration import Vibration, VibrationParameters
 from lathe_rc import messages
-from lathe_rc.signals.vibration import band_limited_random, evaluate, harmonic
-from lathe_rc.stages.cut.vibration import Vibration, VibrationParameters
 
 STEP = 1 / 64000
 

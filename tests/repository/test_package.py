@@ -110,18 +110,58 @@ ALONE = """
 import sys
 sys.modules.update(dict.fromkeys({beside}))
 from lathe_rc.cli import main
-for line in ["--help", "run piston --revolutions=3 --bag=B", "bag check B", "report B -o B.html"]:
-    main(line.split(), standalone_mode=False)
+for line in ["--help", "run {cell} --bag=B", "bag check B", "report B -o B.html"]:
+    assert not main(line.split(), standalone_mode=False)
 """
+SPINDLE = """
+import numpy as np
+from lathe_rc import DONE, Output, messages
+from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
+
+def step(speed, first, start, inputs, flags, outputs):
+    for field in outputs[:2]:
+        field[start:] = speed * (first + np.arange(start, field.size))
+    return outputs[0].size, DONE
+
+class Spindle(TimeMaster):
+    Parameters = TimeMasterParameters
+    step = staticmethod(step)
+
+    def __init__(self, name, parameters):
+        super().__init__(name, parameters)
+        self.samples = self.expected_samples
+        self.declare(outputs=[Output("encoder", messages.ENCODER)])
+
+    @property
+    def memory(self):
+        return self.shared.nominal_speed * self.shared.step
+
+    def sample_at(self, angle):
+        return int(np.ceil(angle / self.memory))
+
+    def speed_range(self):
+        return self.shared.nominal_speed, self.shared.nominal_speed
+
+    def largest_acceleration(self):
+        return 0.0
+"""
+OWN_CELL = 'spindle: {ros__parameters: {stage: "own_spindle:Spindle", revolutions: 3.0}}'
 
 
-def test_the_core_runs_without_the_packages_around_it(tmp_path):
-    code = ALONE.format(beside=sorted(OURS - {"lathe_rc"}))
-    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("cell", ["piston", "own.yaml"])
+def test_the_core_runs_without_the_packages_around_it(cell, tmp_path):
+    """Without the machine as well, if the stages are a user's own."""
+    (tmp_path / "own.yaml").write_text(OWN_CELL)
+    (tmp_path / "own_spindle.py").write_text(SPINDLE)
+    needed = {"lathe_rc", "lathe_machine"} if cell == "piston" else {"lathe_rc"}
+    code = ALONE.format(beside=sorted(OURS - needed), cell=cell)
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))}
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    listed = re.findall(r"^  (\w+) ", ran.stdout.partition("Commands:")[2], re.MULTILINE)
-    assert set(COMMANDS_OF["lathe_rc"]) <= {*listed}
-    assert not {*listed} & {name for package in OURS - {"lathe_rc", "lathe_papers"} for name in COMMANDS_OF[package]}
+    listed = {*re.findall(r"^  (\w+) ", ran.stdout.partition("Commands:")[2], re.MULTILINE)}
+    assert listed >= {*COMMANDS_OF["lathe_rc"]}
+    assert not listed & {name for package, names in COMMANDS_OF.items() if package != "lathe_rc" for name in names}
     assert (tmp_path / "B.html").exists()
 
 

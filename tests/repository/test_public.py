@@ -13,6 +13,7 @@ import lathe_bagtools
 import lathe_commission
 import lathe_explore
 import lathe_export
+import lathe_machine
 import lathe_rc
 from lathe_rc.cell.recording import Recording
 from lathe_rc.cell.scenario import Scenario
@@ -24,7 +25,7 @@ SHOWN_ELSEWHERE = {
     *("DONE", "Input", "InputError", "LatheError", "LawParameters", "NodeParameters", "Now", "Output"),
     *("PlantParameters", "Scenario", "messages", "study"),
 }
-PACKAGES = (lathe_rc, lathe_bagtools, lathe_commission, lathe_explore, lathe_export)
+PACKAGES = (lathe_rc, lathe_machine, lathe_bagtools, lathe_commission, lathe_explore, lathe_export)
 EXAMPLES = {
     name: getattr(package, name) for package in PACKAGES for name in sorted({*package.__all__} - SHOWN_ELSEWHERE)
 }

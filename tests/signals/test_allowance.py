@@ -6,7 +6,7 @@ import pytest
 from machines import assert_refused, refusals, run
 from numpy.testing import assert_allclose
 
-from lathe_rc.signals.allowance import PAPER_RMS, Allowance, Walk, mean_reverting, unbounded
+from lathe_machine.signals.allowance import PAPER_RMS, Allowance, Walk, mean_reverting, unbounded
 
 STEP = 1 / 64000
 STILL = Walk(1.0, 0.0, 0.0)

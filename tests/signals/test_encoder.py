@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
+from lathe_machine.signals.encoder import Encoder, EncoderSamples
+from lathe_machine.signals.encoder_errors import EncoderErrors, seen_along
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import undulations
 from lathe_rc.cell import scenario
 from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
-from lathe_rc.signals.encoder import Encoder, EncoderSamples
-from lathe_rc.signals.encoder_errors import EncoderErrors, seen_along
 
 TURN = 2 * np.pi
 STEP = 1 / 64000

@@ -7,9 +7,9 @@ import user_files
 from machines import assert_refused
 from numpy.testing import assert_array_equal
 
+from lathe_machine.signals.counts import CsvReader
 from lathe_rc.cell import cells_file
 from lathe_rc.signals import measurement_file, tachogram
-from lathe_rc.signals.counts import CsvReader
 from lathe_rc.signals.quantities import Mapped, parse_columns
 
 

@@ -8,14 +8,14 @@ import pytest
 from cells import scenario
 from click.testing import CliRunner
 
+from lathe_machine.signals.interpolation_doubt import doubt
+from lathe_machine.signals.measured_profile import Measured
+from lathe_machine.signals.profile import Piston
 from lathe_rc import harness
 from lathe_rc.analysis import profile_csv
 from lathe_rc.analysis.tolerance import judge
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.cli import main
-from lathe_rc.signals.interpolation_doubt import doubt
-from lathe_rc.signals.measured_profile import Measured
-from lathe_rc.signals.profile import Piston
 
 TURN = 2.0 * np.pi
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
+from lathe_machine.signals import profile_table
+from lathe_machine.signals.measured_profile import Measured, doubts, read_csv
+from lathe_machine.signals.profile import Harmonics, Piston, Polygon
+from lathe_machine.signals.profile_table import ProfileTable, kept
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.jit import cache_folder
-from lathe_rc.signals import profile_table
-from lathe_rc.signals.measured_profile import Measured, doubts, read_csv
-from lathe_rc.signals.profile import Harmonics, Piston, Polygon
-from lathe_rc.signals.profile_table import ProfileTable, kept
 
 TURN = 2 * np.pi
 ANGLES = np.linspace(-TURN, 2 * TURN, 4001)

@@ -8,11 +8,11 @@ import pytest
 from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
+from lathe_machine.signals.profile import Harmonics, Piston
+from lathe_machine.signals.profile_table import ProfileTable
+from lathe_machine.signals.tip_path import TipPath, steepest_fall
 from lathe_rc import harness
 from lathe_rc.cell import scenario
-from lathe_rc.signals.profile import Harmonics, Piston
-from lathe_rc.signals.profile_table import ProfileTable
-from lathe_rc.signals.tip_path import TipPath, steepest_fall
 
 TURN = 2 * np.pi
 EVEN = np.linspace(0.0, TURN, 240, endpoint=False)

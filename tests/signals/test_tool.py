@@ -6,8 +6,8 @@ import pytest
 from cells import config, encoder, run
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lathe_machine.signals.profile import Piston
 from lathe_rc import harness, messages
-from lathe_rc.signals.profile import Piston
 
 TURN = 2 * np.pi
 PISTON = {"profile": "piston", "feed": 2e-3, "start_height": 0.01}

@@ -29,6 +29,10 @@ from sealed_bags import unsealed
 from lathe_bagtools.resimulation import resim
 from lathe_commission import hysteresis_fit, reduced_order
 from lathe_commission.commands.fit import fit as fit_command
+from lathe_machine.control import memory_file
+from lathe_machine.control.predistortion import Predistortion
+from lathe_machine.signals import measured_profile, profile_table
+from lathe_machine.stages.feed.trajectory import Trajectory, TrajectoryParameters, follow
 from lathe_papers.formulas import step_fit
 from lathe_rc import data_file, files, harness, messages
 from lathe_rc.bag import check, provenance, reader
@@ -43,11 +47,8 @@ from lathe_rc.cell.engine import Engine
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.scenario import TABLES, Scenario, new_stage
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control import memory_file
-from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import measured_profile, measurement_file, profile_table
-from lathe_rc.stages.feed.trajectory import Trajectory, TrajectoryParameters, follow
+from lathe_rc.signals import measurement_file
 from lathe_rc.view import report
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS

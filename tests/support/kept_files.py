@@ -15,12 +15,12 @@ from lathe_explore.sweep.folder import Folder, Request
 from lathe_explore.sweep.space import Space
 from lathe_explore.sweep.study import Study
 from lathe_explore.sweep.sweep import ignore
+from lathe_machine.control import memory_file
+from lathe_machine.signals import profile_table
 from lathe_rc import jit
 from lathe_rc.cell import checkpoint, program, scenario
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.control import memory_file
 from lathe_rc.errors import LatheError
-from lathe_rc.signals import profile_table
 
 CONFIG = Path(__file__).parents[2] / "config"
 OWN = "learning_controller"

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from lathe_machine.stages.tool.tool import ToolParameters
 from lathe_rc import messages
 from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.ports import Input
@@ -39,7 +40,6 @@ from lathe_rc.protocol.leading_run import LeadingRun
 from lathe_rc.protocol.member_host import MemberHost
 from lathe_rc.protocol.restart import Restart
 from lathe_rc.protocol.stage_run import StageRun
-from lathe_rc.stages.tool.tool import ToolParameters
 
 SIZE = 4  # samples in a block
 LEASE = 0.08  # [s] of DDS's liveliness

@@ -16,16 +16,17 @@ from numpy.testing import assert_allclose
 
 from lathe_commission import drive_measurement, hysteresis_fit, ilc, part_record, reduced_order
 from lathe_explore.sweep.space import Space
+from lathe_machine.control.predistortion import Predistortion
+from lathe_machine.signals import measured_profile
+from lathe_machine.signals.counts import CsvReader
+from lathe_machine.stages.feed.trajectory import Trajectory, TrajectoryParameters
 from lathe_rc.analysis import measured_drive
 from lathe_rc.arrays import Array
 from lathe_rc.cell import cells_file, scenario
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import measured
-from lathe_rc.control.predistortion import Predistortion
 from lathe_rc.errors import InputError
-from lathe_rc.signals import measured_profile, tachogram
-from lathe_rc.signals.counts import CsvReader
-from lathe_rc.stages.feed.trajectory import Trajectory, TrajectoryParameters
+from lathe_rc.signals import tachogram
 
 Rows = list[list[str]]
 Reader = Callable[[Path], list[Array]]

@@ -12,11 +12,11 @@ from click.testing import CliRunner
 import lathe_rc
 from lathe_commission import design
 from lathe_commission.commands import design as command
+from lathe_machine.plants.modes import carriage
 from lathe_rc.analysis.frequency_response import of_states
 from lathe_rc.analysis.tolerance import growth
 from lathe_rc.cli import main
 from lathe_rc.errors import LatheError
-from lathe_rc.plants.modes import carriage
 from lathe_rc.signals.measurement_file import read
 
 pytestmark = pytest.mark.system

@@ -12,8 +12,8 @@ import pytest
 from drive_fit_accuracy import TURN
 from lathe_commission import modal_fit
 from lathe_commission.modal_fit import ResponseData
+from lathe_machine.analysis.modal_drive import ModalDrive
 from lathe_rc.analysis.frequency_response import FrequencyResponse, deviation_of
-from lathe_rc.analysis.modal_drive import ModalDrive
 from lathe_rc.errors import LatheError
 
 KINDS = ("second order", "modes", "real pole", "complex residues")

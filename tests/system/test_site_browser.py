@@ -115,7 +115,7 @@ def test_search_finds_guides_before_docstrings(site, tmp_path):
             browser.kill()
     first = {word: found[0] for word, found in zip(WORDS, answers, strict=True)}
     assert not [place for place in first.items() if place[1].startswith(("/api/", "/reference/", "/changelog/"))]
-    assert "/api/lathe_rc.control/" in answers[0]
+    assert "/api/lathe_machine.control/" in answers[0]
 
 
 @pytest.mark.parametrize("width", [1280, 420])

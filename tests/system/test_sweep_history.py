@@ -38,7 +38,7 @@ VALUES = {
 SCENARIO = ["spindle_encoder.revolutions=2", "electrodynamic_actuator.stage=my_drive:Drive"]
 PISTON = Path(__file__).parents[2] / "config" / "piston.yaml"
 DRIVE = '''
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 
 class Drive(ElectrodynamicActuator):
     """A drive of one's own, version {}."""

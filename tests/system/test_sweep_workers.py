@@ -155,7 +155,7 @@ def test_a_full_disk_is_said_in_a_line_and_what_is_written_is_kept(small_disk):
 POISON = '''
 import ctypes, os, sys
 import numpy as np
-from lathe_rc.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
+from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuator
 
 def fill():
     kept = []

@@ -312,7 +312,7 @@ def test_a_run_prints_its_object_alone_and_imports_what_its_cell_has():
     assert list(json.loads(done.stdout)) == KEYS
     assert not re.search("Traceback|Warning", done.stderr)
     modules = done.stderr.splitlines()[-1]
-    begin = "lathe_rc.stages."
+    begin = "lathe_machine.stages."
     imported = {module.rpartition(".")[2] for module in modules.split() if module.startswith(begin)}
     assert imported >= {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "form", "tool"}
     assert not imported & {"compound_controller", "cutting_process", "feed_drive", "loaded_drive", "piezo_actuator"}
