@@ -21,11 +21,11 @@ import numpy as np
 from lathe_rc import __version__, data_file
 from lathe_rc.cell.changes import Change, ClashError, Restoring, changes
 from lathe_rc.cell.events import Trigger
-from lathe_rc.cell.kinds import MASTERS, STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, remapped_by
 from lathe_rc.cell.scenario import HOST_PARAMETERS, Scenario, kind_of, new_stage
 from lathe_rc.cell.stage import Stage
-from lathe_rc.cell.time_master import START_FROM, TimeMaster
+from lathe_rc.cell.time_master import START_FROM, TimeMaster, TimeMasterParameters
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import is_ours, source_hash
 from lathe_rc.files import written
@@ -140,7 +140,7 @@ class Checkpoint:
         # Nodes announce the rules that concern their topics, sorted.
         if all(remapped_by(table.remap, topic) == remapped_by(before["remap"], topic) for topic in stage.topics):
             differing.discard("remap")
-        fixed = differing - _FREE if kind in MASTERS else set[str]()
+        fixed = differing - _FREE if isinstance(table, TimeMasterParameters) else set[str]()
         fixed |= {key for key in differing if type(table).rows()[key].named is not None or key == "remap"}
         if fixed:
             told = ", ".join(f"{name}.{key} = {before[key]}" for key in sorted(fixed))

@@ -17,11 +17,12 @@ import yaml
 
 from lathe_rc import allowed_code, files, resources
 from lathe_rc.cell import models, ros_yaml
-from lathe_rc.cell.kinds import MASTERS, STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value, Values
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stage import Stage
+from lathe_rc.cell.time_master import TimeMasterParameters
 from lathe_rc.drawing import html
 from lathe_rc.errors import InputError, shown
 from lathe_rc.extensions import in_words
@@ -155,7 +156,7 @@ class Scenario:
     @property
     def masters(self) -> list[str]:
         """Names of the time masters; exactly one in a valid cell."""
-        return [name for name in self.nodes if self.kind(name) in MASTERS]
+        return [name for name, table in self.nodes.items() if isinstance(table, TimeMasterParameters)]
 
     def check_members(self) -> None:
         """Check that a time master names nodes of the scenario as members; a recorder may be added to them.
