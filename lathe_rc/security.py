@@ -14,7 +14,7 @@ from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.catalogue import DRAWN
 from lathe_rc.cell.beside import MACHINE_STATE, PANEL, PANEL_COMMANDS, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
-from lathe_rc.cell.host_topics import HOST_TOPICS
+from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS
 from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
@@ -45,7 +45,7 @@ _LIFECYCLE = (
 )
 _PLAYER = "burst get_rate is_paused pause play_next resume seek set_rate stop toggle_paused"
 #: services of some kinds of nodes
-_SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split()), **dict.fromkeys(MASTERS, ("end",))}
+_SERVICES = {RECORDER: ("snapshot",), REPLAYER: tuple(_PLAYER.split())}
 _RECORDED = ("/diagnostics", "cell_state")  # host topics stored in a bag
 _OF_A_SIMULATOR = ("get_simulation_state", "get_simulator_features", "set_simulation_state", "step_simulation")
 _STEPS = "simulate_steps/_action"  # its services and topics
@@ -95,12 +95,16 @@ class _Maker:
         own = {topic for topic, source in self._signals.items() if source.node == name}
         reads = {topic for topic in self._signals if stage is None or stage in self._cell.readers(topic)}
         inside = {topic for topic, source in self._signals.items() if source.node in group}
-        services = [*_LIFECYCLE, *_SERVICES.get(kind, ())]
+        services = [*_LIFECYCLE, *_SERVICES.get(kind, ()), *(["end"] if name in self._scenario.masters else [])]
         if stage:
             services.append("schedule")
-        told = {topic.name for topic in HOST_TOPICS if kind in topic.publishers}
-        heard = {topic.name for topic in HOST_TOPICS if kind in topic.subscribers}
         masters = set(self._scenario.masters)
+
+        def among(kinds: Sequence[str]) -> bool:  # stages of others are members, and may be time masters, as well
+            return kinds == MEMBERS or (name in masters if kinds == MASTERS else kind in kinds)
+
+        told = {topic.name for topic in HOST_TOPICS if among(topic.publishers)}
+        heard = {topic.name for topic in HOST_TOPICS if among(topic.subscribers)}
         watched = set(self._scenario.nodes) - masters if name in masters else masters
         heard |= {remapped(stage.shared, topic) for topic in stage.foreign} if stage else set()
         heard |= {f"{other}/{ALIVE}" for other in watched - set(group)}

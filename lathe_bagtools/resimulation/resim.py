@@ -32,7 +32,6 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.engine import Engine, Sink
-from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import SharedParameters
 from lathe_rc.cell.recording import Digester, SparseTopic
 from lathe_rc.cell.running_form import RunningForm
@@ -308,7 +307,7 @@ def _start(source: Source, path: Path | None, *, given: bool) -> list[str]:
     if path is None:
         return []
     nodes = provenance.values_of(source.about)
-    master = next((name for name, values in nodes.items() if str(values.get("stage") or name) in MASTERS), "")
+    master = next((name for name, values in nodes.items() if START_FROM in values), "")
     if given or not master:
         raise InputError(
             f"--from {path}: a checkpoint is one of the run in a bag; allowed: with the scenario of the bag"

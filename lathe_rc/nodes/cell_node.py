@@ -31,11 +31,10 @@ from std_msgs.msg import Empty
 from lathe_rc import messages
 from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.cell.checkpoint import Checkpoint, begun_of
-from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import NodeParameters, SharedParameters, Value, remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
-from lathe_rc.cell.time_master import START_FROM
+from lathe_rc.cell.time_master import START_FROM, TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.nodes import declare, graph
 from lathe_rc.nodes.liveliness import Watch, has_ended, liveliness, this_host
@@ -43,7 +42,15 @@ from lathe_rc.nodes.ports import latched_qos, message_class, signal_qos
 from lathe_rc.nodes.publisher_info import asked
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.nodes.report import Reporter
-from lathe_rc.protocol import Announcement, CellState, ForeignMessage, MemberProtocol, Progress, actions
+from lathe_rc.protocol import (
+    Announcement,
+    CellState,
+    ForeignMessage,
+    MemberProtocol,
+    Progress,
+    TimeMasterProtocol,
+    actions,
+)
 from lathe_rc.protocol.exchange import Exchange
 from lathe_rc.protocol.member_host import MOST_DEFERRED, MemberHost, Work
 
@@ -284,7 +291,7 @@ class CellNode(LifecycleNode, MemberHost):
             "progress": add(ProgressMessage, "progress", latched_qos(1)),  # a late reader needs the newest one
             "diagnostics": add(DiagnosticArray, "/diagnostics", QoSProfile(depth=100)),
         }
-        if self.protocol.own.stage in MASTERS:
+        if isinstance(self.protocol, TimeMasterProtocol):
             self._host["cell_state"] = add(CellStateMessage, "cell_state", latched_qos(1))
         self.subscribe(Member, "members", self._on_member, latched_qos(_LATCHED_DEPTH))
         self.subscribe(CellStateMessage, "cell_state", self._on_cell_state, latched_qos(), always=True)
@@ -362,7 +369,7 @@ class CellNode(LifecycleNode, MemberHost):
         if name in SharedParameters.model_fields:
             return f"it is the same in all nodes of the cell; {before} in each"
         tunable = f"; allowed now: {', '.join(self.role.tunable)}" if self.role.tunable else ""
-        alike = self.kind not in (*MASTERS, RECORDER)
+        alike = self.kind != RECORDER and not isinstance(self.table, TimeMasterParameters)
         bag = f", 'lathe resim BAG --set {self.get_name()}.{name}=VALUE' shows its effect on a recorded run" * alike
         return f"the node is configured with it{tunable}; {before}{bag}"
 

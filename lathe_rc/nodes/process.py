@@ -26,11 +26,12 @@ from rclpy.type_support import check_for_type_support
 from lathe_rc import allowed_code
 from lathe_rc.catalogue import DEVICES, PREPARE
 from lathe_rc.cell import scenario as scenarios
-from lathe_rc.cell.kinds import MASTERS, STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import names_others
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import compile_kernels
+from lathe_rc.cell.time_master import TimeMasterParameters
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.nodes import arguments, chain, dds, declare
 from lathe_rc.nodes.cell_node import CellNode, Role
@@ -55,14 +56,15 @@ _ENDED_BY_SIGNAL = 128  # exit code of a shell's command that a signal has ended
 def _make(name: str, kind: str, reporter: Reporter, exchange: Exchange) -> CellNode:
     if kind not in TABLES:
         raise InputError(f"{name}: no stage {kind!r}; {TABLES.instead(kind)}")
-    roles: dict[str, Callable[[CellNode], Role]] = {
-        RECORDER: RecorderRole,
-        **dict.fromkeys(MASTERS, SpindleRole),
-    }
-    if kind in DEVICES:
-        roles[kind] = pkgutil.resolve_name(DEVICES[kind])
+    role: Callable[[CellNode], Role] = StageRole
+    if kind == RECORDER:
+        role = RecorderRole
+    elif kind in DEVICES:
+        role = pkgutil.resolve_name(DEVICES[kind])
+    elif issubclass(TABLES[kind], TimeMasterParameters):
+        role = SpindleRole
     try:
-        return CellNode(name, kind, roles.get(kind, StageRole), reporter, exchange)
+        return CellNode(name, kind, role, reporter, exchange)
     except RuntimeError as error:
         raise LatheError(f"{name}: {_words(error)}") from None
 

@@ -23,7 +23,6 @@ from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.blocks.wire import Decoder, Encoder
 from lathe_rc.cell.host_topics import HOST_TOPICS
-from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.scenario import Scenario
@@ -76,7 +75,7 @@ class RecorderRole(Role):
 
     def protocol(self, own: Announcement) -> MemberProtocol:
         """Return the node's protocol object; it is wired after the subscriptions are created (implements `Role`)."""
-        return MemberProtocol(own, self.table.window, masters=MASTERS, wired=False)
+        return MemberProtocol(own, self.table.window, wired=False)
 
     @property
     def tunable(self) -> tuple[str, ...]:
@@ -169,7 +168,7 @@ class RecorderRole(Role):
             if self._merger is not None and members[name].pid != pid:
                 self._processes[name] = members[name].pid
                 self._merger.restarted(name)
-        alone = any(member.stage in MASTERS and not member.members for member in members.values())
+        alone = self.node.protocol.alone
         if not alone and (self._queues or not self.node.protocol.complete):
             return
         before = len(self._queues) + len(self._sparse)

@@ -13,7 +13,6 @@ from std_srvs.srv import Trigger
 
 from lathe_rc import messages
 from lathe_rc.blocks.latency_histogram import LATENCY, LATENESS, PERCENT
-from lathe_rc.cell.kinds import MASTERS
 from lathe_rc.cell.parameters import Value
 from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
 from lathe_rc.cell.wiring import Cell
@@ -89,7 +88,7 @@ class SpindleRole(LeadingRun, StageRole):
             safe_samples=max(1, round(table.safe_time * table.sample_rate)),
             block_size=table.block_size,
         )
-        protocol = TimeMasterProtocol(own, table.window, reactions, masters=MASTERS, first=self.samples)
+        protocol = TimeMasterProtocol(own, table.window, reactions, first=self.samples)
         protocol.know_end(self.stage.samples)
         if table.simulation_services == "paused":
             protocol.held_at = 0

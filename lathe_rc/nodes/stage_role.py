@@ -13,7 +13,7 @@ from lathe_rc.cell import events
 from lathe_rc.cell.ahead import uncompiled
 from lathe_rc.cell.changes import Restoring, changes
 from lathe_rc.cell.checkpoint import Checkpoint
-from lathe_rc.cell.kinds import MASTERS, STAGES
+from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.parameters import Value, explain_overflow, remapped
 from lathe_rc.cell.scenario import new_stage
 from lathe_rc.cell.stage import Stage, compile_kernels
@@ -71,7 +71,7 @@ class StageRole(StageRun, Role):
 
     def protocol(self, own: Announcement) -> MemberProtocol:
         """Return the node's protocol object (implements `Role`)."""
-        return MemberProtocol(own, self.node.table.window, masters=MASTERS)
+        return MemberProtocol(own, self.node.table.window)
 
     def publications(self) -> list[tuple[str, str, bool]]:
         """Return topic, message type and sparse flag of each output (implements `Role`)."""

@@ -37,7 +37,6 @@ class MemberProtocol:
     Args:
         own: first announcement of this member, with the topics known so far.
         window: largest number of blocks in flight; 0: the cell is free-running.
-        masters: kinds of nodes that may be time masters.
         wired: True if all publishers and subscriptions exist once the member is active; False: only after `describe`.
 
     Attributes:
@@ -68,11 +67,10 @@ class MemberProtocol:
         own: Announcement,
         window: int,
         *,
-        masters: Collection[str] = (),
         wired: bool = True,
     ) -> None:
         self.own, self.window = own, window
-        self._masters, self._wired = masters, wired
+        self._wired = wired
         self.actions: deque[Action] = deque()
         self.members: dict[str, Announcement] = {}
         self.master: Announcement | None = None
@@ -259,8 +257,6 @@ class MemberProtocol:
             raise ForeignMessage("members", sender, member.run_id, f"it speaks as {member.name}")
         if member.state not in _STATES:
             why = f"state {member.state}; expected one of its states"
-        elif member.members and member.stage not in self._masters:
-            why = f"a time master is a {' or '.join(self._masters)}"
         elif member.members and not self._may_lead(member):
             why = f"the time master is {self.master.name if self.master else ''}"
         elif not len(member.publishes) == len(member.types) == len(member.sparse):
@@ -350,8 +346,8 @@ class MemberProtocol:
 
     @property
     def alone(self) -> bool:
-        """Return True if a time master is known that names no members."""
-        return any(member.stage in self._masters and not member.members for member in self.members.values())
+        """Return True if a time master is known that names no members, as its parameters tell."""
+        return any(_parsed(member.parameters).get("members") == [] for member in self.members.values())
 
     @property
     def wants_match(self) -> bool:

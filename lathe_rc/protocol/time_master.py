@@ -49,7 +49,7 @@ class TimeMasterProtocol(MemberProtocol):
     """Protocol of a time master: a `MemberProtocol` that also tracks the progress of the members that it names.
 
     Args:
-        own, window, masters: see `MemberProtocol`.
+        own, window: see `MemberProtocol`.
         reactions: reactions to silence and death of members.
         first: index of the first sample of the run.
 
@@ -71,10 +71,9 @@ class TimeMasterProtocol(MemberProtocol):
         window: int,
         reactions: Reactions,
         *,
-        masters: Collection[str] = (),
         first: int = 0,
     ) -> None:
-        super().__init__(own, window, masters=masters)
+        super().__init__(own, window)
         self._reactions = reactions
         self._first = self.samples = first
         self.blocks = 0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import own_spindle
 import pytest
 from bags import lathe
 
@@ -57,6 +58,15 @@ TOGETHER = """
 """
 
 
+#: a spindle of others, before our controller, drive and tool
+LED = """
+/turning: {ros__parameters: {stage: "own_spindle:Spindle", revolutions: 2.0}}
+/learning_controller: {ros__parameters: {feedback_delay: 3200}}
+/electrodynamic_actuator: {ros__parameters: {}}
+/tool: {ros__parameters: {profile: harmonics}}
+"""
+
+
 @pytest.mark.parametrize(
     "kinds", [pytest.param(["law", "plant", "stage"], marks=pytest.mark.system), ["plain law"]], ids=" ".join
 )
@@ -70,6 +80,15 @@ def test_what_lathe_new_writes_has_the_same_bits_in_every_host(begin, tmp_path, 
         file = tmp_path / "together.yaml"
         file.write_text(TOGETHER, encoding="utf-8")
     found = hosts.digests_by_host(scenario.load(file, ["spindle_encoder.revolutions=2.0"]), tmp_path)
+    assert set(found) == {"offline", "bag", "simulated again", "blocks of 23", "batch", "composed", "processes"}
+    assert {host for host, topics in found.items() if topics != found["offline"]} == set()
+
+
+def test_a_spindle_of_others_leads_a_cell_in_every_host(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(own_spindle.__file__).parent), prepend=os.pathsep)
+    file = tmp_path / "own.yaml"
+    file.write_text(LED)
+    found = hosts.digests_by_host(scenario.load(file), tmp_path)
     assert set(found) == {"offline", "bag", "simulated again", "blocks of 23", "batch", "composed", "processes"}
     assert {host for host, topics in found.items() if topics != found["offline"]} == set()
 

@@ -31,7 +31,6 @@ from lathe_rc.protocol.leading_run import LeadingRun
 from lathe_rc.protocol.member_host import MemberHost
 from lathe_rc.protocol.stage_run import StageRun
 
-MASTERS = ("spindle_encoder",)
 SHARE = 300  # schedules of one test: the workers of the suite share them
 
 
@@ -186,7 +185,7 @@ def tool() -> MemberProtocol:
     own = member(
         publishes=("/tool",), types=(messages.TOOL,), sparse=(False,), subscribes=("/coarse/state", "/encoder"), pid=7
     )
-    protocol = MemberProtocol(own, 64, masters=MASTERS)
+    protocol = MemberProtocol(own, 64)
     protocol.activate(100.0)
     return protocol
 
@@ -257,7 +256,7 @@ def test_a_second_time_master_is_a_stranger(tool):
 def test_one_of_two_established_namesakes_stays(tool):
     """Both may be ready, on two machines or as two processes that resumed; the other one hears it and gives up."""
     other = member("/tool", MemberState.READY, host="elsewhere", pid=6)
-    protocol = MemberProtocol(other, 64, masters=MASTERS)
+    protocol = MemberProtocol(other, 64)
     tool.ready = protocol.ready = True
     with pytest.raises(ForeignMessage, match="this node, process 7, has that name"):
         tool.hear_member(other, 0.0)
@@ -298,7 +297,7 @@ def leads(window=4, first=0, **reactions) -> TimeMasterProtocol:
     """A time master whose run has begun, with a controller and a recorder."""
     own = member("/spindle", stage="spindle_encoder", members=("/spindle", "/c", "/recorder"), session=5)
     values = {"stall_reaction": "safe", "stall_time": 0.1, "restart_time": 30.0, "safe_samples": 8, "block_size": 4}
-    protocol = TimeMasterProtocol(own, window, Reactions(**values | reactions), masters=MASTERS, first=first)
+    protocol = TimeMasterProtocol(own, window, Reactions(**values | reactions), first=first)
     protocol.activate(0.0)
     for name in own.members[1:]:
         protocol.hear_member(member(name, MemberState.READY, parameters='{"restart_file": "x"}'), 0.0)

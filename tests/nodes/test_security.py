@@ -24,6 +24,8 @@ from lathe_rc import cli, harness, process_launcher, security
 from lathe_rc.catalogue import STANDALONE
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.beside import MACHINE_STATE, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
+from lathe_rc.cell.host_topics import HOST_TOPICS
+from lathe_rc.cell.scenario import TABLES
 from lathe_rc.nodes.ports import latched_qos
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -125,6 +127,17 @@ def test_nodes_of_a_process_share_an_enclave_and_read_each_other_in_memory():
     assert "coarse/command" in alone["/electrodynamic_actuator"][0].subscribe - drive.subscribe
     assert "coarse/state" in alone["/learning_controller"][0].subscribe - controller.subscribe
     assert "coarse/state" in grouped["/a/b/tool"][0].subscribe
+
+
+def test_a_stage_of_others_is_a_member_like_ours():
+    """Without these topics it could not join the cell."""
+    nodes = dict(scenario().nodes)
+    ours = security.policy(scenarios.Scenario("ours", nodes))["/learning_controller"][0]
+    nodes["learning_controller"] = TABLES["adrc"](stage="adrc")
+    others = security.policy(scenarios.Scenario("others", nodes))["/learning_controller"][0]
+    host = {topic.name for topic in HOST_TOPICS}
+    assert ours.publish & host == others.publish & host == {"members", "progress", "/diagnostics"}
+    assert ours.subscribe & host == others.subscribe & host == {"members", "cell_state"}
 
 
 def test_an_encoder_device_may_read_what_comes_from_outside_of_the_cell():

@@ -5,11 +5,13 @@ import ast
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import own_spindle
 import pytest
 import setuptools
 from lacking import write_site
@@ -113,38 +115,6 @@ from lathe_rc.cli import main
 for line in ["--help", "run {cell} --bag=B", "bag check B", "report B -o B.html"]:
     assert not main(line.split(), standalone_mode=False)
 """
-SPINDLE = """
-import numpy as np
-from lathe_rc import DONE, Output, messages
-from lathe_rc.cell.time_master import TimeMaster, TimeMasterParameters
-
-def step(speed, first, start, inputs, flags, outputs):
-    for field in outputs[:2]:
-        field[start:] = speed * (first + np.arange(start, field.size))
-    return outputs[0].size, DONE
-
-class Spindle(TimeMaster):
-    Parameters = TimeMasterParameters
-    step = staticmethod(step)
-
-    def __init__(self, name, parameters):
-        super().__init__(name, parameters)
-        self.samples = self.expected_samples
-        self.declare(outputs=[Output("encoder", messages.ENCODER)])
-
-    @property
-    def memory(self):
-        return self.shared.nominal_speed * self.shared.step
-
-    def sample_at(self, angle):
-        return int(np.ceil(angle / self.memory))
-
-    def speed_range(self):
-        return self.shared.nominal_speed, self.shared.nominal_speed
-
-    def largest_acceleration(self):
-        return 0.0
-"""
 OWN_CELL = 'spindle: {ros__parameters: {stage: "own_spindle:Spindle", revolutions: 3.0}}'
 
 
@@ -152,7 +122,7 @@ OWN_CELL = 'spindle: {ros__parameters: {stage: "own_spindle:Spindle", revolution
 def test_the_core_runs_without_the_packages_around_it(cell, tmp_path):
     """Without the machine as well, if the stages are a user's own."""
     (tmp_path / "own.yaml").write_text(OWN_CELL)
-    (tmp_path / "own_spindle.py").write_text(SPINDLE)
+    shutil.copy(own_spindle.__file__, tmp_path)
     needed = {"lathe_rc", "lathe_machine"} if cell == "piston" else {"lathe_rc"}
     code = ALONE.format(beside=sorted(OURS - needed), cell=cell)
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))}

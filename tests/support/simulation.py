@@ -316,13 +316,12 @@ class Member(MemberHost):
             pid=self.process.pid,
             session=self.process.pid if is_master else 0,
         )
-        masters = ("spindle_encoder",)
         if is_master:
             reactions = Reactions(cell.stalls, 0.5, RESTART_TIME, cell.safe_samples, SIZE)
-            self.protocol = TimeMasterProtocol(own, cell.window, reactions, masters=masters, first=cell.first)
+            self.protocol = TimeMasterProtocol(own, cell.window, reactions, first=cell.first)
             self.protocol.know_end(cell.end)
         else:
-            self.protocol = MemberProtocol(own, cell.window, masters=masters, wired=not design.records)
+            self.protocol = MemberProtocol(own, cell.window, wired=not design.records)
 
     def activate(self) -> None:
         """Activate the node (extends `MemberHost`)."""
