@@ -101,9 +101,11 @@ class Pool:
 
     Args:
         msgtype: message type.
+        blank: all numbers are NaN at first, so that a field that the stage does not fill is found out.
     """
 
-    def __init__(self, msgtype: str) -> None:
+    def __init__(self, msgtype: str, *, blank: bool = False) -> None:
+        self._blank = blank
         self._fields = messages.sample_fields(msgtype)
         self._uniform = set(self._fields.values()) == {np.dtype(np.float64)}
         self._samples = 0
@@ -111,6 +113,9 @@ class Pool:
 
     def take(self, samples: int) -> tuple[Signals, Samples | None]:
         """Return uninitialised arrays of shape (samples,) by field, and one array of all if they have the same type."""
+        if self._blank:
+            blank = {np.dtype(np.float64): np.nan}
+            return {name: np.full(samples, blank.get(dtype, 0), dtype) for name, dtype in self._fields.items()}, None
         if not self._uniform:
             return {name: np.empty(samples, dtype) for name, dtype in self._fields.items()}, None
         if not self._free or samples != self._samples:

@@ -18,6 +18,7 @@ from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.stage import DONE, PYTHON, Stage
 from lathe_rc.compiled.step import BROKEN, AddressTable, broken
 from lathe_rc.compiled.struct_view import address, call, floats
+from lathe_rc.extensions import is_ours
 from lathe_rc.jit import kernel
 from lathe_rc.messages import Samples, Signals
 
@@ -100,6 +101,13 @@ class Tapes:
         for array in self._arrays.values():
             array.fill(0)
         self.begin = 0
+
+    def blank(self, topic: str) -> None:
+        """Make all numbers of a topic NaN, so that a field that its stage does not fill is found out."""
+        for name in self._fields[topic]:
+            array = self._arrays[topic, name]
+            if array.dtype == np.float64:
+                array[0 if (topic, name) in self._passing else self.history :] = np.nan
 
     def past(self, end: int) -> dict[str, Signals]:
         """Return copies of the samples before ``end`` that delayed readers need, by topic and field."""
@@ -297,8 +305,10 @@ class Program:
         self._where[:] = first, 0, 0
         self._told = [first] * len(stages)
         self._sparse: list[list[Sparse]] = [[] for _ in stages]
-        for number in range(len(stages)):
+        for number, stage in enumerate(stages):
             self._load(number)
+            for tape in self._outputs[number] if not is_ours(type(stage).__module__) else ():
+                self._tapes.blank(tape)
 
     def _field(self, tape: str, delay: int, name: str) -> tuple[int, int, int]:
         return *self._tapes.place(tape, name, delay), 0

@@ -10,6 +10,7 @@ from lathe_rc.blocks.ports import Sparse
 from lathe_rc.blocks.wire import Encoder
 from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import LatheError
+from lathe_rc.extensions import is_ours
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.ports import message_class, signal_qos
@@ -43,7 +44,8 @@ class Outputs:
         ]
         for encoder in self._encoders:
             encoder.prepare(self._size)
-        self._pools = [Pool(port.type) for port in stage.outputs]
+        others = not is_ours(type(stage).__module__)
+        self._pools = [Pool(port.type, blank=others) for port in stage.outputs]
         self._sparse_topics = {topic: node.topic(topic) for topic in stage.sparse_topics}
         self.publications = [
             *((topic, port.type, False) for topic, port in zip(self.topics, stage.outputs, strict=True)),

@@ -93,6 +93,28 @@ def test_a_spindle_of_others_leads_a_cell_in_every_host(tmp_path, monkeypatch):
     assert {host for host, topics in found.items() if topics != found["offline"]} == set()
 
 
+LAZY = """
+import own_spindle
+def step(speed, first, start, inputs, flags, outputs):
+    return own_spindle.step(speed, first, start, inputs, flags, [*outputs[:3], outputs[3].copy(), outputs[4]])
+class Spindle(own_spindle.Spindle):
+    step = staticmethod(step)
+"""
+
+
+@pytest.mark.parametrize("mode", ["offline", "composed", "processes"])
+def test_a_field_that_a_step_does_not_fill_is_refused(mode, tmp_path, monkeypatch):
+    """It was zero offline, and whatever was in the memory of a node."""
+    folders = os.pathsep.join(map(str, (tmp_path, Path(own_spindle.__file__).parent)))
+    monkeypatch.setenv("PYTHONPATH", folders, prepend=os.pathsep)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lazy_spindle.py").write_text(LAZY)
+    file = tmp_path / "own.yaml"
+    file.write_text(LED.replace("own_spindle:", "lazy_spindle:"))
+    with pytest.raises(LatheError, match="turning sends angle_true = nan at sample 0; allowed: finite numbers"):
+        harness.run(scenario.load(file), mode=mode)
+
+
 @pytest.mark.parametrize("kind", ["law", "plant", "stage"])
 def test_plain_python_has_the_bits_of_the_compiled_step(begin, kind):
     digests = []
