@@ -202,24 +202,6 @@ def test_a_q_that_cannot_be_flat_is_left_out_and_said_to_be():
     assert re.fullmatch(r"form error diverges from revolution \d+ on: .*; the shares are of what .*", found.warning)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ("force_turning --revolutions 2", "no form error to budget: the cell has no encoder and tool; allowed: "),
-        ("piston --revolutions 0.5", "budget of piston: no complete revolution; allowed: "),
-        ("piston --revolutions 1e-9", "budget of piston: no complete revolution; allowed: "),
-        ("piston --revolutions 11.9996", "its runs end with another revolution each"),
-        ("piston --set tool.fed=1.0", "tool.fed: unknown parameter; "),
-    ],
-)
-def test_what_has_no_budget_is_refused_in_a_line(arguments, said):
-    refused = CliRunner().invoke(main, ["budget", *arguments.split()])
-    assert refused.exit_code == 2
-    assert refused.stderr.startswith("lathe: ")
-    assert said in refused.stderr
-    assert len(refused.stderr.splitlines()) == 1
-
-
 def test_the_command_and_a_run_tell_the_same():
     length = ("piston", "--revolutions", "12")
     told = json.loads(CliRunner().invoke(main, ["budget", *length, "--json"]).stdout)

@@ -5,14 +5,12 @@ import functools
 import itertools
 import math
 import operator
-import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from cells import SCENARIOS, assert_resimulated, command, config, cuts
-from cells import run as cell_run
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -162,14 +160,6 @@ def test_a_command_that_is_not_finite_is_not_taken_over():
     take_over(takeover.table, np.array([0.0, np.nan]))
     with pytest.raises(LatheError, match=r"^a command of nan with a rate of nan is taken over; allowed: finite"):
         takeover.change(Mode.RETRACT)
-
-
-def test_a_takeover_reaches_as_far_as_the_drive():
-    listens = {"reaction_delay": 3200, "retract_time": 0.01}
-    with pytest.raises(
-        InputError, match=r"^learning_controller.retract_time = 0.01 s: .* the stroke of .* needs 0.002 m;"
-    ):
-        cell_run(learning_controller=listens, supervisor={})
 
 
 def test_a_monitor_that_only_warns_warns_again_after_a_reset():
@@ -507,22 +497,6 @@ def test_a_finer_channel_learns_again_only_when_the_coarse_one_is_back():
     assert np.array(fine["max_error"])[waits[-1] + 1] < 15e-6
     assert np.ptp(np.array(fine["stability_margin"])[8:]) < 1e-3
     assert result.errors.rms[-1] < 1e-8
-
-
-def test_a_retraction_needs_a_drive_and_a_node_that_obeys():
-    for others, message in (
-        (
-            [
-                "supervisor.drives=[]",
-                *(f"supervisor.{each}_limit=[]" for each in ("following", "stroke", "effort", "margin")),
-            ],
-            "no drives",
-        ),
-        (["learning_controller.reaction_delay=0"], "reads safety"),
-    ):
-        quiet = [f"supervisor.{each}_limit=0.0" for each in ("speed", "index", "error", "acceleration")]
-        with pytest.raises(InputError, match=message):
-            harness.run(supervised("supervisor.events=['revolution 12: retract']", *quiet, *others))
 
 
 def test_a_stop_is_not_reset():
@@ -865,25 +839,3 @@ def test_a_drive_that_is_commanded_a_position_stays_there(tmp_path):
 def test_a_re_simulation_reacts_in_the_same_way(tmp_path):
     harness.run(supervised(STUCK, "supervisor.events=['revolution 26: reset']"), bag=tmp_path / "bag")
     assert_resimulated(tmp_path / "bag")
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ("supervisor.following_limit=[1e-4, 2e-4]", "allowed: one for each of coarse"),
-        ("learning_controller.publish_margin=false", "supervisor reads coarse/margin, which no node"),
-        ("supervisor.margin_limit=[0.1, 0.1]", "allowed: one for each of coarse"),
-        ("supervisor.slide_limit=[1e-4]", "allowed: one for each of none"),
-        ("learning_controller.reaction_delay=32", "feedback of safety is delayed by 32 samples, block_size = 64"),
-        ("learning_controller.retract_position=2e-3", "the stroke of electrodynamic_actuator ends at 0.001 m; allowed"),
-        ("supervisor.speed_limit=-1", "allowed: a finite number from 0"),
-    ],
-)
-def test_what_cannot_be_is_refused(change, said):
-    with pytest.raises(InputError, match=re.escape(said)):
-        harness.run(supervised("supervisor.clear_position=1.5e-3", change))
-
-
-def test_a_reaction_that_no_node_obeys_is_refused():
-    with pytest.raises(InputError, match="no drive is named that takes the tool out"):
-        harness.run(config("supervised_turning", "supervisor.force_reaction=retract"))

@@ -155,14 +155,6 @@ def test_a_run_without_a_revolution_is_not_in_tolerance():
     assert "not in tolerance (±2 µm): no complete revolution" in done.stderr
 
 
-def test_a_tolerance_that_nobody_gave_cannot_be_required():
-    done = lathe(*SHORT, "--require-tolerance", "--set", "tool.tolerance=0.0")
-    assert done.exit_code == 2
-    assert done.stderr.startswith("lathe: --require-tolerance without tool.tolerance; allowed: ")
-    done = lathe("run", "force_turning", "--require-tolerance", "--set", "force_controller.tolerance=0.0")
-    assert done.stderr.strip().endswith("allowed: a scenario that has one, or --set force_controller.tolerance=5.0")
-
-
 def test_terminal_json_and_report_say_alike_that_a_run_diverges_though_it_is_in_tolerance(tmp_path):
     """A lead that is too long: the form error falls, then grows, within a wide tolerance."""
     lead = ("--set", "learning_controller.lead_time=3e-3", "--set", "learning_controller.allow_unstable=true")
@@ -274,16 +266,3 @@ def test_zones_have_heights():
     assert zone.covers(np.zeros(2), below).all()
     assert not zone.covers(np.zeros(2), above).any()
     assert zone.name == "0° to 0°, 0 to 0.45 mm"
-
-
-@pytest.mark.parametrize(
-    ("values", "told"),
-    [
-        ({"zone_start": [0.0]}, "zone_start, zone_width, zone_tolerance: lengths [1, 0, 0]; allowed: as many of each"),
-        ({"zone_start": [0.0], "zone_width": [1.0], "zone_tolerance": [1e-6]}, "tolerance = 0 with zones; allowed"),
-        ({"zone_bottom": [0.0], "zone_top": [1e-3]}, "zone_bottom: 1 values; allowed: none, or as many as of zone_st"),
-    ],
-)
-def test_zones_that_do_not_fit_together_are_refused(values, told):
-    with pytest.raises(InputError, match=re.escape(told)):
-        scenario(tool=values)

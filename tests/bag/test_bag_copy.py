@@ -88,17 +88,3 @@ def test_a_cell_recorded_at_the_wall_time_is_clean(turned, tmp_path):
             made.write(topic, 17 * 10**17 + log_ns, data)
     made.close()
     assert check(tmp_path / "wall").exit_code == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--topics", "/tol"], "no topic '/tol' in "),
-        (["--start", "0.5", "--end", "0.5"], "--end 0.5 with --start 0.5; allowed: an end after the start"),
-    ],
-)
-def test_a_choice_that_cannot_be_met_is_refused(turned, tmp_path, words, said):
-    done = lathe("bag", "copy", turned, "-o", tmp_path / "part", *words)
-    assert done.exit_code == 2
-    assert said in done.output
-    assert not (tmp_path / "part").exists()

@@ -15,6 +15,7 @@ from bags import EMPTY, FIRST, HEADER, SCHEMA, bag_writer, channel, chunk, chunk
 from fuzz_targets import CUT, TARGETS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import assert_refused
 from mcap.writer import MCAP0_MAGIC
 
 from lathe_machine.control import memory_file
@@ -65,12 +66,10 @@ def test_damage_is_refused_in_a_line(name):
 
 def test_memory_that_is_a_pipe_or_far_too_long_is_refused_unread(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="not a file"):
-        memory_file.load(tmp_path / "pipe", 64, 32)
+    assert_refused(lambda: memory_file.load(tmp_path / "pipe", 64, 32), "not a file")
     with (tmp_path / "long").open("wb") as file:
         file.truncate(2**40)
-    with pytest.raises(InputError, match="larger than any memory"):
-        memory_file.load(tmp_path / "long", 64, 32)
+    assert_refused(lambda: memory_file.load(tmp_path / "long", 64, 32), "larger than any memory")
 
 
 # ---- bags
@@ -276,8 +275,7 @@ COUNTING = """CREATE VIEW message_definitions AS
 )
 def test_database_that_answers_more_than_it_holds_is_refused(tmp_path, statements, said):
     bag = database(tmp_path / "bag", *statements)
-    with pytest.raises(InputError, match=said):
-        check(bag)
+    assert_refused(lambda: check(bag), said)
     salvage = Salvage(bag)
     assert list(salvage) == []
     assert said in salvage.damage[0]
@@ -288,8 +286,7 @@ def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_pa
     inside = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS + chunk_index(2**63, 100)).read_bytes()
     for content, said in ((skipped + zstandard.compress(inside), "none can be"), (zstandard.compress(BOMB), "twice")):
         (tmp_path / "x.mcap").write_bytes(content)
-        with pytest.raises(InputError, match=said):
-            Source(tmp_path / "x.mcap")
+        assert_refused(lambda: Source(tmp_path / "x.mcap"), said)
 
 
 def test_names_and_numbers_of_a_bag_are_what_they_should_be():

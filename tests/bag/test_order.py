@@ -179,10 +179,7 @@ def block(topic, first, samples, *, run_id="run", last=False):
         ([block("/a", 0, 8, run_id="other")], "block of run 'other' from /one; expected 'run'"),
         ([block("/a", 0, 8, last=True), block("/a", 8, 8)], "/a brings 8 samples from 8"),
         ([block("/a", 0, 8, last=True), block("/z", 0, 8), block("/z", 8, 8)], "/z brings 8 samples from 8"),
-        (
-            [block("/z", 0, 8), block("/z", 8, 8), block("/a", 0, 8, last=True)],
-            "/a ends with block 0, others elsewhere",
-        ),
+        ([block("/z", 0, 8), block("/z", 8, 8), block("/a", 0, 8, last=True)], "/a ends with block 0, others "),
         ([block("/a", 0, 5, last=True), block("/z", 0, 6, last=True)], "/z brings 6 samples from 0"),
         ([block("/a", 0, 8, last=True), block("/z", 0, 8), block("/encoder", 0, 8)], "not all end with the same one"),
     ],

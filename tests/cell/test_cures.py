@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from machines import line_of
 
 from lathe_commission.reduced_order import ChannelStep, fit_inverse
 from lathe_machine.stages.learning.learner import Learner
@@ -16,7 +17,7 @@ from lathe_rc import harness, resources
 from lathe_rc.cell import batch
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError, at_least, at_most
+from lathe_rc.errors import at_least, at_most
 
 CONFIG = Path(__file__).parents[2] / "config"
 FAST = ("nominal_rpm=3000.0",)
@@ -29,9 +30,7 @@ def load(name, *changes):
 
 
 def refused(name, *changes):
-    with pytest.raises(InputError) as refusal:
-        Cell(load(name, *changes).nodes).check()
-    return str(refusal.value)
+    return line_of(lambda: Cell(load(name, *changes).nodes).check())
 
 
 def cures(said):
@@ -158,9 +157,8 @@ def test_the_limit_that_is_named_is_allowed(name, parameter, beyond, changes, be
 def test_the_lag_that_is_named_suits_the_record():
     time = np.arange(64) / 48_000  # a step that is no short number
     model, measured = TransferFunction((1.0,), (1e-4, 1.0)), ChannelStep(time, 1.0 - np.exp(-time / 1e-4))
-    with pytest.raises(InputError) as refusal:
-        fit_inverse(model, measured, least_lag=1e-6)
-    fit_inverse(model, measured, least_lag=float(re.search(r"--lag ([\d.e-]*\d)", str(refusal.value))[1]))
+    refusal = line_of(lambda: fit_inverse(model, measured, least_lag=1e-6))
+    fit_inverse(model, measured, least_lag=float(re.search(r"--lag ([\d.e-]*\d)", refusal)[1]))
 
 
 def test_revolutions_that_are_named_are_in_the_file(tmp_path):
@@ -175,9 +173,8 @@ def test_revolutions_that_are_named_are_in_the_file(tmp_path):
         changes = [f"encoder_device.revolutions={revolutions!r}", f"encoder_device.counts_file={counts}"]
         return Cell(scenarios.load(file, changes).nodes).master
 
-    with pytest.raises(InputError) as refusal:
-        device(1000.0)
-    device(float(re.search(r"after ([\d.]+) revolutions", str(refusal.value))[1]))
+    refusal = line_of(lambda: device(1000.0))
+    device(float(re.search(r"after ([\d.]+) revolutions", refusal)[1]))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from cells import config, form_error, of_nodes
-from machines import assert_refused, refusals, run
+from machines import assert_refused, run
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_machine.stages.tool.gauge import Gauge, GaugeParameters
@@ -15,7 +15,6 @@ TURN = 2 * np.pi
 DELAY = 64
 SAMPLES = 3840  # per revolution at 1000 rpm
 STATE = tuple(messages.allocate(messages.STATE, 1))
-DRIVE = "loaded_drive"
 
 
 def stage(**values):
@@ -152,32 +151,6 @@ def test_the_other_fields_are_those_of_the_drive():
         assert_array_equal(state[name], measured)
 
 
-@refusals(
-    (lambda: stage(points_per_revolution=100), r"^gauge.points_per_revolution = 100; allowed: a power of 2"),
-    (lambda: stage(gap_start=[1.0]), r"^gauge.gap_start, gap_width: 1 and 0; give as many of each"),
-    (lambda: stage(cutoff=1000.0), r"^gauge.cutoff = 1000 UPR; allowed: \d+ up to 64 with 512 points"),
-    (
-        lambda: Cell(config("gauged", "gauge.angle_offset=0.2").nodes).check(),
-        r"^gauge.angle_offset = 0.2 rad: the correction diverges; allowed: less than 0.00\d+ rad, or more",
-    ),
-    (
-        lambda: Cell(config("gauged", "gauge.points_per_revolution=4096").nodes).check(),
-        r"^gauge.points_per_revolution = 4096: a revolution takes 37\d\d .*: 2048 or fewer, or a sample_rate of \d+",
-    ),
-    (lambda: stage(dropouts_per_revolution=1e4), r"^gauge.dropouts_per_revolution = 10000; allowed: below 3840"),
-    (
-        lambda: Cell(config("gauged", "gauge.tool_delay=4096").nodes).check(),
-        r"^gauge.tool_delay = 4096 samples: .* allowed: a shorter delay, or more revolutions_late",
-    ),
-    (
-        lambda: Cell(config("gauged", "gauge.tool_delay=8").nodes).check(),
-        r"^gauge: feedback of encoder is delayed by 8 samples, block_size = 16",
-    ),
-)
-def test_what_cannot_work_is_refused(make, message):
-    assert_refused(make, message)
-
-
 # --- in a cell
 
 BLIND = "controller.remap=[]"
@@ -225,10 +198,3 @@ def test_a_gauge_that_nobody_learns_from_changes_nothing():
     nodes = {name: table for name, table in with_gauge.nodes.items() if name != "gauge"}
     without = of_nodes("without", nodes)
     assert_array_equal(form_error(harness.run(with_gauge)), form_error(harness.run(without)))
-
-
-def test_a_form_that_the_drive_cannot_follow_is_refused_behind_a_gauge_too():
-    wild = config(
-        "gauged", "tool.remap=['coarse/state:=gauge/state']", "profile.harmonic_amplitude=[0.0, 2e-3, 0.0, 0.0]"
-    )
-    assert_refused(lambda: Cell(wild.nodes).check(), r"^profile.profile: loaded_drive cannot follow it .* stroke")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from machines import assert_refused
 
 from lathe_machine.control import memory_file
 from lathe_rc import data_file
@@ -42,16 +43,13 @@ def test_crash_before_the_rename_leaves_what_was_there(path, monkeypatch):
 
 @pytest.mark.parametrize(("cycle", "grid"), [(255, 128), (512, 128), (256, 256)])
 def test_memory_of_another_grid_is_refused(path, cycle, grid):
-    with pytest.raises(InputError, match=f"allowed: {cycle} (points )?with {grid}"):
-        memory_file.load(path, cycle, grid)
+    assert_refused(lambda: memory_file.load(path, cycle, grid), f"allowed: {cycle} (points )?with {grid}")
 
 
 def test_missing_files_and_values_that_are_not_finite_are_refused(path):
-    with pytest.raises(InputError, match="No such file or directory"):
-        memory_file.load(path.with_name("none"), 256, 128)
+    assert_refused(lambda: memory_file.load(path.with_name("none"), 256, 128), "No such file or directory")
     memory_file.save(path, np.full(256, np.nan), 128)
-    with pytest.raises(InputError, match="not a finite number"):
-        memory_file.load(path, 256, 128)
+    assert_refused(lambda: memory_file.load(path, 256, 128), "not a finite number")
 
 
 def test_a_file_of_another_kind_or_too_long_is_refused(path):
@@ -62,8 +60,7 @@ def test_a_file_of_another_kind_or_too_long_is_refused(path):
         b"0" * 2**20: "larger than any memory here",
     }.items():
         path.write_bytes(content)
-        with pytest.raises(InputError, match=why):
-            memory_file.load(path, 256, 128)
+        assert_refused(lambda: memory_file.load(path, 256, 128), why)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

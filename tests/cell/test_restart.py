@@ -176,14 +176,7 @@ def role(run_id="piston"):
     outputs = SimpleNamespace(framer=SimpleNamespace(companions=0))
     stage, start = (Cell(cell.nodes).stages[OWN] for _ in range(2))
     return SimpleNamespace(
-        node=node,
-        stage=stage,
-        inputs=inputs,
-        outputs=outputs,
-        _start=start,
-        blocks=0,
-        samples=0,
-        started=True,
+        node=node, stage=stage, inputs=inputs, outputs=outputs, _start=start, blocks=0, samples=0, started=True
     )
 
 

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 from lathe_machine import Law, LawParameters
 from lathe_rc import allowed_code, harness, parameter
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
 
 EVENTS = "/learning_controller/events"
 LENGTH = {"revolutions": 16.0}
@@ -111,32 +110,6 @@ def test_the_disturbance_law_takes_another_gain():
         for events in gains
     )
     assert equal == plain != none
-
-
-@pytest.mark.parametrize(
-    ("event", "said"),
-    [
-        ("set gain 0.5", r"event 'set gain 0\.5': no PARAM of 'set PARAM VALUE'; did you mean learning_gain\?"),
-        ("set feedback_delay 64", r"no PARAM of 'set PARAM VALUE'; allowed: learning_gain, lead_time, q_time$"),
-        ("set learning_gain", r"learning_controller\.learning_gain = ''; allowed: a finite number above 0 up to 2"),
-        ("set learning_gain 2.5", r"learning_controller\.learning_gain = 2\.5; allowed: a finite number above 0 up to"),
-        ("set q_time 0.05", r"learning_controller\.q_time: Q filter reaches .*; as with q_time = "),
-        (
-            "set lead_time 3e-3",
-            r"learning diverges with electrodynamic_actuator: .* lead_time = 3 ms.*; allowed: below",
-        ),
-    ],
-)
-def test_an_event_that_cannot_be_is_refused_before_the_start(event, said):
-    with pytest.raises(InputError, match=said):
-        Cell(scenario(learning_controller={"events": [f"revolution 2: {event}"]}).nodes).check()
-
-
-def test_a_stage_without_such_parameters_refuses_the_event():
-    nodes = scenario(tool={"events": ["sample 2: set feed 1.0"]}).nodes
-    said = r"tool\.events: event 'set feed 1\.0': no PARAM of 'set PARAM VALUE'; allowed: none"
-    with pytest.raises(InputError, match=said):
-        Cell(nodes)
 
 
 def test_a_law_of_ones_own_is_tuned():

@@ -6,14 +6,11 @@ import itertools
 import os
 import signal
 
-import pytest
 from cells import scenario
-from click.testing import CliRunner
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness, messages
-from lathe_rc.cli import main
 
 LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 60.0, "speed_factor": 1.0})  # there for 3.6 s
 RIGHT = scenario(
@@ -77,16 +74,3 @@ def test_a_domain_that_a_cell_was_given_is_chosen_for_no_other(monkeypatch):
         monkeypatch.setattr("lathe_rc.harness.processes._numbers", itertools.count(number - 1))  # the next one tried
         with harness.free_domain() as chosen, harness.free_domain(number) as shared:
             assert given == shared == number != chosen
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (["--mode", "composed", "--namespace", "left"], "namespace 'left'; allowed: / or /NAME"),
-        (["--namespace", "/left"], "--namespace /left with --mode offline; allowed: --mode processes or composed"),
-    ],
-)
-def test_a_namespace_that_cannot_be_is_refused(words, why):
-    done = CliRunner().invoke(main, ["run", "piston", *words])
-    assert done.exit_code == 2
-    assert why in done.output

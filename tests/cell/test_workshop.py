@@ -59,19 +59,3 @@ def test_the_last_profile_of_a_run_is_written(tmp_path):
         "# deviation from the desired form, revolution 3",
         "angle_deg,radius_um",
     ]
-
-
-@pytest.mark.parametrize("given", ["0", "7", "2,9", "x", "3-", "5-2", "-1"])
-def test_revolutions_that_there_are_not_are_refused(turned, given):
-    refused = lathe("measure", turned[0], f"--revolutions={given}")
-    assert refused.exit_code == 2
-    assert f"--revolutions '{given}'; allowed: " in refused.stderr
-    assert len(refused.stderr.splitlines()) == 1
-
-
-def test_a_recording_without_a_revolution_is_refused(tmp_path):
-    bag = tmp_path / "bag"
-    harness.run(scenario(spindle_encoder={"revolutions": 0.4}), bag=bag)
-    refused = lathe("measure", bag)
-    assert refused.exit_code == 2
-    assert "no complete revolution" in refused.stderr

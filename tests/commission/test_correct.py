@@ -18,8 +18,6 @@ from lathe_commission import form_correction, part_record
 from lathe_commission.form_correction import align, correction, evaluate, harmonics, outliers
 from lathe_machine.signals.measured_profile import read_csv as read_profile
 from lathe_rc import cli, harness
-from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
 from lathe_rc.signals.quantities import parse_columns
 
 TURN = 2 * np.pi
@@ -66,10 +64,7 @@ OVAL[2] = 225e-6
 
 
 @refusals(
-    (
-        lambda: align([OVAL], [OVAL], 0.0, np.pi),
-        r"when it is turned by 180°: .*; allowed: --offset with --search below 90",
-    ),
+    (lambda: align([OVAL], [OVAL], 0.0, np.pi), r"when it is turned by 180°: .*; allowed: --offset with --search "),
     (lambda: align([NO_NOISE], [OVAL], 0.0, np.pi), "round: nothing to align it by; allowed: --offset"),
     (lambda: align([OVAL], [OVAL], 0.5, 0.1), "still rises at 22.92°, the end of the search; allowed: a larger"),
     (lambda: harmonics(even(60), np.zeros(60), 50, "a.csv"), "a.csv: 60 points for 50 harmonics; allowed: 101 points"),
@@ -193,15 +188,8 @@ def test_a_revolution_begins_at_any_angle_and_goes_either_way(tmp_path, first, s
         ("phi,radius_um\n0,1\n", [], r"columns 'phi', 'radius_um'; allowed: angle and radius, with units"),
         ("phi,radius_um\n0,1\n", ["angle=phi"], r"column 'phi' has no unit; allowed for angle: deg, °, rad, rev"),
         ("angle_deg,angle_rad,radius_um\n0,0,1\n", [], r"'angle_deg' and 'angle_rad' are both angle; allowed: one"),
-        ("angle_deg,radius_um\n0,x\n", [], r"r.csv:2: 'radius_um' is 'x'; allowed: a finite number"),
-        ("angle_deg,radius_um\n0\n", [], r"r.csv:2: 1 values; allowed: 2, as in the header"),
-        ("angle_deg,radius_um\n0,inf\n", [], r"r.csv:2: 'radius_um' is 'inf'; allowed: a finite number"),
-        ("angle_deg,radius_um\nnan,1\n", [], r"r.csv:2: 'angle_deg' is 'nan'; allowed: a finite number"),
-        ("angle_deg,radius_um\n,1\n", [], r"r.csv:2: 'angle_deg' is empty; allowed: a finite number"),
         ("angle_deg,radius_um\n0,nan\n", [], r"no complete revolution: 0 points over 0°; allowed"),
         ("angle_deg,radius_um\n0,1\n9,1\n18,1\n", [], r"no complete revolution: 3 points over 18°; allowed"),
-        ("# nothing\n", [], "no header; allowed: a first line with the names"),
-        ("angle_deg,radius_um\n", [], "no rows below its header; allowed: one or more"),
         ("angle_deg,radius_um\n", ["diameter=d:mm"], r"--column 'diameter=d:mm'; allowed: QUANTITY=COLUMN"),
         ("angle_deg,radius_um\n", ["angle="], r"--column 'angle='; allowed: QUANTITY=COLUMN"),
     ],
@@ -542,8 +530,6 @@ def test_the_form_error_stays_that_of_the_form_when_the_controllers_are_told_ano
     plain, told = (harness.run(config("piston", long, *more)) for more in ([], [f"tool.programmed_file={out}"]))
     assert_allclose(told.part.profile[-1] - plain.part.profile[-1], 1e-6, atol=0.02e-6)
     assert_array_equal(read_profile(out).heights, form.heights)
-    with pytest.raises(InputError, match=r"^tool.programmed_file: .*none.csv: cannot be read"):
-        Cell(config("piston", "tool.programmed_file=/none.csv").nodes)
 
 
 def test_a_law_is_told_the_form_of_the_tool(tmp_path):

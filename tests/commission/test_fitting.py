@@ -78,13 +78,7 @@ def first_away(time):
         (first_away, 1e-3, ["--poles", "2", "--zeros", "1"], {"inverse"}, "inverse of .*a zero that is not stable; "),
         (lambda t: -decay(t), 1e-3, [], {"pid", "loop"}, "tuning: no crossover from 5 to 500 rad/s has margins of 60"),
         (decay, 1e-3, ["--gain-margin", "1e9"], {"pid", "loop"}, r"tuning: no crossover from .* of 60° and 1e\+09"),
-        (
-            lambda t: -decay(t),
-            0.005,
-            ["--lag", "1e-3"],
-            {"inverse", "pid", "loop"},
-            "inverse: .*; tuning: no crossover",
-        ),
+        (lambda t: -decay(t), 0.005, ["--lag", "1e-3"], {"inverse", "pid", "loop"}, "inverse: .*; tuning: no "),
     ],
 )
 def test_a_model_without_an_inverse_or_a_pid_is_kept(tmp_path, monkeypatch, response, step, options, lacking, message):
@@ -131,10 +125,3 @@ def test_a_model_alone_is_told_in_words(tmp_path, monkeypatch):
     path = step_file(tmp_path, time, -decay(time))
     done = lathe("channel", path, "--poles", 1, "--lag", 1e-3, "--figure", tmp_path / "fit.svg")
     assert [line[:9] for line in done.stdout.splitlines()] == ["model    ", "figure:  "]
-
-
-@pytest.mark.parametrize("kind", ["channel", "hysteresis"])
-def test_files_that_are_none_are_refused_in_one_line(kind, tmp_path):
-    refused = lathe(kind, tmp_path / "nowhere.csv")
-    assert refused.exit_code == 2
-    assert len(refused.stderr.splitlines()) == 1

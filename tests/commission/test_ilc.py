@@ -164,10 +164,7 @@ LOOP = "ilc.Loop(G, {}, {})"
         ("ilc.learning_filter(G, 'P')", "allowed: lead, inverse, zero-phase, notch"),
         ("ilc.learning_filter(ilc.frequency_response(F, 5e-6 * ONES))", "static gain of 5e-06; allowed: 0.01 to 100"),
         ("ilc.learning_filter(G, gain=np.nan)", "gain = nan; allowed: a number above 0 to 2"),
-        (
-            "ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)",
-            r"0.9; allowed: up to \S+, which \S+ Hz limits \(more",
-        ),
+        ("ilc.q_filter(G, {'lead_time': 0.0}, margin=0.9)", r"0.9; allowed: up to \S+, which \S+ Hz limits \(more"),
         (
             "ilc.q_filter(ilc.frequency_response(F[:60], ONES[:60]), {'lead_time': 0.0})",
             r"points up to \S+ Hz; allowed: up to \S+ Hz or more, or response = response.fit\(\)",

@@ -140,11 +140,6 @@ def test_two_forms_in_a_cell_are_not_guessed_between():
         made.varied({"tool.feed": 1e-4})
 
 
-def test_a_height_that_a_slide_makes_is_refused():
-    with pytest.raises(InputError, match="height_from = slide; allowed: feed"):
-        Cell(config("robust").varied({"disturbance_controller.height_from": "slide"}).nodes)
-
-
 # --- the law
 
 
@@ -333,5 +328,3 @@ def test_the_map_compares_each_sensor_with_the_variable_lead():
 
 def test_a_study_that_has_a_quick_form_has_an_option_for_it():
     assert "--quick" in CliRunner().invoke(main, ["study", "robust", "--help"]).stdout
-    refused = CliRunner().invoke(main, ["study", "invariance", "--quick"])
-    assert (refused.exit_code, "--quick" in refused.stderr) == (2, True)

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 
 from lathe_machine.control.identification import DriveIdentifier
 from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
-from lathe_rc.errors import InputError
 
 STATUS = "/coarse/learning"
 STEP = 1 / 64000
@@ -127,8 +126,3 @@ def test_adaptive_inverse_beats_the_variable_lead_fivefold(deviation):
     if deviation == 10.7:
         model |= {"correction_model": "given", **wrong(1.2, 0.8)}
         assert largest_error("variable_second_order", deviation, 3.0, **model) > 2 * variable
-
-
-def test_identified_model_without_identification_is_refused():
-    with pytest.raises(InputError, match="correction_model = identified without identification; set identify as well"):
-        run(learning_controller={"identify": False, "correction_model": "identified"})

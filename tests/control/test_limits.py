@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lathe_machine.control.limits import CommandLimits, limit, limiter
 from lathe_rc import harness, messages
-from lathe_rc.errors import InputError
 
 STEP = 1.0 / 64000
 LIMITS = CommandLimits(0.5e-3, 0.1, 200.0, 1e5)
@@ -166,8 +165,3 @@ def test_the_feed_is_limited_and_says_so():
     position, _, told = turned("longitudinal.command_stroke=2e-3")
     assert 1.9e-3 < position.max() <= 2e-3 + 1e-12
     assert "limited" in told
-
-
-def test_a_negative_limit_is_refused():
-    with pytest.raises(InputError, match="command_velocity = -1"):
-        run(electrodynamic_actuator={"command_velocity": -1.0})

@@ -14,7 +14,6 @@ from lathe_machine.control import rational_fit, rational_inverse
 from lathe_rc import messages
 from lathe_rc.cell import batch
 from lathe_rc.cell.wiring import Cell
-from lathe_rc.errors import InputError
 
 STEP = 1 / 64000
 DRIVE = ModalDrive(1036.7, 0.7, 0.2e-3, (5654.9,), (0.02,), (0.02,))
@@ -153,22 +152,6 @@ def test_law_starts_with_the_resonances_of_the_drive_unless_others_are_given():
     known = Cell(cell.nodes).stages["disturbance_controller"]
     assert_allclose(known.parameters.coefficients("law"), MODEL, rtol=1e-6)
     assert rational_inverse.is_rational(known.law.known.rational)
-
-
-@pytest.mark.parametrize(
-    ("denominator", "numerator", "words"),
-    [
-        ([1e-3, 1e-6], [1e-5, 1e-8], "2 and 2 coefficients; allowed: 4 and 2, or none"),
-        ([1e-3, 1e-6, 1e-10, 1e-14], [1e-7, 1e-8], "zeros that are not damped"),
-    ],
-)
-def test_a_model_that_cannot_be_inverted_is_refused(denominator, numerator, words):
-    with pytest.raises(InputError, match=words):
-        Cell(
-            config("oval3000")
-            .varied({"controller.model_denominator": denominator, "controller.model_numerator": numerator})
-            .nodes
-        )
 
 
 def test_blocks_and_a_checkpoint_beside_a_candidate_change_no_bit(tmp_path):

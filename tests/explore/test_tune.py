@@ -9,6 +9,7 @@ import numpy as np
 import optuna
 import pytest
 from click.testing import CliRunner
+from machines import assert_refused
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
@@ -78,8 +79,7 @@ class TestAsking:
         ],
     )
     def test_what_cannot_be_searched_is_refused_in_one_line(self, piston, free, said):
-        with pytest.raises(InputError, match=rf"^.*{said}.*$"):
-            search_space(piston, free)
+        assert_refused(lambda: search_space(piston, free), rf"^.*{said}.*$")
 
     def test_a_range_in_percent_is_of_the_start(self, piston):
         found = search_space(piston, {LEAD: "50%:200%"})[LEAD].distribution
@@ -98,15 +98,13 @@ class TestAsking:
         ],
     )
     def test_what_cannot_be_wanted_is_refused_in_one_line(self, piston, goals, subjects, said):
-        with pytest.raises(InputError, match=rf"^.*{said}.*$"):
-            objectives(piston, goals, subjects)
+        assert_refused(lambda: objectives(piston, goals, subjects), rf"^.*{said}.*$")
 
     @pytest.mark.parametrize(
         ("goal", "why"), [("tool.max_error", "there is no tool"), ("-margin", "there is no learning controller")]
     )
     def test_a_column_that_a_cell_never_has_is_refused(self, goal, why):
-        with pytest.raises(InputError, match=f"{why} in interrupted_cut"):
-            objectives(load("interrupted_cut", 3), [goal])
+        assert_refused(lambda: objectives(load("interrupted_cut", 3), [goal]), f"{why} in interrupted_cut")
 
     def test_the_command_refuses_in_one_line(self, command):
         refused = command("--worst")
@@ -125,8 +123,7 @@ class TestAsking:
     )
     def test_a_search_that_cannot_be_is_refused_before_anything_is_written(self, piston, tmp_path, more, said):
         goals = more.pop("goals", ["tool.max_error"])
-        with pytest.raises(InputError, match=said):
-            lathe_explore.tune(piston, FREE, goals, tmp_path / "x", **more)
+        assert_refused(lambda: lathe_explore.tune(piston, FREE, goals, tmp_path / "x", **more), said)
         assert not (tmp_path / "x").exists()
 
 
@@ -220,8 +217,7 @@ class TestSearch:
 
     def test_one_program_at_a_time_computes_into_a_folder(self, search):
         def beside(_event):
-            with pytest.raises(InputError, match="another program computes into it; allowed: one at a time"):
-                search("beside", 4)
+            assert_refused(lambda: search("beside", 4), "another program computes into it; allowed: one at a time")
 
         search("beside", 4, watch=beside)
 
@@ -251,8 +247,7 @@ class TestSearch:
         storage = JournalStorage(JournalFileBackend(str(journal)))
         study = optuna.load_study(study_name="tuning", storage=storage)
         study.add_trial(optuna.create_trial(value=0.0))
-        with pytest.raises(InputError, match=r"trials\.log: trial 20 is another program's"):
-            tune.load(journal.parent)
+        assert_refused(lambda: tune.load(journal.parent), r"trials\.log: trial 20 is another program's")
 
     def test_a_folder_holds_one_tuning_and_no_sweep(self, tuned, piston, search, client):
         with pytest.raises(InputError, match="holds a tuning; allowed: a new folder"):

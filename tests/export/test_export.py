@@ -204,20 +204,6 @@ def test_time_is_that_of_the_message_headers():
     assert rows["time"][0] == header.sec + header.nanosec * 1e-9
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "0 formats; allowed: one of --csv, --parquet and --npz"),
-        (["--csv", "--npz"], "2 formats"),
-        (["--csv", "--topics", "/nothing"], "--topics /nothing: not in the bag; allowed: /coarse/command"),
-        (["--csv", "-o", "no/such/folder"], "make it first"),
-    ],
-)
-def test_what_cannot_be_used_is_refused(recorded, arguments, said):
-    refused = lathe("export", recorded[0], *arguments)
-    assert (refused.exit_code, said in refused.stderr) == (2, True)
-
-
 @pytest.mark.parametrize("topic", ["/../../etc/x", "/a.b", "/a b", "/" + "a" * 300, "/ä"])
 def test_topics_that_would_leave_the_folder_or_are_no_signals_are_refused(topic):
     for kind, said in ((messages.TOOL, "no name of ROS"), ("own_msgs/msg/Unknown", "nothing to export")):

@@ -4,7 +4,6 @@
 from dataclasses import replace
 
 import pytest
-from bags import lathe
 from cells import scenario
 
 from lathe_export.c_library.hal import export_hal, files
@@ -46,16 +45,4 @@ def test_names_that_hal_cannot_hold_are_refused(tmp_path):
     library.inputs.append(replace(library.inputs[0], topic="encoder/angle", field="true"))
     with pytest.raises(InputError, match=r"pin tip\.encoder-angle-true: the name of another pin"):
         files(library, "piston")
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_command_refuses_what_the_c_export_refuses_and_float(tmp_path):
-    """By the name of what Python computes, and of the option; exit code 2."""
-    place = ["-o", tmp_path / "law"]
-    refused = lathe("export", "hal", "learning_controller", "--scenario", "supervised", *place)
-    assert refused.exit_code == 2
-    assert "learning_controller: publish_margin = true" in refused.output
-    refused = lathe("export", "hal", "learning_controller", "--scenario", "piston", "--real", "float", *place)
-    assert refused.exit_code == 2
-    assert "--real" in refused.output
     assert not list(tmp_path.iterdir())

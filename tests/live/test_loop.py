@@ -6,7 +6,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from bags import lathe
 
 from lathe_live import loop_figures
 from lathe_live.block_diagram import block_diagram
@@ -113,8 +112,3 @@ class TestPage:
             others = {name: value for name, value in values.items() if name == LEAD}
             strip = loop_figures.strip(loop.along(others, setting), values.get(setting.target, setting.value))
             assert page.along({"values": values, "setting": setting.target}) == {"strip": strip}
-
-    def test_a_file_that_is_no_page_is_refused_before_the_work(self, tmp_path):
-        done = lathe("loop", "piston", "--html", tmp_path / "loop.pdf")
-        assert done.exit_code == 2
-        assert "--html" in done.output

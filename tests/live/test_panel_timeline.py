@@ -133,13 +133,11 @@ def test_commands_and_parameters_of_an_own_run_are_marked_at_their_sample(opened
     """The bands go on after another parameter; a restart begins a new timeline."""
     shown = opened(scenario("piston", 12))
     for _ in range(3):
-        shown.ask("step")
-        shown.until(lambda now: now["state"] == "paused" and now["sample"])
+        shown.step()
     shown.ask("act", node="learning_controller", action="freeze")
     at = shown.now["sample"]
     shown.ask("change", values={"learning_controller.lead_time": "1.3e-3"}, here=True)
-    shown.ask("step")
-    shown.until(lambda now: now["state"] == "paused" and now["sample"] > at)
+    shown.step()
     told = shown.ask("timeline", cells=100)
     marks = {mark["kind"]: mark for mark in told["marks"] if mark["sample"] == at}
     assert marks["command"]["text"] == "learning_controller/events: freeze"

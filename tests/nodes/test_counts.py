@@ -205,12 +205,9 @@ def test_counts_far_from_0_keep_their_digits(start, changed):
         ),
         (
             lambda: filled([0, 5_000_000, 20_500_000], [0, 1, 9]),
-            "^no counts from 0.005 to 0.0205 s, for 15.5 ms; allowed: up to max_gap = 10 ms$",
+            "^no counts from 0.005 to 0.0205 s, .*max_gap = 10 ms$",
         ),
-        (
-            lambda: filled(np.arange(6) * STEP_NS, [10, 12, 11, 10, 13, 10]),
-            "gone back by 3 counts at 7.8125e-05 s; allowed: up to max_reverse = 2",
-        ),
+        (lambda: filled(np.arange(6) * STEP_NS, [10, 12, 11, 10, 13, 10]), "back by 3 counts at .* max_reverse = 2"),
     ],
 )
 def test_readings_that_no_encoder_gives_are_an_error(make, message):

@@ -181,10 +181,7 @@ class TestLaunch:
         ("argument", "said"),
         [
             ("spindle_encoder.members", "spindle_encoder.members: no node 'far' in the scenario; allowed: learning"),
-            (
-                "revolutions",
-                "no launch argument 'revolutions'; allowed: scenario, .*NODE.* .*nominal_rpm",
-            ),
+            ("revolutions", "no launch argument 'revolutions'; allowed: scenario, .*NODE.* .*nominal_rpm"),
             ("spindle.revolutions", "no node 'spindle' in the scenario; did you mean spindle_encoder?"),
             ("spindle_encoder.revolution", "spindle_encoder.revolution: unknown parameter; did you mean revolutions"),
             ("tool.feed", "tool.feed = 'far'; allowed: a finite number"),

@@ -179,9 +179,7 @@ def test_a_repeat_and_a_gap_are_refused(second, words):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_sample_that_is_not_finite_is_refused(bad):
-    with pytest.raises(
-        BadBlock, match=f"^/encoder: /spindle sends angle = {bad} at sample 2; allowed: finite numbers$"
-    ):
+    with pytest.raises(BadBlock, match=f"^/encoder: /spindle sends angle = {bad} at sample 2; allowed: finite"):
         queue().add(block(0, angle=[0.0, 1.0, bad, 3.0]))
 
 

@@ -11,11 +11,9 @@ import threading
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from cells import STEP, Seen, block, held, scenario, until
-from diagnostic_msgs.msg import DiagnosticArray
+from cells import STEP, Seen, block, held, scenario
 from lathe_rc_msgs.msg import CellState, EncoderBlock, Member, Progress, ToolBlock
 from mcap.reader import make_reader
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
@@ -86,25 +84,6 @@ def refused_by_a_node(event):
         return None
     topic, run, source = re.match(r"(\S+): message of run ('.*?') from (\S+);", event["message"]).groups()
     return f"{'an unknown sender' if source == '?' else source} of run {run} on {topic}"
-
-
-def until_named(ghost, topic, readers):
-    """Wait until the ``readers`` of a topic, which have refused a message on it, name the ghost as its publisher.
-
-    DDS may tell a node of a publisher some seconds before it tells it the name.
-    """
-    left = set(readers)
-
-    def heard(array):
-        for status in array.status:
-            if "/haunted/ghost" in {pair.key: pair.value for pair in status.values}.get(f"publishers of {topic}", ""):
-                left.discard(status.name)
-
-    ghost.create_subscription(DiagnosticArray, "/diagnostics", heard, 100)
-    executor = SingleThreadedExecutor()
-    executor.add_node(ghost)
-    until(lambda: not left, lambda: executor.spin_once(timeout_sec=1.0))
-    executor.shutdown()
 
 
 def diagnostics(bag):

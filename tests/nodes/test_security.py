@@ -49,12 +49,6 @@ def parsed(text):
     return ET.fromstring(text)  # noqa: S314 - made here
 
 
-def refused(*arguments):
-    result = CliRunner().invoke(cli.main, ["policy", *map(str, arguments)])
-    assert result.exit_code == 2
-    return result.output
-
-
 # ---- the files
 
 
@@ -166,20 +160,6 @@ def test_an_attached_panel_asks_for_what_its_page_commands():
     assert commands.request == asked
     offered = frozenset().union(*(profile.reply for enclave in policy.values() for profile in enclave))
     assert asked <= offered
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--namespace", "left"], "namespace 'left'; allowed: / or /NAME"),
-        (["--namespace", "/le ft"], "namespace '/le ft'; allowed: / or /NAME"),
-        (["--group", "tool+spool"], "--group: no node 'spool' in the scenario"),
-        (["-o", "none/x.xml"], "none/x.xml: cannot be written"),
-    ],
-)
-def test_what_cannot_be_is_refused(options, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert said in refused("piston", *options)
 
 
 # ---- the real graph

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from machines import assert_refused
 from numpy.testing import assert_allclose
 from scipy.integrate import trapezoid
 from scipy.signal import step as scipy_step
@@ -19,7 +20,6 @@ from lathe_papers.formulas.step_fit import (
     fit_second_order,
     read_csv,
 )
-from lathe_rc.errors import InputError
 
 DRIVE = SecondOrder(1038.0, 0.804, 0.36e-3)
 TIME = np.linspace(0.0, 12e-3, 1000)
@@ -171,24 +171,15 @@ def test_csv_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "no header; allowed"),
         (None, "cannot be read"),
         ("t,h\n" + GOOD, "columns 't', 'h'; allowed: time and response"),
-        ("time_ms,response\n", "no rows below its header; allowed"),
-        ("time_ms,response\n" + GOOD + "13\n", ":102: 1 values"),
-        ("time_ms,response\n" + GOOD + "13,one\n", ":102: 'response' is 'one'; allowed"),
-        ("time_ms,response\n" + GOOD + "13,nan\n", ":102: 'response' is 'nan'; allowed"),
         ("time_ms,response\n" + GOOD + "3,1\n", "is followed by 0.003 s; allowed: increasing"),
         ("time_ms,response\n" + GOOD + "13,225\n", "ends at 225; allowed: near 1"),
     ],
 )
 def test_bad_csv_is_refused_in_one_line(tmp_path, text, reason):
     path = tmp_path if text is None else written(tmp_path, text)
-    with pytest.raises(InputError) as refusal:
-        read_csv(path)
-    assert str(refusal.value).startswith(str(path))
-    assert reason in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+    assert_refused(lambda: read_csv(path), f"^{path}.*{reason}")
 
 
 @pytest.mark.parametrize(
@@ -202,5 +193,4 @@ def test_bad_csv_is_refused_in_one_line(tmp_path, text, reason):
     ],
 )
 def test_what_is_no_step_response_is_refused(time, response, reason):
-    with pytest.raises(InputError, match=reason):
-        StepResponse(time, response)
+    assert_refused(lambda: StepResponse(time, response), reason)

@@ -140,36 +140,6 @@ def test_study_prints_a_table_or_json_and_draws_a_figure(folder, name, monkeypat
     assert paths == ["a.png"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["fork"], "no study 'fork'; allowed: angle-domain, "),
-        (["invarience"], "no study 'invarience'; did you mean invariance?"),
-        (["invariance", "--set", "t0_ms"], "--set 't0_ms'; allowed: PARAM=VALUE"),
-        (["invariance", "--set", "t0=2"], "invariance.t0: unknown parameter; did you mean t0_ms?"),
-        (["invariance", "--set", "t0_ms=0"], "invariance.t0_ms = 0; allowed: a finite number above 0 up to 1000 [ms]"),
-        (["invariance", "--set", "t0_ms=2,3"], "invariance.t0_ms = '2,3'; allowed: a finite number"),
-        (["invariance", "--set", "t0_ms=[2"], "--set t0_ms"),
-        (["invariance", "--set", "speeds=84,fast"], "invariance.speeds = [84, 'fast']; allowed: a list, each a finite"),
-        (["invariance", "--set", "speeds=[]"], "invariance.speeds = ['']; allowed: a list"),
-        (["invariance", "--set", "speeds=1,105"], "allowed: from 10.5 rad/s"),
-        (["angle-domain", "--set", "waves=2.5"], "angle-domain.waves = 2.5; allowed: an integer from 1"),
-        (["angle-domain", "--set", "amplitudes=0.1"], "amplitudes = [0.1]; allowed: two or more, increasing"),
-        (["drive-models", "--set", "file=no.csv"], "no.csv: cannot be read"),
-        (["drive-models", "--figure", "a.pdf"], "--figure a.pdf; allowed: a file name that ends in .png"),
-        (["drive-models", "--figure", "no/a.png"], "no such folder"),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(folder, arguments, text):
-    result = study(*arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1, result.stderr
-    assert result.stderr.startswith("lathe: ")
-    assert text in result.stderr
-    assert list(folder.iterdir()) == []
-
-
 @pytest.mark.parametrize("text", ["84,105,126.5", "[84, 105, 126.5]", " 84 , 1.05e2,126.5"])
 def test_lists_are_numbers_with_commas(text):
     assert read(STUDIES["invariance"], [f"speeds={text}"]).speeds == [84.0, 105.0, 126.5]

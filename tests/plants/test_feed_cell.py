@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose
 from lathe_machine.control.predistortion import Predistortion, cancelling, proportional
 from lathe_rc import harness
 from lathe_rc.cell.scenario import load
-from lathe_rc.errors import InputError
 
 
 def run(name, *overrides):
@@ -170,37 +169,6 @@ def test_slow_controllers_compute_at_multiples_of_their_divisor():
     changes = np.flatnonzero(np.diff(command)) + 1
     assert changes.size > 10
     assert np.all(changes % 96 == 0)
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "told"),
-    [
-        ("approach", {"trajectory": "csv"}, "trajectory_file is empty"),
-        ("approach", {"set_point": [1.0, 2.0]}, "set_point, set_point_time: 2 values and 1 times"),
-        ("approach", {"set_point_time": [1.0, 1.0], "set_point": [1.0, 2.0]}, "each later than"),
-        ("approach", {"feed_drive.model": "dc_screw", "feed_drive.zero": 0.1}, "feed drive"),
-        ("approach", {"law": "periodic_hyperstable", "period": 0.0001}, "period"),
-        ("approach", {"predistortion_file": "/nowhere.csv"}, "/nowhere.csv"),
-        ("approach", {"link": "paper", "link_gain": 20.0}, "feedback_delay, link: "),
-        ("force_turning", {"gap_start": [1.0]}, "gap_start, gap_width: 1 and 0"),
-        ("force_turning", {"hard_spot_start": [1.0]}, "hard_spot_"),
-        ("force_turning", {"moved_by": ["longitudinal", "longitudinal"]}, "each once"),
-        ("force_turning", {"allowance_rate": 1e-6}, "allowance_rms and allowance_rate"),
-        ("force_turning", {"run_out_amplitude": []}, "run-out"),
-        (
-            "full_cell",
-            {"block_size": 128},
-            "delayed by 64 samples, block_size = 128; allowed: block_size up to the delay",
-        ),
-    ],
-)
-def test_bad_servos_cuts_and_blocks_are_refused_in_one_line(name, changes, told):
-    node = {"approach": "position_controller.", "force_turning": "cutting_process."}.get(name, "")
-    values = {key if "." in key else f"{node}{key}": value for key, value in changes.items()}
-    with pytest.raises(InputError) as refused:
-        harness.run(load(name).varied(values))
-    assert told in str(refused.value)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 SHAFT = """

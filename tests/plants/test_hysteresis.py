@@ -16,7 +16,6 @@ from numpy.testing import assert_allclose
 from lathe_commission.hysteresis_fit import Loop, from_signals, identify, of_measurement
 from lathe_machine.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
 from lathe_papers.formulas.vibration import describing_function
-from lathe_rc.errors import InputError
 from lathe_rc.signals.measurement_file import read
 
 FORWARD = [PrandtlIshlinskii, BoucWen]
@@ -286,19 +285,6 @@ def test_file_gives_the_loop(tmp_path):
     assert_allclose(identify(back, STROKE).model.weights, WEIGHTS, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("displacement_um,u\n0,1\n", "columns 'displacement_um', 'u'; allowed: command and displacement"),
-        (HEAD, "no rows below its header; allowed"),
-    ],
-)
-def test_bad_file_is_refused(tmp_path, text, message):
-    path = write(tmp_path, text)
-    assert_refused(lambda: of_measurement(read(path)), f"{path}.*{message}")
-
-
 @pytest.mark.parametrize(("topics", "message"), [({}, "no topics"), ({"/fine/command": {}}, "there are /fine/command")])
 def test_recording_without_the_drive_is_refused(topics, message):
-    with pytest.raises(InputError, match=rf"is not in the recording; .*{message}"):
-        from_signals(topics)
+    assert_refused(lambda: from_signals(topics), rf"is not in the recording; .*{message}")

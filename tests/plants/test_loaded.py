@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 from cells import scenario
-from machines import assert_refused, refusals
 from numpy.testing import assert_allclose
 
 from lathe_machine.analysis.regeneration import Regeneration
@@ -238,10 +237,7 @@ def steady(machine, frequency, **cut):
 
 MACHINES = {
     "alone": (loaded, lambda: compliance(**SERVO)),
-    "coil": (
-        lambda: loaded(coil=COIL),
-        lambda: compliance(**SERVO, coil=COIL, force_constant=FORCE_CONSTANT),
-    ),
+    "coil": (lambda: loaded(coil=COIL), lambda: compliance(**SERVO, coil=COIL, force_constant=FORCE_CONSTANT)),
     "series": (lambda: loaded(series=True), lambda: compliance_in_series(**SERVO, **STACK)),
 }
 
@@ -343,21 +339,6 @@ def test_a_stack_is_torn_off_its_preload():
     loaded(series=True, preload=300.0).block(cutting(), 0, shaken)
     with pytest.raises(LatheError, match="tears the stack off its preload"):
         loaded(series=True, preload=50.0).block(cutting(), 0, shaken)
-
-
-@refusals(
-    (lambda: loaded(coil=replace(COIL, bandwidth=500e3)), "current loop of 500000 rad/s at a step of .*: largest pole"),
-    (
-        lambda: harness.run(together(coarse_current_limit=3.0)),
-        r"^loaded_drive\.coarse_current_limit = 3 with coarse_loop = ideal; allowed: 0, or current$",
-    ),
-    (
-        lambda: harness.run(together(cut_gap_start=[1.0, 2.0])),
-        r"loaded_drive\.cut_gap_start, cut_gap_width: 2 and 1; give as many of each",
-    ),
-)
-def test_what_cannot_work_is_refused_by_its_own_names(make, message):
-    assert_refused(make, message)
 
 
 def test_a_tool_breaks_as_in_a_cut_of_its_own():

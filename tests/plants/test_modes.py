@@ -11,7 +11,6 @@ from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
 from lathe_machine.plants.modes import Modes, carriage
 from lathe_machine.plants.piezo import Stack
 from lathe_machine.plants.tool_drive import Piezo, ToolDrive
-from lathe_rc.errors import InputError
 
 STEP = 1 / 64000
 LOOP = (2 * np.pi * 165.0, 0.7)  # ω1, ζ1
@@ -134,28 +133,3 @@ def test_at_an_end_stop_the_edge_apart_from_the_sensor_still_makes_the_chip():
     chip = cut["depth_of_cut"] + drive["position"] - form["reference"] - cut["allowance"]
     assert np.count_nonzero(stopped) > 100
     assert np.ptp(chip[stopped]) < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (PISTON[:2], "lengths [2, 2, 0, 0]; allowed: as many of each"),
-        (["electrodynamic_actuator.mode_frequency=[3e5]"], "below half the sample rate, 201062 rad/s"),
-        (
-            [*PISTON[:2], "electrodynamic_actuator.mode_participation=[0.5, 0.5]"],
-            "participations at the sensor sum up to 1; allowed: below 1",
-        ),
-    ],
-)
-def test_modes_that_cannot_be_are_refused(overrides, said):
-    with pytest.raises(InputError) as refusal:
-        lathe_rc.run(lathe_rc.load("piston", overrides))
-    assert str(refusal.value).startswith("electrodynamic_actuator.mode_frequency")
-    assert said in str(refusal.value)
-
-
-def test_modes_beside_a_current_loop_are_refused():
-    loaded = ["loaded_drive.coarse_mode_frequency=[5e3]", "loaded_drive.coarse_mode_damping=[0.02]"]
-    loaded += ["loaded_drive.coarse_mode_participation=[0.02]", "loaded_drive.coarse_loop=current"]
-    with pytest.raises(InputError, match="modes belong to a closed position loop; allowed: without a current loop"):
-        lathe_rc.run(lathe_rc.load("robust_cutting", loaded))

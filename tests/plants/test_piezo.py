@@ -6,7 +6,7 @@ import pytest
 from cells import cuts
 from hypothesis import given
 from hypothesis import strategies as st
-from machines import amplitude, assert_refused, refusals, run
+from machines import amplitude, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
@@ -206,38 +206,12 @@ def advance(made, *inputs):
 def test_stage_reads_what_it_is_asked_for(values, expected):
     made = stage(**values)
     assert [port.topic for port in made.inputs] == expected
-    kinds = {
-        "fine/command": (messages.COMMAND, ("position",)),
-        "reference": (messages.REFERENCE, ("expected",)),
-    }
+    kinds = {"fine/command": (messages.COMMAND, ("position",)), "reference": (messages.REFERENCE, ("expected",))}
     state = (messages.STATE, ("measured_position",))
     assert all((port.type, port.fields) == kinds.get(port.topic, state) for port in made.inputs)
     assert not any(port.delay for port in made.inputs)
     assert [(output.topic, output.type) for output in made.outputs] == [("fine/state", messages.STATE)]
     compile_kernels(made)
-
-
-def made_of(**values):
-    return lambda: stage("piezo", **values)
-
-
-@refusals(
-    (made_of(use_command=False), "^piezo.use_command, use_reference, compensates: there is no set point; allowed: one"),
-    (made_of(compensates=["a", "b", "a"]), r"^piezo.compensates = \['a', 'b', 'a'\]; allowed: each displacement once"),
-    (
-        made_of(play_thresholds=[0.1]),
-        "^piezo.play_thresholds, play_weights, play_proportional: plays: 1 thresholds and",
-    ),
-    (made_of(play_thresholds=[0.2, 0.1], play_weights=[0.1, 0.1]), ": play thresholds"),
-    (made_of(play_proportional=0.1, play_weights=[-0.02] * 10), ": play weights: slope .* after 5 plays"),
-    (made_of(hysteresis="bouc_wen", bouc_wen_a=0.8), "^piezo.bouc_wen_a, bouc_wen_beta, bouc_wen_gamma: Bouc-Wen A"),
-    (made_of(identified_thresholds=[0.1]), "^piezo.identified_weights: empty"),
-    (made_of(identified_weights=[0.1]), "^piezo.identified_thresholds, .*: plays: 10 thresholds and 1 weights"),
-    (made_of(amplifier_lag=1e-9), "^piezo.amplifier_lag, creep_shortest: lag of 1e-09 s at a step of .* 1.5625e-08 s,"),
-    (made_of(events=["revolution 3: freeze"]), "^piezo.events: event 'freeze'"),
-)
-def test_stage_refuses_what_cannot_work(make, message):
-    assert_refused(make, message)
 
 
 def test_direct_compensation_follows_the_error_of_the_same_sample():

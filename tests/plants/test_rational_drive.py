@@ -135,22 +135,3 @@ def test_lost_members_make_a_drive_go_to_its_safe_position_whatever_its_gain():
         drive.step(drive.memory, 0, 0, (np.zeros(64_000),), (), tuple(outputs))
         assert_allclose(outputs[0, -1], 0.3e-3, rtol=1e-6)
         assert np.abs(outputs[1]).max() <= 0.1
-
-
-def test_retraction_by_the_law_has_the_sign_of_the_drive():
-    with pytest.raises(InputError, match="retract_position"):
-        Cell(lathe_rc.load("supervised", ["electrodynamic_actuator.gain=0.1"]).nodes).check()
-
-
-@pytest.mark.parametrize(
-    ("scenario", "changes", "said"),
-    [
-        ("piston", ["electrodynamic_actuator.gain=0"], "actuator.gain = 0; allowed: of either sign, not 0"),
-        ("piston", ["electrodynamic_actuator.lag_participation=[0.1]"], r"lags: lengths \[0, 1\]; allowed: as many"),
-        ("robust_cutting", ["loaded_drive.coarse_lag_time=[1e-3]", "loaded_drive.coarse_lag_participation=[0.1]"],
-         "mode_velocity and lag_time say how the drive follows its command, not how it gives way to a force"),
-    ],
-)  # fmt: skip
-def test_models_that_cannot_be_are_refused(scenario, changes, said):
-    with pytest.raises(InputError, match=said):
-        lathe_rc.run(lathe_rc.load(scenario, changes))

@@ -6,7 +6,7 @@ import pytest
 from cells import cuts
 from hypothesis import given
 from hypothesis import strategies as st
-from machines import amplitude, assert_refused, refusals, run
+from machines import amplitude, assert_refused, run
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
@@ -287,27 +287,6 @@ def test_stage_reads_what_it_is_asked_for(values, expected):
     assert [(port.topic, port.delay) for port in made.inputs] == [(topic, 0) for topic in expected]
     assert [port.topic for port in made.outputs] == ["coarse/state", "fine/state"]
     compile_kernels(made)
-
-
-def made_of(**values):
-    return lambda: stage("series", **values)
-
-
-@refusals(
-    (made_of(fine_damping=-1.0), "^series.fine_damping = -1.0; allowed: a finite number above 0"),
-    (
-        made_of(fine_use_command=False),
-        "^series.fine_use_command, fine_use_reference, fine_compensates: there is no set point",
-    ),
-    (made_of(fine_compensates=["a", "a"]), r"^series.fine_compensates = \['a', 'a'\]; allowed: each displacement once"),
-    (made_of(fine_play_thresholds=[0.1]), "^series.fine_play_thresholds, .*: plays: 1 thresholds and 10 weights"),
-    (
-        made_of(**DIRECT, mass_ratio=1.0, sample_rate=4000),
-        "^series.mass_ratio, sample_rate: series drive: at a step of",
-    ),
-)
-def test_stage_refuses_what_cannot_work(make, message):
-    assert_refused(make, message)
 
 
 def test_stage_without_mass_is_the_two_stages():

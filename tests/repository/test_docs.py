@@ -24,7 +24,6 @@ from lathe_rc.messages import PACKAGE, store
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 WITH_PYTHON = [page for page in PAGES if "```python\n" in page.read_text(encoding="utf-8")]
-FIVE = {"spindle_encoder", "learning_controller", "electrodynamic_actuator", "tool", "recorder"}
 
 _LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 _RUN = re.compile(r"^\$ \./lathe (run .*)$", re.MULTILINE)

@@ -16,7 +16,6 @@ from lathe_machine.signals.encoder_errors import EncoderErrors, seen_along
 from lathe_rc import harness, messages
 from lathe_rc.analysis.metrology import undulations
 from lathe_rc.cell import scenario
-from lathe_rc.errors import InputError
 from lathe_rc.signals import speed
 
 TURN = 2 * np.pi
@@ -249,12 +248,6 @@ def measure_at(step, counts, samples):
     return np.floor(swinging.at(np.arange(samples) * step)[0] * counts / TURN)
 
 
-def test_edge_clock_and_several_reads_are_not_both_given():
-    with pytest.raises(InputError, match=r"spindle_encoder\.reads_per_sample = 4 with edge_clock = 1e-06 s; allowed"):
-        config("robust", "spindle_encoder.reads_per_sample=4", "spindle_encoder.edge_clock=1e-6")
-    with pytest.raises(
-        InputError, match=r"spindle_encoder\.edge_clock = 1e-13 s; allowed: 0, or from 1e-12 s up to 1 s"
-    ):
-        config("robust", "spindle_encoder.edge_clock=1e-13")
+def test_several_reads_are_an_edge_clock_for_the_law():
     law = config("robust", "spindle_encoder.reads_per_sample=16").nodes["disturbance_controller"]
     assert law.encoder_edge_clock == STEP / 16

@@ -200,10 +200,7 @@ GOOD = "0,1\n90,2\n180,3\n"
         ("# c\n" + HEAD + "\n" + GOOD + "270,four\n", ":7: 'radius_um' is 'four'; allowed"),
         (HEAD + GOOD + "270,\n", ":5: 'radius_um' is empty; allowed"),
         (HEAD + GOOD + "270\n", ":5: 1 values; allowed: 2"),
-        (
-            HEAD + "0,1,5\n90,2\n",
-            ":2: 3 values; allowed: 2, as in the header (between columns a semicolon, or",
-        ),
+        (HEAD + "0,1,5\n90,2\n", ":2: 3 values; allowed: 2, as in the header (between columns a semicolon, or"),
         (HEAD + GOOD + "90,2\n", ": angle 90° at height 0 mm appears more than once"),
         (HEAD + "360,1\n120,2\n240,3\n360,1\n", ": angle 0° at height 0 mm appears more than once"),
         (HEAD + GOOD + "360.5,1\n", ": angle 360.5°; allowed: 0 up to 360, where 360 is 0 again"),
@@ -224,14 +221,8 @@ GOOD = "0,1\n90,2\n180,3\n"
         (HEAD.encode() + b"0,\x00\n", "not a text file"),
         (HEAD + "0,0\n1.571,10\n3.142,0\n4.712,-10\n", "spans 0 to 4.712, which looks like radians; allowed: degrees"),
         (HEAD + "0,0\n0.25,10\n0.5,0\n0.75,-10\n", "angle_deg spans 0 to 0.75, which looks like revolutions"),
-        (
-            HEAD + "0,0\n90,225e-6\n180,0\n270,-225e-6\n",
-            "radius_um is 0.00045 µm from peak to valley, which looks like",
-        ),
-        (
-            HEAD + "0,50000\n90,50225\n180,50000\n270,49775\n",
-            "radius_um is 4.978e+04 µm or more everywhere, which looks",
-        ),
+        (HEAD + "0,0\n90,225e-6\n180,0\n270,-225e-6\n", "radius_um is 0.00045 µm from peak to valley, which looks "),
+        (HEAD + "0,50000\n90,50225\n180,50000\n270,49775\n", "radius_um is 4.978e+04 µm or more everywhere, which "),
     ],
 )
 def test_bad_file_is_refused(tmp_path, text, message):

@@ -13,13 +13,6 @@ import numpy as np
 
 from lathe_rc import messages
 
-KINDS: dict[str, Callable[[Any], object]] = {}  #: by name: changes a decoded message in place
-
-
-def kind(change: Callable[[Any], object]) -> Callable[[Any], object]:
-    KINDS[change.__name__.replace("_", " ").strip()] = change
-    return change
-
 
 def _arrays(message: Any) -> dict[str, Any]:
     return {name: each for name, each in vars(message).items() if isinstance(each, np.ndarray)}
@@ -38,86 +31,36 @@ def _shift(message: Any, samples: int) -> None:
     message.header.stamp.nanosec += samples * message.block.step_ns
 
 
-@kind
-def nan(message):
+def _poison(message: Any, value: float) -> None:
+    """Give one sample of the first signal of numbers another value."""
     name = next(name for name, array in _arrays(message).items() if array.dtype == np.float64)
-    setattr(message, name, np.where(np.arange(64) == 7, np.nan, getattr(message, name)))
+    setattr(message, name, np.where(np.arange(64) == 7, value, getattr(message, name)))
 
 
-@kind
-def infinite(message):
-    name = next(name for name, array in _arrays(message).items() if array.dtype == np.float64)
-    setattr(message, name, np.where(np.arange(64) == 7, -np.inf, getattr(message, name)))
+def _tear(message: Any) -> None:
+    """Take the last sample off one array alone."""
+    name, array = next(iter(_arrays(message).items()))
+    setattr(message, name, array[:-1])
 
 
-@kind
-def gap(message):
-    _shift(message, 64)
-
-
-@kind
-def repeat(message):
-    _shift(message, -64)
-
-
-@kind
-def half_a_repeat(message):
-    _shift(message, -32)
-
-
-@kind
-def short(message):
-    _cut(message, 63)
-
-
-@kind
-def long(message):
-    _cut(message, 65)
-
-
-@kind
-def empty(message):
-    _cut(message, 0)
-
-
-@kind
-def uneven(message):
-    setattr(message, name := next(iter(_arrays(message))), getattr(message, name)[:-1])
-
-
-@kind
-def step(message):
-    message.block.step_ns += 1
-
-
-@kind
-def stamp(message):
-    message.header.stamp.nanosec += 1
-
-
-@kind
-def last(message):
-    message.block.last = True
-
-
-@kind
-def far_away(message):
-    message.block.first_index = 2**63
-
-
-@kind
-def another_run(message):
-    message.block.run_id = "another"
-
-
-@kind
-def another_source(message):
-    message.block.source = "/nobody"
-
-
-@kind
-def no_block(message):
-    """Bytes that are cut off."""
+KINDS: dict[str, Callable[[Any], object]] = {  #: by name: changes a decoded message in place
+    "nan": lambda message: _poison(message, np.nan),
+    "infinite": lambda message: _poison(message, -np.inf),
+    "gap": lambda message: _shift(message, 64),
+    "repeat": lambda message: _shift(message, -64),
+    "half a repeat": lambda message: _shift(message, -32),
+    "short": lambda message: _cut(message, 63),
+    "long": lambda message: _cut(message, 65),
+    "empty": lambda message: _cut(message, 0),
+    "uneven": _tear,
+    "step": lambda message: setattr(message.block, "step_ns", message.block.step_ns + 1),
+    "stamp": lambda message: setattr(message.header.stamp, "nanosec", message.header.stamp.nanosec + 1),
+    "last": lambda message: setattr(message.block, "last", True),
+    "far away": lambda message: setattr(message.block, "first_index", 2**63),
+    "another run": lambda message: setattr(message.block, "run_id", "another"),
+    "another source": lambda message: setattr(message.block, "source", "/nobody"),
+    "no block": id,  # its bytes are cut off
+}
 
 
 def spoil_encoder(source: str, kind: str, sample: int) -> None:

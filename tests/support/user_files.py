@@ -20,6 +20,7 @@ from lathe_machine.control.predistortion import Predistortion
 from lathe_machine.signals import measured_profile
 from lathe_machine.signals.counts import CsvReader
 from lathe_machine.stages.feed.trajectory import Trajectory, TrajectoryParameters
+from lathe_papers.formulas import step_fit
 from lathe_rc.analysis import measured_drive
 from lathe_rc.arrays import Array
 from lathe_rc.cell import cells_file, scenario
@@ -153,6 +154,11 @@ def _channel(path: Path) -> list[Array]:
     return [found.time, found.response]
 
 
+def _of_paper(path: Path) -> list[Array]:
+    found = step_fit.read_csv(path)
+    return [found.time, found.response]
+
+
 def _hysteresis(path: Path) -> list[Array]:
     found = hysteresis_fit.of_measurement(measured.opened(path, []))
     return [found.command, found.displacement]
@@ -184,7 +190,7 @@ KINDS = {
     "response": Kind("frequency_hz,real,imaginary,coherence", _RI, _ri, _RESPONSES),
     "magnitude": Kind("frequency_hz,magnitude_db,phase_deg", _MD, _md, _RESPONSES),
     "record": Kind("time_ms,command_um,response_um", _RECORDS, _record, (_recorded,)),
-    "step": Kind("time_ms,response", ("t [ms],Response", "Zeit (ms),response"), _rise, (_step, _channel)),
+    "step": Kind("time_ms,response", ("t [ms],Response", "Zeit (ms),response"), _rise, (_step, _channel, _of_paper)),
     "loop": Kind("command_um,displacement_um", ("cmd [µm],Displacement [µm]",), _loop, (_hysteresis,)),
     "form": Kind("angle_deg,radius_um", _ANGLES, _of_parts, (_parts, _form)),
     "tachogram": Kind("time_s,rpm", _SPEEDS, lambda: _wave(10.25, 1000.5), (_speed,), rising=True),

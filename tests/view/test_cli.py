@@ -146,79 +146,10 @@ def assert_refused(result, *texts):
     assert [text for text in texts if text not in result.stderr] == []
 
 
-@pytest.mark.parametrize(
-    ("override", "text"),
-    [
-        ("tool.profile_file=no.csv", "no.csv: cannot be read"),
-        ("nonsense", "--set 'nonsense'"),
-        ("tool.feed=nan", "tool.feed = nan; allowed: a finite number"),
-        ("learning_controller.feedback_delay=63", "delayed by 63 samples, block_size = 64"),
-        ("learning_controller.feedback_delay=100000", "at 104.7 rad/s the cycle leaves "),
-        ("learning_controller.lead_time=2e-3", "learning diverges with electrodynamic_actuator: sup|Q - Z| = 1.047"),
-        ("electrodynamic_actuator.stroke=2e-4", "cannot follow it at 104.7 rad/s: stroke 225 µm; allowed: 200 µm"),
-        ("sample_rate=65536", "allowed nearby: 64000 or 78125 Hz"),
-        ("learning_controller.q_time=1e-200", "learning diverges"),
-        ("tool.remap=['tool:=/**']", "tool"),
-    ],
-)
-def test_bad_setting_is_refused_in_one_line(override, text):
-    """Each source of refusals is here once; test_scenario.py, test_refusals.py and test_profile.py have them all."""
-    profile = ["--set", "tool.profile=csv"] if "profile_file" in override else []
-    assert_refused(lathe("run", "cell.yaml", "--json", *profile, "--set", override), text)
-
-
 def test_a_profile_of_several_lines_is_refused_in_one_line(folder):
     (folder / "form.csv").write_text('angle_deg,radius_um\n0,1\n90,2\n180,3\n270,"4\n')
     chosen = ["--set", "tool.profile=csv", "--set", "tool.profile_file=form.csv"]
     assert_refused(lathe("run", "cell.yaml", *chosen), str(folder / "form.csv"))
-
-
-@pytest.mark.parametrize(
-    ("option", "place", "text"),
-    [
-        ("--figure", "a.svg", "--figure a.svg; allowed: a file name that ends in .png"),
-        ("--figure", "no/a.png", "--figure no/a.png: no such folder"),
-        ("--profile", "no/form.csv", "--profile no/form.csv: no such folder"),
-        ("--bag", "new/folder/x", "new/folder/x: there is no folder new/folder;"),
-        ("--bag", "cell.yaml", "cell.yaml exists; a bag is never overwritten"),
-    ],
-)
-def test_a_place_that_cannot_be_written_is_refused_before_the_run(folder, option, place, text):
-    assert_refused(lathe("run", "cell.yaml", "--bag", "bag", option, place), text)
-    assert [*folder.iterdir()] == [folder / "cell.yaml"]
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("no.yaml", "no.yaml: no such file or scenario; ls "),
-        ("pistn", "pistn.yaml: no such file or scenario; did you mean piston? (ls "),
-        ("two_chanel.yaml", "did you mean two_channel, one_channel or"),
-        ("here/no.yaml", "cannot be read"),
-        (".", "cannot be read"),
-    ],
-)
-def test_missing_scenario_is_refused_with_those_of_like_names(name, said):
-    assert_refused(lathe("run", name), said)
-
-
-@pytest.mark.parametrize("options", [["LONG"], ["cell.yaml", "--bag", "LONG"], ["cell.yaml", "--figure", "LONG.png"]])
-def test_a_name_that_no_file_system_takes_is_refused(options):
-    assert_refused(
-        lathe("run", *(option.replace("LONG", "x" * 5000) for option in options)), "the name is too long; al"
-    )
-
-
-def test_a_run_that_no_memory_holds_is_refused_with_what_it_takes(folder):
-    """A run that needs more than the free memory is refused with its need, before anything begins, in every mode."""
-    said = "spindle_encoder.revolutions = 1e+09: 3.84e+12 samples"
-    for mode in ("offline", "processes"):
-        refused = lathe("run", "cell.yaml", "--revolutions", "1e9", "--mode", mode, "--bag", "bag")
-        assert_refused(refused, "GiB of memory, ", "GiB are free; allowed: up to ", said)
-    assert not (folder / "bag").exists()
-    for revolutions in ("1e13", "1e300"):
-        refused = lathe("run", "cell.yaml", "--revolutions", revolutions)
-        assert_refused(refused, "spindle_encoder.revolutions = ", "samples; allowed: below 9007199254740992")
 
 
 def test_a_command_that_memory_does_not_suffice_for_says_so(monkeypatch):
@@ -249,23 +180,6 @@ def test_spindle_alone_ends_in_order(folder):
         assert result.exit_code in (0, 2), result.exception
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *(f"--revolutions {number}" for number in ("-1", "0", "many", "nan", "inf")),
-        *(f"--speed-factor {number}" for number in ("-1", "nan")),
-        "--mode upside-down",
-        "--group tool+fork --mode processes",
-        "--group tool+recorder",
-    ],
-)
-def test_bad_option_is_refused(arguments):
-    arguments = arguments.split()
-    result = lathe("run", "cell.yaml", *arguments)
-    assert (result.exit_code, result.stdout) == (2, ""), result.exception
-    assert arguments[0].removeprefix("--").replace("-", "_") in result.stderr.replace("-", "_")
-
-
 # --- lathe node
 
 
@@ -276,12 +190,6 @@ def test_help_of_a_node_lists_its_parameters(name):
     for row in TABLES[name].rows().values():
         assert row.name in result.stdout
         assert row.unit == "1" or f"[{row.unit}]" in result.stdout
-
-
-def test_unknown_node_is_refused_with_the_known_ones():
-    result = lathe("node", "fork")
-    assert result.exit_code == 2
-    assert all(name in result.stderr for name in TABLES)
 
 
 def test_summary_of_a_failed_learning_is_json_too():

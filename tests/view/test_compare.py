@@ -102,18 +102,3 @@ def test_a_scenario_runs_first_and_nodes_that_only_it_has_are_folded(compared, t
     assert "spindle_encoder.revolutions" in common
     assert "supervisor.force_limit" in folded
     assert "supervisor.force_limit" not in common
-
-
-@pytest.mark.parametrize(
-    ("runs", "message"),
-    [
-        (("fast",), "runs to compare: 1; allowed: 2 to 6"),
-        (("fast", "fast"), "is given twice; allowed: different runs"),
-        (("fast", "nothing"), "nothing.yaml: cannot be read (No such file"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(compared, runs, message, tmp_path):
-    done = lathe("compare", *(compared.folder / run for run in runs), "-o", tmp_path / "page.html")
-    assert done.exit_code == 2
-    assert message in done.output
-    assert not (tmp_path / "page.html").exists()

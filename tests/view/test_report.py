@@ -26,7 +26,6 @@ from lathe_rc.cell.scenario import load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.commands.report import report
 from lathe_rc.drawing import charts
-from lathe_rc.errors import InputError
 from lathe_rc.judge import part
 from lathe_rc.judge.causes import changing
 from lathe_rc.view import report as reporting
@@ -504,16 +503,3 @@ def test_a_gap_stops_the_reading_and_is_reported(turned, tmp_path):
     assert "/tool goes from sample 19136 to 19200" in told.stopped
     assert not told.complete
     assert any(text.startswith("reading stopped: ") for text in reporting.losses(told))
-
-
-def test_places_and_bags_that_are_none_are_refused_and_leave_no_page(turned, tmp_path):
-    (tmp_path / "dir.html").mkdir()
-    for bag, name, reason in (
-        (turned.bag, "page.txt", "ends in .html"),
-        (turned.bag, "no/page.html", "no such folder"),
-        (turned.bag, "dir.html", "is a folder"),
-        (tmp_path / "dir.html", "page.html", "not a readable bag"),
-    ):
-        with pytest.raises(InputError, match=reason):
-            reporting.write_report(bag, tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == ["dir.html"]
