@@ -3,7 +3,7 @@
 
 **write**, uncompressed and with zstd, is timed from the first message to the closed bag, on the disk with the temporary
 files. Rates are in messages and MB (of message bytes) per second. Chunks have 256 KiB for ``lathe_rc`` and ``mcap``;
-rosbags has no such option. Each compresses at its own level of zstd, ``lathe_rc`` at −5.
+rosbags has no such option. Each compresses at its own level of zstd, ``lathe_rc`` at −20.
 
 - ``lathe_rc``, ``mcap`` and ``rosbags`` get the same finished messages in the order of the bag.
 - ``lathe_rc_node`` does the work of the recorder node: it reads and checks each message, sorts it into a row with the

@@ -18,7 +18,7 @@ class RecorderParameters(NodeParameters):
     bag: str = parameter("", "folder of the bag; must not exist; empty: bag_ and the run id", path=True)
     compression: Literal["zstd", "none"] = parameter("zstd", "compression of the bag's chunks")
     chunk_size: Annotated[int, Ge(4096), Le(2**26)] = parameter(
-        2**20, "size of the bag's chunks; a crash may lose two", "B"
+        2**20, "size of the bag's chunks; a crash may lose four", "B"
     )
     split_duration: Annotated[float, Ge(0), Le(1e9)] = parameter(
         0.0, "simulated time after which the bag goes on in another file; 0: one file", "s"

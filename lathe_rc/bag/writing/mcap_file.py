@@ -14,6 +14,7 @@ make other chunks unreadable, not even in a file that was cut off before its sum
 import io
 import os
 import struct
+from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -33,9 +34,11 @@ from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, walk
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 TIMES = (16, 8)  #: offsets of log time and publish time, backwards from a message's data [B]
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, length of the following pairs of log time and offset
+_LENGTH = struct.Struct("<Q")
 _FOOTER = struct.Struct("<BQQQ")
 _ROOM, _ROOM_PER_CHUNK = 2**17, 1024  # disk space reserved for index and metadata [B]
-LEVEL = -5  #: zstd level: 20 % of the time of the default level, for files that are 7 % larger (docs/bags.md)
+_WAITING = 3  # largest number of chunks that the thread has to write
+LEVEL = -20  #: zstd level, the quickest whose files are hardly larger (docs/bags.md)
 
 
 class _Record(Protocol):
@@ -107,17 +110,17 @@ class McapFile:
         self.counts: dict[int, int] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        # The messages of the chunk, followed by leftover bytes of earlier chunks. Two buffers: one is filled while the
-        # thread compresses and writes the other; both release the interpreter lock.
-        self._chunk, self._written = io.BytesIO(), io.BytesIO()
+        # The messages of the chunk, followed by leftover bytes of earlier chunks. The thread compresses and writes it
+        # without the interpreter lock, while others are filled: the engine fills several at once, then computes.
+        self._chunk, self._spare = io.BytesIO(), list[io.BytesIO]()
         self._thread = ThreadPoolExecutor(1)
-        self._at_work: Future[None] | None = None
+        self._at_work: deque[Future[io.BytesIO]] = deque()
         self._begun = 0  # number of chunks handed to the thread
         self._begin_chunk()
         self._offset = self.checksum = 0
         self._reserve = path.with_name(f"{path.name}.reserve")
         self._kept = self._described = 0
-        self._refused: OSError | None = None
+        self._refused: Exception | None = None
         self._put(MCAP0_MAGIC + _encoded(records.Header(profile, seal.LIBRARY)))
 
     def successor(self, path: Path) -> "McapFile":
@@ -229,46 +232,59 @@ class McapFile:
     def _hand_over(self) -> None:
         """Let the thread write the chunk, and begin another one."""
         try:
-            self._wait()
-            if self._refused:
-                raise self._refused  # nothing is recorded after a gap
-            self._chunk, self._written = self._written, self._chunk
-            self._at_work = self._thread.submit(self._write_chunk, self._size)
+            self._wait(_WAITING - 1)
+            full, self._chunk = self._chunk, self._spare.pop() if self._spare else io.BytesIO()
+            self._at_work.append(self._thread.submit(self._write, full, self._size))
             self._begun += 1
         finally:
             self._begin_chunk()
 
-    def _wait(self) -> None:
-        """Wait for the chunk that the thread writes."""
-        work, self._at_work = self._at_work, None
+    def _wait(self, left: int = 0) -> None:
+        """Wait until the thread has at most ``left`` chunks to write."""
         try:
-            if work:
-                work.result()
-        except OSError as error:
-            self._refused = error
+            while len(self._at_work) > left:
+                buffer = self._at_work[0].result()  # an interrupt here leaves the chunk among those to wait for
+                self._at_work.popleft()
+                self._spare.append(buffer)
+        except Exception:
+            self._at_work.clear()  # the thread refuses them
             raise
 
-    def _write_chunk(self, size: int) -> None:
+    def _write(self, buffer: io.BytesIO, size: int) -> io.BytesIO:
+        """Write a chunk, as the thread, and return its buffer."""
+        if self._refused:
+            raise self._refused  # nothing is recorded after a gap
+        try:
+            self._write_chunk(buffer, size)
+        except Exception as error:
+            self._refused = error
+            raise
+        return buffer
+
+    def _write_chunk(self, buffer: io.BytesIO, size: int) -> None:
         self._keep_room()
-        with self._written.getbuffer() as memory, memory[:size] as whole:
+        with buffer.getbuffer() as memory, memory[:size] as whole:
             # Copies: views of the chunk, kept alive by the traceback of a full-disk error, would lock its buffer.
             messages = walk(whole.toreadonly()).messages
             crc = crc32(whole)
             data = self._compressor.compress(whole) if self._compressor else bytes(whole)
         first, last = int(messages[:, 1].min()), int(messages[:, 1].max())
         compression = "zstd" if self._compressor else ""
-        chunk = _encoded(records.Chunk(compression, data, last, first, crc, size))
-        pairs = np.stack([messages[:, 1], messages[:, 2] - np.uint64(BEFORE_DATA)], axis=1)
+        # The record ends with the compressed bytes, which are not copied.
+        empty = _encoded(records.Chunk(compression, b"", last, first, crc, size))[HEAD.size : -_LENGTH.size]
+        head = HEAD.pack(Opcode.CHUNK, len(empty) + _LENGTH.size + len(data)) + empty + _LENGTH.pack(len(data))
         counts = np.bincount(messages[:, 0].astype(np.int64))
-        start = self._offset
-        parts, offsets, end = [chunk], {}, start + len(chunk)
+        by_channel = messages[np.argsort(messages[:, 0], kind="stable"), 1:3]
+        by_channel[:, 1] -= np.uint64(BEFORE_DATA)
+        start, length = self._offset, len(head) + len(data)
+        index: list[bytes] = []
+        offsets, done, end = {}, 0, start + length
         for channel in np.flatnonzero(counts).tolist():
-            text = pairs[messages[:, 0] == channel].tobytes()
-            head = _INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - HEAD.size, channel, len(text))
-            parts += head, text
+            text = by_channel[done : (done := done + counts[channel])].tobytes()
+            index += _INDEX.pack(Opcode.MESSAGE_INDEX, len(text) + _INDEX.size - HEAD.size, channel, len(text)), text
             offsets[channel] = end
-            end += len(head) + len(text)
-        self._put(b"".join(parts))
+            end += _INDEX.size + len(text)
+        self._put(head, data, b"".join(index))
         for channel in offsets:
             self.counts[channel] += int(counts[channel])
         self.first_ns = first if self.first_ns is None else min(first, self.first_ns)
@@ -279,9 +295,9 @@ class McapFile:
                 message_start_time=first,
                 message_end_time=last,
                 chunk_start_offset=start,
-                chunk_length=len(chunk),
+                chunk_length=length,
                 message_index_offsets=offsets,
-                message_index_length=end - start - len(chunk),
+                message_index_length=end - start - length,
                 compression=compression,
                 compressed_size=len(data),
                 uncompressed_size=size,

@@ -11,7 +11,7 @@ from lathe_rc.blocks.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
 
-_BUFFER = 2**20  # size of a buffer, unless a single row is larger [B]
+_BUFFER = 2**22  # size of a buffer, unless a single row is larger [B]
 
 
 class _Single(NamedTuple):

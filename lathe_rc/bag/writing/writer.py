@@ -162,7 +162,7 @@ class BagWriter:
     Args:
         path: folder of the bag; must not exist yet.
         compression: compression of the chunks.
-        chunk_size: size after which a chunk is written out [B]; a crash loses two at most.
+        chunk_size: size after which a chunk is written out [B]; a crash loses four at most.
         about: strings for the bag's metadata (see `tell`).
         profile: profile of the MCAP file.
 
